@@ -1,0 +1,32 @@
+"""Write typings/: one-line stubs that show type checkers folder X as the package rlservo.X.
+
+Setuptools' `package-dir` gives the folders that name at run time; mypy, pyright and editors do not read it.
+`make check` runs this first.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = ("envs", "export", "serve_app", "deploy")
+
+
+def main() -> None:
+    typings = ROOT / "typings" / "rlservo"
+    shutil.rmtree(typings, ignore_errors=True)
+    typings.mkdir(parents=True)
+    (typings / "__init__.pyi").write_text("")
+    for folder in FOLDERS:
+        for module in sorted((ROOT / folder).rglob("*.py")):
+            path = module.relative_to(ROOT)
+            stub = typings / path.with_suffix(".pyi")
+            stub.parent.mkdir(parents=True, exist_ok=True)
+            names = path.with_suffix("").parts
+            dotted = ".".join(names[:-1] if names[-1] == "__init__" else names)
+            stub.write_text(f"from {dotted} import *\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""From an RLlib checkpoint to a policy bundle, proven equal."""

@@ -1,0 +1,387 @@
+"""The policy bundle: the one contract between the exporter and everything that runs a policy.
+
+A bundle is a folder `<name>/<version>/` holding
+
+    policy.onnx     the whole policy as one graph: raw observation in, environment-ready action out
+    policy.ts       the same graph as TorchScript
+    contract.json   what goes in, what comes out, what is baked in, how it was proven (`Contract` below)
+    golden.npz      recorded inputs and outputs, replayed at every load
+    SHA256SUMS      a hash of each of the files above (`sha256sum -c SHA256SUMS` checks them too)
+
+This module reads and writes those files. It needs numpy and pydantic; it knows nothing of torch, ray, gymnasium,
+onnx or onnxruntime, and never unpickles.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from rlservo.export.errors import BundleError, BundleTamperedError
+
+SCHEMA_VERSION = 1
+ONNX_FILE = "policy.onnx"
+TORCHSCRIPT_FILE = "policy.ts"
+CONTRACT_FILE = "contract.json"
+GOLDEN_FILE = "golden.npz"
+SUMS_FILE = "SHA256SUMS"
+
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Element(_Model):
+    """One number of an observation or an action, as a roboticist would call it."""
+
+    name: str
+    unit: str = Field("", description="SI unit such as 'rad', 'm/s'; '1' when dimensionless, '' when unknown")
+
+
+class BoxSpec(_Model):
+    """A Gymnasium Box. Bounds are one number for all elements, or one per element in row-major order; null is unbounded."""
+
+    kind: Literal["box"] = "box"
+    shape: tuple[int, ...]
+    dtype: str
+    low: float | None | tuple[float | None, ...]
+    high: float | None | tuple[float | None, ...]
+    elements: tuple[Element, ...] = Field((), description="Empty, or one per element in row-major order")
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (low, high), each of the space's shape, with infinities where unbounded."""
+
+        def fill(bound: float | None | tuple[float | None, ...], infinity: float) -> NDArray[np.float64]:
+            if isinstance(bound, tuple):
+                flat = np.array([infinity if b is None else b for b in bound], dtype=np.float64)
+                return flat.reshape(self.shape)
+            return np.full(self.shape, infinity if bound is None else bound, dtype=np.float64)
+
+        return fill(self.low, -math.inf), fill(self.high, math.inf)
+
+
+class DiscreteSpec(_Model):
+    """A Gymnasium Discrete: the integers start .. start + n - 1."""
+
+    kind: Literal["discrete"] = "discrete"
+    n: int = Field(ge=1)
+    start: int = 0
+    dtype: str = "int64"
+    elements: tuple[Element, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return ()
+
+    @property
+    def size(self) -> int:
+        return 1
+
+
+SpaceSpec = Annotated[BoxSpec | DiscreteSpec, Field(discriminator="kind")]
+
+
+class TensorSpec(_Model):
+    """A named input or output of the graph. The first axis is the batch, -1."""
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+
+
+class StateSpec(_Model):
+    """A recurrent state: graph input `state_in.<name>`, output `state_out.<name>`; `initial` starts an episode."""
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...] = Field(description="Without the batch axis")
+    initial: float = 0.0
+
+
+class Distribution(_Model):
+    """How `action_dist_inputs` become an exploring action; the deterministic one is the graph's own `action`."""
+
+    kind: Literal["diag_gaussian", "squashed_gaussian", "categorical"]
+    transform: Literal["none", "unsquash", "clip"] = Field(
+        description="What RLlib does to a sample before env.step: 'unsquash' maps [-1, 1] to the bounds and clips, "
+        "'clip' only clips, 'none' sends it as it is (discrete actions: adds the space's start)"
+    )
+
+
+class BakedStep(_Model):
+    """One processing step inside the graph, in the order it is applied."""
+
+    step: str = Field(description="For example 'mean_std_filter', 'one_hot', 'network', 'mode', 'unsquash', 'clip'")
+    detail: str = Field("", description="A sentence for people")
+    values: dict[str, Any] = Field(default_factory=dict, description="For example count, mean and std of a filter")
+
+
+class Provenance(_Model):
+    """Where the policy came from."""
+
+    algorithm: str
+    api_stack: Literal["new", "old"]
+    module_id: str
+    module_class: str
+    checkpoint_sha256: str = Field(description="Hash over the checkpoint files that were read")
+    training_iterations: int | None = None
+    env_steps: int | None = None
+    env_id: str | None = None
+    env_config: dict[str, Any] = Field(default_factory=dict)
+    ray_version: str
+    torch_version: str
+    rlservo_version: str
+    exported_at: str = Field(description="UTC, ISO 8601")
+
+
+class FormatParity(_Model):
+    """The largest differences between one written format and RLlib's own pipeline."""
+
+    max_abs: float
+    max_rel: float
+
+
+class Parity(_Model):
+    """How the export was proven equal to what RLlib itself would send to env.step."""
+
+    reference: str
+    samples: int
+    batch_sizes: tuple[int, ...]
+    rtol: float
+    atol: float
+    formats: dict[str, FormatParity]
+
+
+class Evaluation(_Model):
+    """One closed-loop run of exported policy and checkpoint on the same seeds."""
+
+    env_id: str
+    episodes: int
+    first_seed: int
+    return_bundle: float
+    return_checkpoint: float
+    success_rate_bundle: float | None
+    success_rate_checkpoint: float | None
+    evaluated_at: str
+
+
+class Contract(_Model):
+    """`contract.json`: everything a client, a server or a person needs to know of a policy."""
+
+    schema_version: Literal[1] = SCHEMA_VERSION
+    name: str = Field(pattern=NAME_PATTERN)
+    version: str = Field(pattern=VERSION_PATTERN)
+    description: str = ""
+    observation_space: SpaceSpec
+    action_space: SpaceSpec
+    inputs: tuple[TensorSpec, ...]
+    outputs: tuple[TensorSpec, ...]
+    state: tuple[StateSpec, ...] = ()
+    distribution: Distribution | None
+    baked_in: tuple[BakedStep, ...]
+    control_rate_hz: float | None = Field(None, description="The rate the environment asks for actions at")
+    provenance: Provenance
+    parity: Parity
+    evaluations: tuple[Evaluation, ...] = ()
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A bundle folder whose hashes have been checked, and its contract."""
+
+    path: Path
+    contract: Contract
+
+    @property
+    def onnx(self) -> Path:
+        return self.path / ONNX_FILE
+
+    @property
+    def torchscript(self) -> Path:
+        return self.path / TORCHSCRIPT_FILE
+
+    def golden(self) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
+        """Return the golden (inputs, outputs) by tensor name; all share the leading batch axis."""
+        inputs: dict[str, NDArray[Any]] = {}
+        outputs: dict[str, NDArray[Any]] = {}
+        try:
+            with np.load(self.path / GOLDEN_FILE, allow_pickle=False) as archive:
+                for key in archive.files:
+                    side, _, name = key.partition("/")
+                    (inputs if side == "input" else outputs)[name] = archive[key]
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise BundleError(f"{self.path / GOLDEN_FILE} cannot be read: {error}") from error
+        return inputs, outputs
+
+
+def load_bundle(path: str | Path) -> Bundle:
+    """Read and check one bundle.
+
+    `path` may be the bundle folder itself, a policy folder `<name>/` (its newest version) or a repository that holds
+    exactly one policy.
+
+    Raises BundleError when there is no bundle, a file is missing or the contract is malformed, and
+    BundleTamperedError when a file differs from its recorded hash.
+    """
+    folder = resolve_bundle(path)
+    check_hashes(folder)
+    return Bundle(folder, read_contract(folder))
+
+
+def resolve_bundle(path: str | Path) -> Path:
+    """Return the one bundle folder that `path` means: itself, its newest version, or its only policy's newest."""
+    newest: dict[Path, Path] = {}
+    for folder in find_bundles(path):  # versions of one policy come in ascending order
+        newest[folder.parent] = folder
+    if len(newest) > 1:
+        names = ", ".join(sorted(str(folder.relative_to(path).parent) for folder in newest.values()))
+        raise BundleError(f"{path} holds {len(newest)} policies ({names}): name one of their folders")
+    return next(iter(newest.values()))
+
+
+def find_bundles(path: str | Path) -> list[Path]:
+    """Return every bundle folder at or below `path` (a bundle, a policy folder or a repository), oldest version first.
+
+    Raises BundleError when there is none.
+    """
+    root = Path(path)
+    if not root.exists():
+        raise BundleError(f"{root} does not exist: expected a policy bundle (a folder with {CONTRACT_FILE})")
+    if not root.is_dir():
+        raise BundleError(f"{root} is a file: expected a policy bundle (a folder with {CONTRACT_FILE})")
+    if _looks_like_bundle(root):
+        return [root]
+    versions = _versions(root)
+    if not versions:
+        versions = [v for policy in sorted(root.iterdir()) if policy.is_dir() for v in _versions(policy)]
+    if not versions:
+        raise BundleError(
+            f"{root} holds no policy bundle: expected {CONTRACT_FILE} in it, in <version>/ or in <name>/<version>/"
+        )
+    return versions
+
+
+def _looks_like_bundle(folder: Path) -> bool:
+    return (folder / CONTRACT_FILE).exists() or (folder / SUMS_FILE).exists()
+
+
+def _versions(policy: Path) -> list[Path]:
+    folders = [
+        f for f in policy.iterdir() if f.is_dir() and re.match(VERSION_PATTERN, f.name) and _looks_like_bundle(f)
+    ]
+    return sorted(folders, key=lambda f: version_key(f.name))
+
+
+def version_key(version: str) -> tuple[int, ...]:
+    """Return a sort key: '3' counts as 3.0.0."""
+    parts = tuple(int(part) for part in version.split("."))
+    return parts + (0,) * (3 - len(parts))
+
+
+def read_contract(folder: Path) -> Contract:
+    """Parse `contract.json`; say in one sentence which field is wrong."""
+    file = folder / CONTRACT_FILE
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BundleError(f"{file} cannot be read: {error}") from error
+    try:
+        return Contract.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the document"
+        raise BundleError(f"{file}: {where}: {first['msg']}") from error
+
+
+def check_hashes(folder: Path) -> None:
+    """Compare every file of the bundle with SHA256SUMS."""
+    recorded = _read_sums(folder)
+    for name in (ONNX_FILE, TORCHSCRIPT_FILE, CONTRACT_FILE, GOLDEN_FILE):
+        if name not in recorded:
+            raise BundleError(f"{folder / SUMS_FILE} does not list {name}: the bundle is incomplete")
+    for name, digest in recorded.items():
+        file = folder / name
+        if not file.is_file():
+            raise BundleError(f"{file} is missing: the bundle is incomplete")
+        actual = sha256(file)
+        if actual != digest:
+            raise BundleTamperedError(
+                f"{file} is not the file that was exported: its sha256 is {actual[:12]}..., "
+                f"{SUMS_FILE} records {digest[:12]}...",
+                {"file": name, "expected": digest, "actual": actual},
+            )
+
+
+def _read_sums(folder: Path) -> dict[str, str]:
+    file = folder / SUMS_FILE
+    try:
+        lines = file.read_text(encoding="ascii").splitlines()
+    except FileNotFoundError as error:
+        raise BundleError(f"{file} is missing: the bundle is incomplete") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise BundleError(f"{file} cannot be read: {error}") from error
+    sums: dict[str, str] = {}
+    for number, line in enumerate(lines, start=1):
+        match = re.fullmatch(r"([0-9a-f]{64})  ([A-Za-z0-9._-]+)", line)
+        if match is None:
+            raise BundleError(f"{file}, line {number}: expected '<sha256>  <file name>'")
+        sums[match[2]] = match[1]
+    return sums
+
+
+def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapping[str, NDArray[Any]]) -> None:
+    """Write golden.npz; every array's first axis is the sample."""
+    arrays = {f"input/{name}": value for name, value in inputs.items()}
+    arrays.update({f"output/{name}": value for name, value in outputs.items()})
+    np.savez_compressed(folder / GOLDEN_FILE, allow_pickle=False, **arrays)
+
+
+def write_contract(folder: Path, contract: Contract) -> None:
+    """Write contract.json and, with it, SHA256SUMS over all four files, which must already exist."""
+    (folder / CONTRACT_FILE).write_text(contract_json(contract) + "\n", encoding="utf-8")
+    lines = [f"{sha256(folder / name)}  {name}\n" for name in (CONTRACT_FILE, GOLDEN_FILE, ONNX_FILE, TORCHSCRIPT_FILE)]
+    (folder / SUMS_FILE).write_text("".join(lines), encoding="ascii")
+
+
+def contract_json(contract: Contract) -> str:
+    """Return the contract as the indented JSON that goes into the bundle and the ONNX metadata."""
+    return json.dumps(contract.model_dump(mode="json"), indent=2)
+
+
+def contract_schema() -> dict[str, Any]:
+    """Return the JSON schema of contract.json."""
+    return Contract.model_json_schema()
+
+
+def sha256(file: Path) -> str:
+    """Return the file's hash as 64 hexadecimal digits."""
+    digest = hashlib.sha256()
+    with file.open("rb") as stream:
+        for block in iter(lambda: stream.read(1 << 20), b""):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def iter_elements(space: BoxSpec | DiscreteSpec) -> Iterator[tuple[int, str]]:
+    """Yield (index, label) for error messages: the element's name where known, else its index."""
+    for index in range(space.size):
+        named = index < len(space.elements)
+        yield index, f"{index} ({space.elements[index].name})" if named else str(index)

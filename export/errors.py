@@ -1,0 +1,135 @@
+"""Every error a user of rlservo can meet, in one tree.
+
+It knows nothing of HTTP or of the command line: one table in `serve_app/http.py` maps these to status codes, and one
+handler in `deploy/cli.py` maps them to exit codes.
+
+    RlservoError                  error
+    ├── CheckpointError           checkpoint-unreadable    not a checkpoint, damaged, or its code cannot be imported
+    │   └── UnsupportedError      checkpoint-unsupported   readable, but cannot be exported faithfully
+    ├── ParityError               parity-failed            the exported graph differs from RLlib's own actions
+    ├── BundleError               bundle-invalid           missing, truncated or malformed bundle
+    │   ├── BundleTamperedError   bundle-tampered          a file's hash differs from the recorded one
+    │   └── GoldenMismatchError   golden-mismatch          this machine does not reproduce the golden vectors
+    ├── UnknownPolicyError        unknown-policy
+    │   └── UnknownVersionError   unknown-version
+    ├── RequestError              bad-request              the request itself is malformed
+    │   ├── MediaTypeError        wrong-media-type
+    │   └── TooLargeError         too-large
+    ├── ObservationError          bad-observation          shape, dtype, non-finite or misnamed element
+    ├── ActionError               unsafe-action            the policy produced an action that must not leave
+    ├── DeadlineError             deadline-passed
+    ├── UnavailableError          unavailable              not ready, over capacity, or the server cannot be reached
+    └── UsageError                bad-usage                an argument or the machine's state prevents the start
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+
+class RlservoError(Exception):
+    """An error with a sentence for people, a kebab-case code and details for programs."""
+
+    code: ClassVar[str] = "error"
+
+    def __init__(self, message: str, details: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.details: dict[str, Any] = dict(details or {})
+
+
+class CheckpointError(RlservoError):
+    """The path holds no checkpoint that can be read."""
+
+    code = "checkpoint-unreadable"
+
+
+class UnsupportedError(CheckpointError):
+    """The checkpoint can be read, but not exported without losing something."""
+
+    code = "checkpoint-unsupported"
+
+
+class ParityError(RlservoError):
+    """The exported graph does not give RLlib's own actions; nothing was written."""
+
+    code = "parity-failed"
+
+
+class BundleError(RlservoError):
+    """The path holds no usable policy bundle."""
+
+    code = "bundle-invalid"
+
+
+class BundleTamperedError(BundleError):
+    """A bundle file's hash differs from the one recorded at export."""
+
+    code = "bundle-tampered"
+
+
+class GoldenMismatchError(BundleError):
+    """The loaded graph does not reproduce the bundle's golden vectors on this machine."""
+
+    code = "golden-mismatch"
+
+
+class UnknownPolicyError(RlservoError):
+    """No policy of that name is loaded."""
+
+    code = "unknown-policy"
+
+
+class UnknownVersionError(UnknownPolicyError):
+    """The policy is loaded, but not in that version."""
+
+    code = "unknown-version"
+
+
+class RequestError(RlservoError):
+    """The request cannot be understood."""
+
+    code = "bad-request"
+
+
+class MediaTypeError(RequestError):
+    """The body is not of a type this endpoint reads."""
+
+    code = "wrong-media-type"
+
+
+class TooLargeError(RequestError):
+    """The body exceeds the configured size."""
+
+    code = "too-large"
+
+
+class ObservationError(RlservoError):
+    """The observation does not fit the policy's contract."""
+
+    code = "bad-observation"
+
+
+class ActionError(RlservoError):
+    """The policy's action is not finite or not in the action space."""
+
+    code = "unsafe-action"
+
+
+class DeadlineError(RlservoError):
+    """The answer could not have arrived in time, so the work was not done."""
+
+    code = "deadline-passed"
+
+
+class UnavailableError(RlservoError):
+    """The server is not ready, over capacity, or out of reach."""
+
+    code = "unavailable"
+
+
+class UsageError(RlservoError):
+    """An argument, or something already running on the machine, prevents the start."""
+
+    code = "bad-usage"

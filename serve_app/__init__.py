@@ -1,0 +1,1 @@
+"""Running exported policies: in process (`policy`), as a server (`app`), and from a client (`client`)."""
