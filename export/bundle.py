@@ -30,7 +30,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rlservo.export.errors import BundleError, BundleTamperedError
 
-SCHEMA_VERSION = 1
 ONNX_FILE = "policy.onnx"
 TORCHSCRIPT_FILE = "policy.ts"
 CONTRACT_FILE = "contract.json"
@@ -53,13 +52,16 @@ class Element(_Model):
 
 
 class BoxSpec(_Model):
-    """A Gymnasium Box. Bounds are one number for all elements, or one per element in row-major order; null is unbounded."""
+    """A Gymnasium Box.
+
+    Bounds are one number for all elements or one per element in row-major order; null is unbounded.
+    """
 
     kind: Literal["box"] = "box"
     shape: tuple[int, ...]
     dtype: str
-    low: float | None | tuple[float | None, ...]
-    high: float | None | tuple[float | None, ...]
+    low: float | tuple[float | None, ...] | None
+    high: float | tuple[float | None, ...] | None
     elements: tuple[Element, ...] = Field((), description="Empty, or one per element in row-major order")
 
     @property
@@ -69,7 +71,7 @@ class BoxSpec(_Model):
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return (low, high), each of the space's shape, with infinities where unbounded."""
 
-        def fill(bound: float | None | tuple[float | None, ...], infinity: float) -> NDArray[np.float64]:
+        def fill(bound: float | tuple[float | None, ...] | None, infinity: float) -> NDArray[np.float64]:
             if isinstance(bound, tuple):
                 flat = np.array([infinity if b is None else b for b in bound], dtype=np.float64)
                 return flat.reshape(self.shape)
@@ -186,7 +188,7 @@ class Evaluation(_Model):
 class Contract(_Model):
     """`contract.json`: everything a client, a server or a person needs to know of a policy."""
 
-    schema_version: Literal[1] = SCHEMA_VERSION
+    schema_version: Literal[1] = 1
     name: str = Field(pattern=NAME_PATTERN)
     version: str = Field(pattern=VERSION_PATTERN)
     description: str = ""

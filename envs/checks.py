@@ -1,0 +1,84 @@
+"""What the environments refuse, in sentences that name the element.
+
+robo-gym raises a bare InvalidActionError or InvalidStateError; these say which element was wrong and by how much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypedDict
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class ElementInfo(TypedDict):
+    """Name and unit of one element of an observation or an action; '1' is dimensionless."""
+
+    name: str
+    unit: str
+
+
+class EnvDescription(TypedDict):
+    """What `Env.describe(**constructor_arguments)` returns without building the environment.
+
+    The exporter writes it into the policy's contract; any environment may offer the same classmethod.
+    """
+
+    observation: list[ElementInfo]
+    action: list[ElementInfo]
+    control_rate_hz: float
+
+
+class InvalidActionError(ValueError):
+    """The action does not fit the action space."""
+
+
+class InvalidResetError(ValueError):
+    """A reset option cannot be honoured."""
+
+
+def check_action(action: ArrayLike, space: gym.spaces.Box, elements: Sequence[ElementInfo]) -> NDArray[np.float32]:
+    """Return the action as float32, or raise InvalidActionError naming the element and by how much it is out."""
+    try:
+        array = np.asarray(action, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise InvalidActionError(f"the action is not an array of numbers: {error}") from error
+    if array.shape != space.shape:
+        names = ", ".join(element["name"] for element in elements)
+        raise InvalidActionError(f"the action has shape {array.shape}, expected {space.shape}: {names}")
+    # One comparison covers NaN as well: NaN is neither above low nor below high.
+    inside = (array >= space.low) & (array <= space.high)
+    if not inside.all():
+        raise InvalidActionError(_outside(array, space, elements, int(np.argmin(inside))))
+    return array
+
+
+def _outside(array: NDArray[np.float32], space: gym.spaces.Box, elements: Sequence[ElementInfo], index: int) -> str:
+    value, low, high = float(array[index]), float(space.low[index]), float(space.high[index])
+    which = f"action element {index} ({elements[index]['name']}) is {value:g}"
+    if not np.isfinite(value):
+        return f"{which}: expected a finite number in [{low:g}, {high:g}]"
+    excess = value - high if value > high else low - value
+    return f"{which}, {excess:g} {'above' if value > high else 'below'} its range [{low:g}, {high:g}]"
+
+
+def as_vector(name: str, value: Any, length: int) -> NDArray[np.float64]:
+    """Return a reset option as `length` finite float64 numbers, or raise InvalidResetError."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidResetError(f"reset option {name!r} is not a list of numbers: {error}") from error
+    if array.shape != (length,):
+        raise InvalidResetError(f"reset option {name!r} has shape {array.shape}, expected ({length},)")
+    if not np.isfinite(array).all():
+        raise InvalidResetError(f"reset option {name!r}, element {int(np.argmin(np.isfinite(array)))} is not finite")
+    return array
+
+
+def check_option_names(options: dict[str, Any], known: Sequence[str]) -> None:
+    """Raise InvalidResetError on a reset option that does not exist."""
+    for name in options:
+        if name not in known:
+            raise InvalidResetError(f"reset option {name!r} does not exist: expected one of {', '.join(known)}")

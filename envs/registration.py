@@ -1,0 +1,25 @@
+"""Names the environments to Gymnasium.
+
+It must stay light: every program that imports gymnasium runs it. MuJoCo is imported when an environment is made.
+"""
+
+from __future__ import annotations
+
+from gymnasium.envs.registration import register, registry
+
+NAMESPACE = "rlservo"
+ENTRY_POINTS = {
+    "EndEffectorPositioningURSim-v0": "rlservo.envs.ur.end_effector_positioning:EndEffectorPositioningURSim",
+    "NoObstacleNavigationMir100Sim-v0": "rlservo.envs.mir100.no_obstacle_navigation:NoObstacleNavigationMir100Sim",
+    "ObstacleAvoidanceMir100Sim-v0": "rlservo.envs.mir100.obstacle_avoidance:ObstacleAvoidanceMir100Sim",
+}
+
+
+def register_envs() -> None:
+    """Register every environment as `rlservo/<id>`; harmless when repeated.
+
+    The episode limit is the environment's own, so no `max_episode_steps` is given here.
+    """
+    for name, entry_point in ENTRY_POINTS.items():
+        if f"{NAMESPACE}/{name}" not in registry:
+            register(id=f"{NAMESPACE}/{name}", entry_point=entry_point)

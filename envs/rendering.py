@@ -1,0 +1,63 @@
+"""Pictures of a simulator: `rgb_array` frames off screen, `human` in MuJoCo's viewer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+RENDER_MODES = ("human", "rgb_array")
+
+
+class Camera:
+    """One camera on one simulator. Nothing is allocated, and no GL context made, before the first frame."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        *,
+        lookat: tuple[float, float, float],
+        distance: float,
+        azimuth: float,
+        elevation: float,
+        width: int = 640,
+        height: int = 480,
+    ) -> None:
+        self._model, self._data = model, data
+        self._width, self._height = width, height
+        self._view = mujoco.MjvCamera()
+        self._view.lookat[:] = lookat
+        self._view.distance, self._view.azimuth, self._view.elevation = distance, azimuth, elevation
+        self._renderer: mujoco.Renderer | None = None
+        self._viewer: Any = None
+
+    def frame(self) -> NDArray[np.uint8]:
+        """Return the current view as (height, width, 3) uint8."""
+        if self._renderer is None:
+            self._renderer = mujoco.Renderer(self._model, height=self._height, width=self._width)
+        self._renderer.update_scene(self._data, camera=self._view)
+        return np.asarray(self._renderer.render(), dtype=np.uint8)
+
+    def show(self) -> None:
+        """Open the viewer window at the first call, refresh it at the next ones. Needs a display."""
+        if self._viewer is None:
+            import mujoco.viewer  # opens a display connection when imported, so only where one is wanted
+
+            self._viewer = mujoco.viewer.launch_passive(self._model, self._data)
+            self._viewer.cam.lookat[:] = self._view.lookat
+            self._viewer.cam.distance = self._view.distance
+            self._viewer.cam.azimuth = self._view.azimuth
+            self._viewer.cam.elevation = self._view.elevation
+        self._viewer.sync()
+
+    def close(self) -> None:
+        """Free the GL context and close the window."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
