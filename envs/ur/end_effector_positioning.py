@@ -1,0 +1,319 @@
+"""The end-effector positioning task of robo-gym, on the simulated arm."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlservo.envs.checks import (
+    ElementInfo,
+    EnvDescription,
+    InvalidResetError,
+    as_vector,
+    check_action,
+    check_option_names,
+)
+from rlservo.envs.rendering import RENDER_MODES, Camera
+from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
+from rlservo.envs.ur.simulation import URSimulation
+
+START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
+START_RANGE = (1.5, 0.25, 0.5, 1.0, 0.4, 3.14)  # [rad], +-, with randomize_start
+WRIST_1_RANGE = (-3.48, 0.31)  # [rad], with restrict_wrist_1
+SUCCESS_DISTANCE = 0.1  # [m]
+MAX_STEPS = 300
+RESET_OPTIONS = ("joint_positions", "ee_target_pose", "randomize_start", "continue_on_success")
+REDRAWS = 1000  # of a random start that collides; about one in ten does
+
+_LIMITS = np.array(POSITION_LIMITS)
+
+Observation = NDArray[np.float32]
+
+
+class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
+    """Bring the end effector of a UR arm to within 0.1 m of a target, without touching anything.
+
+    The task, spaces, units and rewards are those of robo-gym 2.0's `EndEffectorPositioningURSim-v0`, so that a policy
+    moves between the two unchanged. One step is one control cycle of 0.1 s.
+
+    ## Observation: Box(27,), float32
+
+    | index | name | unit | range |
+    |---|---|---|---|
+    | 0 | target_r: distance of the target from tool0 | m | 0 .. inf |
+    | 1 | target_theta: acos(z/r) in the tool0 frame | rad | 0 .. pi |
+    | 2 | target_phi: atan2(y, x) in the tool0 frame | rad | -pi .. pi |
+    | 3-8 | position of base, shoulder, elbow, wrist_1, wrist_2, wrist_3, divided by 2 pi (elbow: pi) | 1 | -1.1 .. 1.1 |
+    | 9-14 | velocity of the same joints | rad/s | unbounded |
+    | 15-17 | target x, y, z in base_link | m | unbounded |
+    | 18-20 | tool0 x, y, z in base_link | m | unbounded |
+    | 21-26 | the action before the last one, all six joints, fixed ones filled in; zeros at first | 1 | -1.01 .. 1.01 |
+
+    (Elements 21-26 lag one step, as in robo-gym: it composes the observation before it stores the action.)
+
+    ## Action: Box(5,), float32, -1 .. 1
+
+    Absolute joint positions, one element per joint that is not fixed, in the order above: `position / 2 pi`
+    (elbow: `/ pi`); with `restrict_wrist_1`, wrist_1 maps -1 .. 1 to -3.48 .. 0.31 rad instead. The arm moves towards
+    them in max(0.5 s, slowest joint's way / (scale * velocity limit)), and the next action replaces the motion 0.1 s
+    later. A fixed joint is commanded to its position at reset (`fix_wrist_1` together with `restrict_wrist_1` sends that
+    value through the restricted mapping, as robo-gym does: pass `restrict_wrist_1=False` with it).
+    An action outside the space raises `InvalidActionError` naming the element and the excess.
+
+    ## Reward
+
+    -0.005 * distance [m] each step; +2 instead when the distance is at most 0.1 m; -1 instead on collision.
+
+    ## Endings
+
+    | `info["final_status"]` | when | flag |
+    |---|---|---|
+    | success | distance at most 0.1 m, no collision | terminated |
+    | collision | a link touches the table, the ground or the arm itself | terminated |
+    | max_steps_exceeded | 300 steps | truncated |
+
+    The last step's info also holds `is_success` and `target_coord`.
+
+    ## Reset options
+
+    `joint_positions` (6 numbers, rad), `ee_target_pose` (6 numbers: x, y, z in base_link, orientation unused),
+    `randomize_start` (start joints drawn around the given ones, +- 1.5, 0.25, 0.5, 1.0, 0.4, 3.14 rad; a pose that
+    collides is redrawn), `continue_on_success` (start where the last episode ended, if it was a success).
+    Without options the arm starts at [0, -2.5, 1.5, -1.5, -1.4, 0] rad and the target is drawn uniformly from the
+    half ball of the arm's workspace radius, outside a vertical cylinder around its base.
+
+    ## Constructor
+
+    `ur_model` (ur3, ur3e, ur5, ur5e, ur10, ur10e, ur16e), `fix_base` ... `fix_wrist_3`, `restrict_wrist_1`,
+    `rs_state_to_info` (the robot server's `state_dict` in `info["rs_state"]`; False keeps info picklable for RLlib),
+    `render_mode`. Of our own: `randomize_start` (the default of the reset option), `max_velocity_scale_factor` (0.1) and
+    `action_cycle_rate` (10 Hz), which robo-gym has in its launch file. robo-gym's `ip`, `lower_bound_port`,
+    `upper_bound_port`, `gui` and `rs_address` are accepted and unused: there is no server to find.
+
+    ## Differences from robo-gym on Gazebo
+
+    The time limit truncates (robo-gym says done); success in the very last step counts as success. All randomness comes
+    from the environment's own seed. Resets are immediate, and a colliding start given by the caller is refused.
+    Gazebo's controller jitter and sensor delay are not modelled: a command takes effect within the cycle, exactly.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
+
+    def __init__(
+        self,
+        rs_address: str | None = None,
+        fix_base: bool = False,
+        fix_shoulder: bool = False,
+        fix_elbow: bool = False,
+        fix_wrist_1: bool = False,
+        fix_wrist_2: bool = False,
+        fix_wrist_3: bool = True,
+        ur_model: str = "ur5",
+        rs_state_to_info: bool = True,
+        restrict_wrist_1: bool = True,
+        *,
+        ip: str | None = None,
+        lower_bound_port: int | None = None,
+        upper_bound_port: int | None = None,
+        gui: bool = False,
+        randomize_start: bool = False,
+        max_velocity_scale_factor: float = 0.1,
+        action_cycle_rate: float = 10.0,
+        render_mode: str | None = None,
+    ) -> None:
+        del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
+        if gui and render_mode is None:
+            render_mode = "human"  # what robo-gym's `gui` shows
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(f"render_mode {render_mode!r} does not exist: expected one of {', '.join(RENDER_MODES)}")
+        fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
+        if all(fixed):
+            raise ValueError("all six joints are fixed: there is nothing left to act on")
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": action_cycle_rate}
+        self.simulation = URSimulation(
+            ur_model, max_velocity_scale=max_velocity_scale_factor, cycle_s=1.0 / action_cycle_rate
+        )
+        self._free = np.flatnonzero(~np.array(fixed))
+        self._fixed = np.flatnonzero(np.array(fixed))
+        self._restrict_wrist_1 = restrict_wrist_1
+        self._rs_state_to_info = rs_state_to_info
+        self._randomize_start = randomize_start
+        self._elements = self.describe(
+            fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3, action_cycle_rate
+        )["action"]
+
+        high = np.concatenate(
+            [np.full(3, np.inf), np.full(6, 1.1), np.full(6, np.inf), np.full(6, np.inf), np.full(6, 1.01)]
+        ).astype(np.float32)
+        self.observation_space = gym.spaces.Box(-high, high, dtype=np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (len(self._free),), dtype=np.float32)
+
+        self._camera = Camera(
+            self.simulation.model,
+            self.simulation.data,
+            lookat=(0.0, 0.05, 0.42),
+            distance=2.3,
+            azimuth=145.0,
+            elevation=-18.0,
+        )
+        self._start: NDArray[np.float64] = np.array(START_JOINTS)
+        self._target: NDArray[np.float64] = np.zeros(3)
+        self._previous_action: NDArray[np.float64] = np.zeros(6)
+        self._success_joints: NDArray[np.float64] | None = None
+        self._steps = 0
+
+    @classmethod
+    def describe(
+        cls,
+        fix_base: bool = False,
+        fix_shoulder: bool = False,
+        fix_elbow: bool = False,
+        fix_wrist_1: bool = False,
+        fix_wrist_2: bool = False,
+        fix_wrist_3: bool = True,
+        action_cycle_rate: float = 10.0,
+        **_unrelated: Any,
+    ) -> EnvDescription:
+        """Name the elements for the constructor arguments given, without building a simulator."""
+        fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
+        observation: list[ElementInfo] = [
+            {"name": "target_r", "unit": "m"},
+            {"name": "target_theta", "unit": "rad"},
+            {"name": "target_phi", "unit": "rad"},
+        ]
+        observation += [{"name": f"{joint}_position_normalized", "unit": "1"} for joint in JOINTS]
+        observation += [{"name": f"{joint}_velocity", "unit": "rad/s"} for joint in JOINTS]
+        observation += [{"name": f"target_{axis}", "unit": "m"} for axis in "xyz"]
+        observation += [{"name": f"ee_{axis}", "unit": "m"} for axis in "xyz"]
+        observation += [{"name": f"{joint}_previous_action", "unit": "1"} for joint in JOINTS]
+        action: list[ElementInfo] = [
+            {"name": f"{joint}_position_normalized", "unit": "1"}
+            for joint, is_fixed in zip(JOINTS, fixed, strict=True)
+            if not is_fixed
+        ]
+        return {"observation": observation, "action": action, "control_rate_hz": action_cycle_rate}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; the class's docstring lists the options."""
+        super().reset(seed=seed)
+        options = options or {}
+        check_option_names(options, RESET_OPTIONS)
+        self._steps = 0
+        self._previous_action = np.zeros(6)
+        self._start = self._place_arm(options)
+        pose = options.get("ee_target_pose")
+        self._target = self._random_target() if pose is None else as_vector("ee_target_pose", pose, 6)[:3]
+        self.simulation.place_target(self._target)
+        if self.render_mode == "human":
+            self._camera.show()
+        return self._observation(), {}
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Command joint positions, let 0.1 s pass, and judge the outcome."""
+        given = check_action(action, self.action_space, self._elements)
+        self._steps += 1
+        command = np.empty(6)  # normalised, all joints
+        command[self._free] = given
+        command[self._fixed] = (self._start / _LIMITS)[self._fixed]
+        self.simulation.command(self._to_joint_positions(command))
+        self.simulation.advance()
+
+        observation = self._observation()
+        self._previous_action = command  # after the observation: robo-gym's order, see the data sheet
+        reward, terminated, truncated, info = self._judge(float(observation[0]))
+        if self._rs_state_to_info:
+            info["rs_state"] = self.simulation.state()
+        if self.render_mode == "human":
+            self._camera.show()
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> Any:
+        """Return an (480, 640, 3) uint8 frame in mode rgb_array; the window of mode human refreshes by itself."""
+        return self._camera.frame() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Free the GL context and close the window."""
+        self._camera.close()
+
+    # -- a new episode
+
+    def _place_arm(self, options: dict[str, Any]) -> NDArray[np.float64]:
+        given = options.get("joint_positions")
+        centre = np.array(START_JOINTS) if given is None else as_vector("joint_positions", given, 6)
+        if options.get("continue_on_success") and self._success_joints is not None:
+            centre, randomize = self._success_joints, False
+        else:
+            randomize = bool(options.get("randomize_start", self._randomize_start))
+        for joint, position, limit in zip(JOINTS, centre, POSITION_LIMITS, strict=True):
+            if abs(position) > limit:
+                raise InvalidResetError(
+                    f"reset option 'joint_positions': {joint} is {position:g} rad, expected within +-{limit:g} rad"
+                )
+        if not randomize:
+            if self.simulation.place(centre):
+                links = " and ".join(self.simulation.contacts()[0])
+                raise InvalidResetError(f"the start joint positions collide: {links} touch")
+            return centre
+        for _ in range(REDRAWS):
+            drawn = self.np_random.uniform(centre - START_RANGE, centre + START_RANGE)
+            joints = np.clip(drawn, -_LIMITS, _LIMITS)
+            if not self.simulation.place(joints):
+                return joints
+        raise InvalidResetError(f"{REDRAWS} random starts around the given joint positions all collide")
+
+    def _random_target(self) -> NDArray[np.float64]:
+        arm = self.simulation.parameters
+        while True:
+            phi = self.np_random.uniform(0.0, 2.0 * math.pi)
+            cos_theta = self.np_random.uniform(0.0, 1.0)
+            radius = arm.workspace_radius * math.pow(self.np_random.uniform(0.0, 1.0), 1.0 / 3.0)
+            horizontal = radius * math.sqrt(1.0 - cos_theta * cos_theta)
+            if horizontal > arm.workspace_min_radius:
+                return np.array([horizontal * math.cos(phi), horizontal * math.sin(phi), radius * cos_theta])
+
+    # -- a step
+
+    def _to_joint_positions(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
+        positions = command * _LIMITS
+        if self._restrict_wrist_1:
+            low, high = WRIST_1_RANGE
+            positions[3] = low + (command[3] + 1.0) * 0.5 * (high - low)
+        return positions
+
+    def _observation(self) -> Observation:
+        sim = self.simulation
+        tool = sim.tool_position
+        x, y, z = ((self._target - tool) @ sim.tool_rotation).tolist()  # the target in the tool0 frame
+        r = math.sqrt(x * x + y * y + z * z)
+        theta = math.acos(max(-1.0, min(1.0, z / r))) if r > 0.0 else 0.0
+        observation = np.empty(27, dtype=np.float32)
+        observation[0:3] = r, theta, math.atan2(y, x)
+        observation[3:9] = sim.joint_positions / _LIMITS
+        observation[9:15] = sim.joint_velocities
+        observation[15:18] = self._target
+        observation[18:21] = tool
+        observation[21:27] = self._previous_action
+        return observation
+
+    def _judge(self, distance: float) -> tuple[float, bool, bool, dict[str, Any]]:
+        if self.simulation.in_collision:
+            return -1.0, True, False, self._ending("collision")
+        if distance <= SUCCESS_DISTANCE:
+            self._success_joints = self.simulation.joint_positions.copy()
+            return 2.0, True, False, self._ending("success")
+        reward = -0.005 * distance
+        if self._steps >= MAX_STEPS:
+            return reward, False, True, self._ending("max_steps_exceeded")
+        return reward, False, False, {}
+
+    def _ending(self, status: str) -> dict[str, Any]:
+        if status != "success":
+            self._success_joints = None
+        return {"final_status": status, "is_success": status == "success", "target_coord": self._target.copy()}

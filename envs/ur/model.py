@@ -1,0 +1,139 @@
+"""Builds the MuJoCo model of one arm on its table from the parameter table.
+
+Link frames are those of the ROS description (ur_description), so that `tool0` is where robo-gym's robot server reports
+the end effector. Each link is one or two capsules along the real housing's centre line.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+
+from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, TABLE_CENTRE, TABLE_SIZE, URParameters
+
+TIMESTEP = 0.005  # [s]
+BASE_HEIGHT = TABLE_CENTRE[2] + TABLE_SIZE[2] / 2  # [m], base_link above the world's ground
+
+# The joint servo. Stiffness follows the effort limit (a quarter of the limit at 1 degree off), damping makes the
+# stiffest link-side inertia of the joint well damped. Armature is the harmonic drive's reflected rotor inertia, of the
+# order MuJoCo Menagerie uses for the UR5e.
+STIFFNESS_PER_EFFORT = 14.0  # [1/rad]
+DAMPING_PER_STIFFNESS = 0.1  # [s]
+ARMATURE = 0.1  # [kg m^2]
+
+# Housing radii, measured on the UR5 [m]; the other arms' scale with their joint size.
+SHOULDER_RADIUS, UPPER_ARM_RADIUS, ELBOW_RADIUS, FOREARM_RADIUS, WRIST_RADIUS = 0.060, 0.054, 0.060, 0.040, 0.045
+
+
+def build_model(arm: URParameters) -> mujoco.MjModel:
+    """Return the compiled model: the arm standing on the table, a target marker, a floor.
+
+    Joints are named as in `JOINTS`; `tool0` is a site at wrist_3's origin. Each joint has two actuators that together
+    are one servo: `<joint>` integrates its control, a velocity [rad/s], into a position setpoint, `<joint>_velocity`
+    feeds the same velocity forward. Their sum, gravity compensation included, is limited to the joint's effort.
+    """
+    return mujoco.MjModel.from_xml_string(_document(arm))
+
+
+def _document(arm: URParameters) -> str:
+    s = arm.size
+    housing, cap = "0.78 0.79 0.81 1", "0.29 0.52 0.75 1"
+
+    def joint(index: int) -> str:
+        limit, effort = POSITION_LIMITS[index], arm.effort_limits[index]
+        return (
+            f'<joint name="{JOINTS[index]}" axis="0 0 1" range="{-limit} {limit}" armature="{ARMATURE}" '
+            f'actuatorfrcrange="{-effort} {effort}" actuatorgravcomp="true"/>'
+        )
+
+    def capsule(start: tuple[float, ...], end: tuple[float, ...], radius: float, mass: float, rgba: str) -> str:
+        points = " ".join(f"{x:.6f}" for x in (*start, *end))
+        return f'<geom class="link" fromto="{points}" size="{radius * s:.6f}" mass="{mass}" rgba="{rgba}"/>'
+
+    m = arm.masses
+    flange = 0.045 * s  # the last capsule's round end stops at the flange
+    return f"""
+<mujoco model="ur">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="{TIMESTEP}" integrator="implicitfast"/>
+  <visual>
+    <global offwidth="1280" offheight="960"/>
+    <headlight ambient="0.35 0.35 0.35" diffuse="0.45 0.45 0.45" specular="0.1 0.1 0.1"/>
+    <quality shadowsize="4096"/>
+  </visual>
+  <default>
+    <default class="link"><geom type="capsule" contype="1" conaffinity="3" friction="0.6"/></default>
+    <default class="scene"><geom contype="2" conaffinity="1" friction="0.8"/></default>
+    <default class="seen"><geom contype="0" conaffinity="0" mass="0"/></default>
+  </default>
+  <asset>
+    <texture name="sky" type="skybox" builtin="gradient" rgb1="0.93 0.95 0.97" rgb2="0.70 0.76 0.83" width="64"
+             height="384"/>
+    <texture name="tiles" type="2d" builtin="checker" rgb1="0.82 0.84 0.86" rgb2="0.76 0.78 0.81" width="256"
+             height="256"/>
+    <material name="floor" texture="tiles" texrepeat="8 8" texuniform="true" reflectance="0.05"/>
+  </asset>
+  <worldbody>
+    <light pos="1.2 -0.8 2.6" dir="-0.4 0.3 -1" diffuse="0.5 0.5 0.5" specular="0.1 0.1 0.1"/>
+    <geom class="scene" name="ground" type="plane" size="3 3 0.1" material="floor"/>
+    <geom class="scene" name="table" type="box" size="{TABLE_SIZE[0] / 2} {TABLE_SIZE[1] / 2} {TABLE_SIZE[2] / 2}"
+          pos="{TABLE_CENTRE[0]} {TABLE_CENTRE[1]} {TABLE_CENTRE[2]}" rgba="0.55 0.43 0.32 1"/>
+    <body name="target" mocap="true" pos="0 0 -1">
+      <geom class="seen" type="sphere" size="0.025" rgba="0.85 0.15 0.15 1"/>
+      <geom class="seen" type="sphere" size="0.1" rgba="0.85 0.15 0.15 0.15"/>
+    </body>
+    <body name="base_link" pos="0 0 {BASE_HEIGHT}">
+      <body name="base" euler="0 0 {math.pi}">
+        {capsule((0, 0, SHOULDER_RADIUS * s), (0, 0, arm.d1), SHOULDER_RADIUS, m[0], housing)}
+        <geom class="seen" type="cylinder" fromto="0 0 0 0 0 0.02" size="{0.075 * s}" rgba="0.3 0.31 0.33 1"/>
+        <body name="shoulder" pos="0 0 {arm.d1}" gravcomp="1">
+          {joint(0)}
+          {capsule((0, 0, 0), (0, -arm.shoulder_offset, 0), SHOULDER_RADIUS, m[1], cap)}
+          <body name="upper_arm" euler="{math.pi / 2} 0 0" gravcomp="1">
+            {joint(1)}
+            {capsule((0, 0, arm.shoulder_offset), (arm.a2, 0, arm.shoulder_offset), UPPER_ARM_RADIUS, m[2] * 0.8, housing)}
+            {capsule((arm.a2, 0, arm.elbow_offset), (arm.a2, 0, arm.shoulder_offset), ELBOW_RADIUS, m[2] * 0.2, cap)}
+            <body name="forearm" pos="{arm.a2} 0 0" gravcomp="1">
+              {joint(2)}
+              {capsule((0, 0, arm.elbow_offset), (arm.a3, 0, arm.elbow_offset), FOREARM_RADIUS, m[3], housing)}
+              <body name="wrist_1" pos="{arm.a3} 0 {arm.d4}" gravcomp="1">
+                {joint(3)}
+                {capsule((0, 0, arm.elbow_offset - arm.d4), (0, 0, 0), WRIST_RADIUS, m[4], cap)}
+                <body name="wrist_2" pos="0 {-arm.d5} 0" euler="{math.pi / 2} 0 0" gravcomp="1">
+                  {joint(4)}
+                  {capsule((0, 0, -arm.d5 / 2), (0, 0, 0), WRIST_RADIUS, m[5], housing)}
+                  <body name="wrist_3" pos="0 {arm.d6} 0" euler="{-math.pi / 2} 0 0" gravcomp="1">
+                    {joint(5)}
+                    {capsule((0, 0, -arm.d6), (0, 0, -flange), WRIST_RADIUS, m[6], cap)}
+                    <site name="tool0" size="0.01" rgba="0.1 0.6 0.2 1"/>
+                  </body>
+                </body>
+              </body>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <contact>
+    <!-- MuJoCo leaves out parent and child, but not where the parent is fixed to the world. -->
+    <exclude body1="base" body2="shoulder"/>
+    <exclude body1="base" body2="world"/>
+  </contact>
+  <actuator>
+    {_servos(arm)}
+  </actuator>
+</mujoco>
+"""
+
+
+def _servos(arm: URParameters) -> str:
+    lines = []
+    for name, limit, effort in zip(JOINTS, POSITION_LIMITS, arm.effort_limits, strict=True):
+        stiffness = STIFFNESS_PER_EFFORT * effort
+        lines.append(
+            f'<intvelocity name="{name}" joint="{name}" kp="{stiffness}" actrange="{-limit} {limit}"/>'
+            f'<velocity name="{name}_velocity" joint="{name}" kv="{DAMPING_PER_STIFFNESS * stiffness}"/>'
+        )
+    return "\n    ".join(lines)
