@@ -15,7 +15,7 @@ FOLDERS = ("envs", "export", "serve_app", "deploy")
 
 def main() -> None:
     typings = ROOT / "typings" / "rlservo"
-    shutil.rmtree(typings, ignore_errors=True)
+    shutil.rmtree(typings.parent, ignore_errors=True)
     typings.mkdir(parents=True)
     (typings / "__init__.pyi").write_text("")
     for folder in FOLDERS:
@@ -26,6 +26,11 @@ def main() -> None:
             names = path.with_suffix("").parts
             dotted = ".".join(names[:-1] if names[-1] == "__init__" else names)
             stub.write_text(f"from {dotted} import *\n")
+    # MuJoCo is compiled and ships no types: say that everything in it is Any.
+    for name in ("__init__", "viewer"):
+        stub = typings.parent / "mujoco" / f"{name}.pyi"
+        stub.parent.mkdir(exist_ok=True)
+        stub.write_text("from typing import Any\n\ndef __getattr__(name: str) -> Any: ...\n")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,11 @@ class ElementInfo(TypedDict):
     unit: str
 
 
+def element(name: str, unit: str) -> ElementInfo:
+    """Name one element."""
+    return {"name": name, "unit": unit}
+
+
 class EnvDescription(TypedDict):
     """What `Env.describe(**constructor_arguments)` returns without building the environment.
 

@@ -7,13 +7,14 @@ today's RLlib (new API stack), a progress line, and the inference phase.
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 # Said before Ray is imported, so that it holds for every process of the cluster that is started here.
 os.environ.setdefault("RAY_AUTH_MODE", "token")
@@ -85,9 +86,11 @@ def algorithm_config(task: Task, args: argparse.Namespace, cpus: int) -> Algorit
     config.framework("torch")
     config.env_runners(
         num_env_runners=max(2, cpus - 1),
-        num_cpus_per_env_runner=0.5 if cpus < 3 else 1,  # sampling and learning take turns, so they may share cores
+        # Sampling and learning take turns, so on a small machine they may share cores. (RLlib's annotations here are
+        # narrower than what it takes: a fraction of a core, and the connector's three-argument form.)
+        num_cpus_per_env_runner=cast(Any, 0.5 if cpus < 3 else 1),
         num_envs_per_env_runner=args.num_envs_per_env_runner,
-        env_to_module_connector=_mean_std_filter,
+        env_to_module_connector=cast(Any, _mean_std_filter),
     )
     config.learners(num_learners=0, num_gpus_per_learner=gpus)
     config.rl_module(
@@ -138,7 +141,7 @@ def train(task: Task, args: argparse.Namespace) -> Path:
     """Train until one of the stop criteria holds; return the folder of the best checkpoint (by mean return)."""
     # Checkpoints hold the two functions above. Pickled by value, they load where this file does not exist.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    ray.init(num_cpus=args.num_cpus or None, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    ray.init(num_cpus=args.num_cpus or None, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     try:
         cpus = int(ray.cluster_resources()["CPU"])
         config = algorithm_config(task, args, cpus)
@@ -148,7 +151,7 @@ def train(task: Task, args: argparse.Namespace) -> Path:
         )
         tuner = tune.Tuner(
             args.run,
-            param_space=config,
+            param_space=cast(Any, config),  # Tune takes an AlgorithmConfig, its annotation says dict
             run_config=tune.RunConfig(
                 name=f"{args.run}-{task.env_id.split('/')[-1]}",
                 storage_path=str(args.storage.resolve()),

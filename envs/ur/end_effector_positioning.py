@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.checks import (
-    ElementInfo,
     EnvDescription,
     InvalidResetError,
     as_vector,
     check_action,
     check_option_names,
+    element,
 )
 from rlservo.envs.rendering import RENDER_MODES, Camera
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
@@ -47,7 +47,7 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
     | 0 | target_r: distance of the target from tool0 | m | 0 .. inf |
     | 1 | target_theta: acos(z/r) in the tool0 frame | rad | 0 .. pi |
     | 2 | target_phi: atan2(y, x) in the tool0 frame | rad | -pi .. pi |
-    | 3-8 | position of base, shoulder, elbow, wrist_1, wrist_2, wrist_3, divided by 2 pi (elbow: pi) | 1 | -1.1 .. 1.1 |
+    | 3-8 | position of base, shoulder, elbow, wrist_1, wrist_2, wrist_3 over 2 pi (elbow: pi) | 1 | -1.1 .. 1.1 |
     | 9-14 | velocity of the same joints | rad/s | unbounded |
     | 15-17 | target x, y, z in base_link | m | unbounded |
     | 18-20 | tool0 x, y, z in base_link | m | unbounded |
@@ -60,8 +60,8 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
     Absolute joint positions, one element per joint that is not fixed, in the order above: `position / 2 pi`
     (elbow: `/ pi`); with `restrict_wrist_1`, wrist_1 maps -1 .. 1 to -3.48 .. 0.31 rad instead. The arm moves towards
     them in max(0.5 s, slowest joint's way / (scale * velocity limit)), and the next action replaces the motion 0.1 s
-    later. A fixed joint is commanded to its position at reset (`fix_wrist_1` together with `restrict_wrist_1` sends that
-    value through the restricted mapping, as robo-gym does: pass `restrict_wrist_1=False` with it).
+    later. A fixed joint is commanded to its position at reset (`fix_wrist_1` together with `restrict_wrist_1` sends
+    that value through the restricted mapping, as robo-gym does: pass `restrict_wrist_1=False` with it).
     An action outside the space raises `InvalidActionError` naming the element and the excess.
 
     ## Reward
@@ -90,8 +90,8 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
 
     `ur_model` (ur3, ur3e, ur5, ur5e, ur10, ur10e, ur16e), `fix_base` ... `fix_wrist_3`, `restrict_wrist_1`,
     `rs_state_to_info` (the robot server's `state_dict` in `info["rs_state"]`; False keeps info picklable for RLlib),
-    `render_mode`. Of our own: `randomize_start` (the default of the reset option), `max_velocity_scale_factor` (0.1) and
-    `action_cycle_rate` (10 Hz), which robo-gym has in its launch file. robo-gym's `ip`, `lower_bound_port`,
+    `render_mode`. Of our own: `randomize_start` (the default of the reset option), `max_velocity_scale_factor` (0.1)
+    and `action_cycle_rate` (10 Hz), which robo-gym has in its launch file. robo-gym's `ip`, `lower_bound_port`,
     `upper_bound_port`, `gui` and `rs_address` are accepted and unused: there is no server to find.
 
     ## Differences from robo-gym on Gazebo
@@ -101,7 +101,8 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
     Gazebo's controller jitter and sensor delay are not modelled: a command takes effect within the cycle, exactly.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
+    # Not a ClassVar: each instance states its own rate.
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
 
     def __init__(
         self,
@@ -151,7 +152,8 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
             [np.full(3, np.inf), np.full(6, 1.1), np.full(6, np.inf), np.full(6, np.inf), np.full(6, 1.01)]
         ).astype(np.float32)
         self.observation_space = gym.spaces.Box(-high, high, dtype=np.float32)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (len(self._free),), dtype=np.float32)
+        self._actions = gym.spaces.Box(-1.0, 1.0, (len(self._free),), dtype=np.float32)
+        self.action_space = self._actions
 
         self._camera = Camera(
             self.simulation.model,
@@ -181,21 +183,14 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
     ) -> EnvDescription:
         """Name the elements for the constructor arguments given, without building a simulator."""
         fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
-        observation: list[ElementInfo] = [
-            {"name": "target_r", "unit": "m"},
-            {"name": "target_theta", "unit": "rad"},
-            {"name": "target_phi", "unit": "rad"},
-        ]
-        observation += [{"name": f"{joint}_position_normalized", "unit": "1"} for joint in JOINTS]
-        observation += [{"name": f"{joint}_velocity", "unit": "rad/s"} for joint in JOINTS]
-        observation += [{"name": f"target_{axis}", "unit": "m"} for axis in "xyz"]
-        observation += [{"name": f"ee_{axis}", "unit": "m"} for axis in "xyz"]
-        observation += [{"name": f"{joint}_previous_action", "unit": "1"} for joint in JOINTS]
-        action: list[ElementInfo] = [
-            {"name": f"{joint}_position_normalized", "unit": "1"}
-            for joint, is_fixed in zip(JOINTS, fixed, strict=True)
-            if not is_fixed
-        ]
+        observation = [element("target_r", "m"), element("target_theta", "rad"), element("target_phi", "rad")]
+        observation += [element(f"{joint}_position_normalized", "1") for joint in JOINTS]
+        observation += [element(f"{joint}_velocity", "rad/s") for joint in JOINTS]
+        observation += [element(f"target_{axis}", "m") for axis in "xyz"]
+        observation += [element(f"ee_{axis}", "m") for axis in "xyz"]
+        observation += [element(f"{joint}_previous_action", "1") for joint in JOINTS]
+        free = [joint for joint, is_fixed in zip(JOINTS, fixed, strict=True) if not is_fixed]
+        action = [element(f"{joint}_position_normalized", "1") for joint in free]
         return {"observation": observation, "action": action, "control_rate_hz": action_cycle_rate}
 
     def reset(
@@ -217,7 +212,7 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Command joint positions, let 0.1 s pass, and judge the outcome."""
-        given = check_action(action, self.action_space, self._elements)
+        given = check_action(action, self._actions, self._elements)
         self._steps += 1
         command = np.empty(6)  # normalised, all joints
         command[self._free] = given
@@ -281,7 +276,7 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
     # -- a step
 
     def _to_joint_positions(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
-        positions = command * _LIMITS
+        positions: NDArray[np.float64] = command * _LIMITS
         if self._restrict_wrist_1:
             low, high = WRIST_1_RANGE
             positions[3] = low + (command[3] + 1.0) * 0.5 * (high - low)

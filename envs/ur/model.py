@@ -52,6 +52,7 @@ def _document(arm: URParameters) -> str:
         return f'<geom class="link" fromto="{points}" size="{radius * s:.6f}" mass="{mass}" rgba="{rgba}"/>'
 
     m = arm.masses
+    upper_arm_end = (arm.a2, 0.0, arm.shoulder_offset)
     flange = 0.045 * s  # the last capsule's round end stops at the flange
     return f"""
 <mujoco model="ur">
@@ -92,8 +93,8 @@ def _document(arm: URParameters) -> str:
           {capsule((0, 0, 0), (0, -arm.shoulder_offset, 0), SHOULDER_RADIUS, m[1], cap)}
           <body name="upper_arm" euler="{math.pi / 2} 0 0" gravcomp="1">
             {joint(1)}
-            {capsule((0, 0, arm.shoulder_offset), (arm.a2, 0, arm.shoulder_offset), UPPER_ARM_RADIUS, m[2] * 0.8, housing)}
-            {capsule((arm.a2, 0, arm.elbow_offset), (arm.a2, 0, arm.shoulder_offset), ELBOW_RADIUS, m[2] * 0.2, cap)}
+            {capsule((0, 0, arm.shoulder_offset), upper_arm_end, UPPER_ARM_RADIUS, m[2] * 0.8, housing)}
+            {capsule((arm.a2, 0, arm.elbow_offset), upper_arm_end, ELBOW_RADIUS, m[2] * 0.2, cap)}
             <body name="forearm" pos="{arm.a2} 0 0" gravcomp="1">
               {joint(2)}
               {capsule((0, 0, arm.elbow_offset), (arm.a3, 0, arm.elbow_offset), FOREARM_RADIUS, m[3], housing)}

@@ -1,0 +1,310 @@
+"""The UR positioning environment against robo-gym's contract."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from rlservo.envs.checks import InvalidActionError, InvalidResetError
+from rlservo.envs.ur.end_effector_positioning import EndEffectorPositioningURSim
+from rlservo.envs.ur.parameters import UR_PARAMETERS
+
+ENV_ID = "rlservo/EndEffectorPositioningURSim-v0"
+START = [0.0, -2.5, 1.5, -1.5, -1.4, 0.0]
+LIMITS = np.array([2 * math.pi, 2 * math.pi, math.pi, 2 * math.pi, 2 * math.pi, 2 * math.pi])
+
+
+def make(**arguments: Any) -> EndEffectorPositioningURSim:
+    env = gym.make(ENV_ID, **arguments).unwrapped
+    assert isinstance(env, EndEffectorPositioningURSim)
+    return env
+
+
+def hold_action(env: EndEffectorPositioningURSim) -> np.ndarray:
+    """The action that commands the arm to where it is."""
+    position = env.simulation.joint_positions
+    action = position / LIMITS
+    action[3] = 2 * (position[3] + 3.48) / (0.31 + 3.48) - 1
+    return action[:5].astype(np.float32)
+
+
+def test_gym_make_finds_it_in_a_fresh_process_without_an_import() -> None:
+    code = f"import gymnasium as gym; env = gym.make({ENV_ID!r}); env.reset(seed=0); print(env.spec.id)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == ENV_ID, done.stderr
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space (minimum|maximum) value is:UserWarning")
+@pytest.mark.parametrize("ur_model", list(UR_PARAMETERS))
+def test_gymnasium_check_env_passes(ur_model: str) -> None:
+    # The contract's bounds are infinite where robo-gym's are; nothing else may be warned of.
+    check_env(make(ur_model=ur_model), skip_render_check=True)
+
+
+def test_spaces_are_robo_gyms() -> None:
+    env = make()
+    high = [math.inf] * 3 + [1.1] * 6 + [math.inf] * 12 + [1.01] * 6
+    assert env.observation_space.shape == (27,)
+    assert env.observation_space.dtype == np.float32
+    assert env.observation_space.high.tolist() == pytest.approx(high)
+    assert env.observation_space.low.tolist() == pytest.approx([-h for h in high])
+    assert env.action_space == gym.spaces.Box(-1.0, 1.0, (5,), np.float32)
+    assert make(fix_wrist_3=False).action_space.shape == (6,)
+    assert make(fix_base=True, fix_elbow=True).action_space.shape == (3,)
+
+
+def test_first_observation_is_composed_as_in_the_contract() -> None:
+    env = make()
+    target = [0.3, -0.4, 0.5]
+    observation, info = env.reset(seed=1, options={"ee_target_pose": [*target, 0.0, 0.0, 0.0]})
+    assert info == {}
+    assert observation[3:9] == pytest.approx((np.array(START) / LIMITS).tolist(), abs=1e-6)
+    assert observation[9:15] == pytest.approx([0.0] * 6, abs=1e-6)
+    assert observation[15:18] == pytest.approx(target)
+    tool = observation[18:21]
+    assert observation[0] == pytest.approx(float(np.linalg.norm(np.array(target) - tool)), rel=1e-5)
+    local = env.simulation.tool_rotation.T @ (np.array(target) - env.simulation.tool_position)
+    assert observation[1] == pytest.approx(math.acos(local[2] / np.linalg.norm(local)), rel=1e-5)
+    assert observation[2] == pytest.approx(math.atan2(local[1], local[0]), rel=1e-5)
+    assert observation[21:27].tolist() == [0.0] * 6
+
+
+def test_previous_action_lags_one_step_and_holds_the_fixed_joint() -> None:
+    env = make()
+    env.reset(seed=1, options={"joint_positions": [*START[:5], 0.5], "ee_target_pose": [0.5, 0.5, 0.2, 0, 0, 0]})
+    first, second = hold_action(env), hold_action(env) + np.float32(0.001)
+    observation, *_ = env.step(first)
+    assert observation[21:27].tolist() == [0.0] * 6
+    observation, *_ = env.step(second)
+    assert observation[21:27] == pytest.approx([*first, 0.5 / (2 * math.pi)], abs=1e-6)
+
+
+def test_action_is_absolute_joint_positions_and_wrist_1_is_restricted() -> None:
+    env = make(max_velocity_scale_factor=1.0)
+    env.reset(seed=1, options={"ee_target_pose": [0.5, 0.5, 0.2, 0, 0, 0]})
+    goal = np.array(START) + [0.3, 0.2, -0.2, 0.4, 0.3, 0.0]
+    action = goal / LIMITS
+    action[3] = 2 * (goal[3] + 3.48) / (0.31 + 3.48) - 1
+    for _ in range(30):
+        env.step(action[:5])
+    assert env.simulation.joint_positions == pytest.approx(goal.tolist(), abs=2e-3)
+
+
+def test_unrestricted_wrist_1_uses_its_whole_range() -> None:
+    env = make(max_velocity_scale_factor=1.0, restrict_wrist_1=False)
+    env.reset(seed=1, options={"ee_target_pose": [0.5, 0.5, 0.2, 0, 0, 0]})
+    action = (np.array(START) / LIMITS)[:5]
+    action[3] = -0.3
+    for _ in range(30):
+        env.step(action)
+    assert env.simulation.joint_positions[3] == pytest.approx(-0.3 * 2 * math.pi, abs=2e-3)
+
+
+def test_velocity_scale_limits_the_joints() -> None:
+    env = make()
+    env.reset(seed=1, options={"ee_target_pose": [0.5, 0.5, 0.2, 0, 0, 0]})
+    action = hold_action(env)
+    action[0] = 1.0
+    for _ in range(10):
+        observation, *_ = env.step(action)
+        assert abs(observation[9]) <= 0.1 * math.pi * 1.05
+    assert env.simulation.joint_positions[0] == pytest.approx(0.1 * math.pi, rel=0.1)  # one second at 0.314 rad/s
+
+
+def test_step_reward_is_the_distance_penalty() -> None:
+    env = make()
+    env.reset(seed=1, options={"ee_target_pose": [0.5, 0.5, 0.2, 0, 0, 0]})
+    observation, reward, terminated, truncated, _ = env.step(hold_action(env))
+    assert reward == pytest.approx(-0.005 * float(observation[0]))
+    assert not terminated
+    assert not truncated
+
+
+def test_reaching_the_target_is_success() -> None:
+    env = make()
+    env.reset(seed=1)
+    near = env.simulation.tool_position + [0.05, 0.0, 0.05]
+    env.reset(seed=1, options={"ee_target_pose": [*near, 0, 0, 0]})
+    _, reward, terminated, truncated, info = env.step(hold_action(env))
+    assert (reward, terminated, truncated) == (2.0, True, False)
+    assert info["final_status"] == "success"
+    assert info["is_success"] is True
+    assert info["target_coord"] == pytest.approx(near)
+
+
+def test_the_threshold_is_a_tenth_of_a_metre() -> None:
+    env = make()
+    env.reset(seed=1)
+    tool = env.simulation.tool_position
+    for distance, expected in ((0.0999, True), (0.1001, False)):
+        env.reset(options={"ee_target_pose": [tool[0], tool[1], tool[2] + distance, 0, 0, 0]})
+        assert env.step(hold_action(env))[2] is expected
+
+
+def test_collision_ends_the_episode_even_at_the_target() -> None:
+    env = make(max_velocity_scale_factor=1.0)
+    env.reset(seed=1, options={"ee_target_pose": [0.0, 0.0, 3.0, 0, 0, 0]})
+    action = hold_action(env)
+    action[1] = 0.2  # the shoulder past the horizontal: the upper arm meets the table
+    for _ in range(60):
+        _, reward, terminated, truncated, info = env.step(action)
+        if terminated:
+            break
+    assert (reward, terminated, truncated) == (-1.0, True, False)
+    assert info["final_status"] == "collision"
+    assert info["is_success"] is False
+
+
+def test_three_hundred_steps_truncate() -> None:
+    env = make(rs_state_to_info=False)
+    env.reset(seed=1, options={"ee_target_pose": [0.5, 0.5, 0.2, 0, 0, 0]})
+    action = hold_action(env)
+    for step in range(1, 301):
+        _, reward, terminated, truncated, info = env.step(action)
+        assert truncated is (step == 300)
+        assert not terminated
+    assert info["final_status"] == "max_steps_exceeded"
+    assert reward < 0
+
+
+@pytest.mark.parametrize("ur_model", list(UR_PARAMETERS))
+def test_random_targets_fill_the_workspace(ur_model: str) -> None:
+    env = make(ur_model=ur_model)
+    arm = UR_PARAMETERS[ur_model]
+    targets = np.array([env.reset(seed=seed)[0][15:18] for seed in range(300)])
+    radius = np.linalg.norm(targets, axis=1)
+    assert radius.max() <= arm.workspace_radius + 1e-6
+    assert np.linalg.norm(targets[:, :2], axis=1).min() > arm.workspace_min_radius - 1e-6
+    assert targets[:, 2].min() >= 0.0
+    assert np.median(radius) > 0.75 * arm.workspace_radius  # uniform in volume: most lie far out
+    assert {(x > 0, y > 0) for x, y, _ in targets.tolist()} == {(a, b) for a in (True, False) for b in (True, False)}
+
+
+def test_randomised_starts_stay_in_range_and_never_collide() -> None:
+    env = make()
+    spread = np.array([1.5, 0.25, 0.5, 1.0, 0.4, 3.14])
+    starts = []
+    for seed in range(200):
+        observation, _ = env.reset(seed=seed, options={"randomize_start": True})
+        assert not env.simulation.in_collision
+        starts.append(observation[3:9] * LIMITS)
+    offsets = np.array(starts) - START
+    assert (np.abs(offsets) <= spread + 1e-5).all()
+    assert (np.abs(offsets).max(axis=0) > 0.8 * spread).all()
+
+
+def test_continue_on_success_starts_where_the_last_success_ended() -> None:
+    env = make()
+    env.reset(seed=1)
+    near = env.simulation.tool_position + [0.05, 0.0, 0.05]
+    env.reset(options={"ee_target_pose": [*near, 0, 0, 0]})
+    action = hold_action(env)
+    action[0] += 0.05
+    assert env.step(action)[4]["final_status"] == "success"
+    ended = env.simulation.joint_positions.copy()
+    env.reset(options={"continue_on_success": True})
+    assert env.simulation.joint_positions == pytest.approx(ended)
+    env.reset(options={})
+    assert env.simulation.joint_positions == pytest.approx(START)
+
+
+def test_same_seed_gives_the_same_episode_to_the_bit() -> None:
+    def episode(env: EndEffectorPositioningURSim) -> list[np.ndarray]:
+        observation, _ = env.reset(seed=7, options={"randomize_start": True})
+        rng = np.random.default_rng(7)
+        seen = [observation]
+        for _ in range(100):
+            observation, reward, terminated, _, _ = env.step(rng.uniform(-1, 1, 5).astype(np.float32))
+            seen += [observation, np.array([reward])]
+            if terminated:
+                break
+        return seen
+
+    env = make()
+    first, again, other = episode(env), episode(env), episode(make())
+    for a, b, c in zip(first, again, other, strict=True):
+        assert a.tobytes() == b.tobytes() == c.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("action", "sentence"),
+    [
+        ([0, 0, 0, 0, 1.5], r"action element 4 \(wrist_2_position_normalized\) is 1.5, 0.5 above its range \[-1, 1\]"),
+        ([0, -1.25, 0, 0, 0], r"element 1 \(shoulder_position_normalized\) is -1.25, 0.25 below"),
+        ([0, 0, float("nan"), 0, 0], r"element 2 \(elbow_position_normalized\) is nan: expected a finite number"),
+        ([0, 0, 0], r"shape \(3,\), expected \(5,\): base_position_normalized, shoulder"),
+        ("left", r"not an array of numbers"),
+    ],
+)
+def test_out_of_space_action_says_which_element_and_by_how_much(action: Any, sentence: str) -> None:
+    env = make()
+    env.reset(seed=1)
+    with pytest.raises(InvalidActionError, match=sentence):
+        env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"joint_position": START}, r"'joint_position' does not exist: expected one of joint_positions, ee_target"),
+        ({"joint_positions": [0.0] * 5}, r"shape \(5,\), expected \(6,\)"),
+        ({"joint_positions": [0, 0, 4.0, 0, 0, 0]}, r"elbow is 4 rad, expected within \+-3.14159 rad"),
+        ({"joint_positions": [0, 0.3, 0, 0, 0, 0]}, r"start joint positions collide: .* touch"),
+        ({"ee_target_pose": [math.nan] * 6}, r"element 0 is not finite"),
+    ],
+)
+def test_impossible_reset_options_are_refused(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InvalidResetError, match=sentence):
+        make().reset(seed=1, options=options)
+
+
+def test_description_names_every_element_of_the_spaces() -> None:
+    for arguments in ({}, {"fix_wrist_3": False}, {"fix_base": True, "ur_model": "ur10e"}):
+        env = make(**arguments)
+        description = EndEffectorPositioningURSim.describe(**arguments)
+        assert len(description["observation"]) == env.observation_space.shape[0]
+        assert len(description["action"]) == env.action_space.shape[0]
+        assert len({element["name"] for element in description["observation"]}) == 27
+        assert description["control_rate_hz"] == 10.0
+
+
+def test_robo_gyms_constructor_arguments_are_accepted_and_others_refused() -> None:
+    env = make(ip="127.0.0.1", lower_bound_port=50100, upper_bound_port=50200, gui=False, rs_address="127.0.0.1:1")
+    assert env.action_space.shape == (5,)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'ur_modell'"):
+        make(ur_modell="ur5")
+    with pytest.raises(ValueError, match="all six joints are fixed"):
+        make(fix_base=True, fix_shoulder=True, fix_elbow=True, fix_wrist_1=True, fix_wrist_2=True)
+
+
+def test_robot_server_state_is_in_info_only_when_asked_for() -> None:
+    env = make()
+    env.reset(seed=1)
+    info = env.step(hold_action(env))[4]
+    assert len(info["rs_state"]) == 27
+    quiet = make(rs_state_to_info=False)
+    quiet.reset(seed=1)
+    assert "rs_state" not in quiet.step(hold_action(quiet))[4]
+
+
+def test_rllib_env_runner_samples_it_with_every_check_on() -> None:
+    # RLlib has no single-agent pre-check of its own any more: its env runner builds the environment with Gymnasium's
+    # passive checker on, whose findings are warnings, and warnings are errors here.
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+
+    config = PPOConfig().environment(ENV_ID, env_config={"rs_state_to_info": False})
+    runner = SingleAgentEnvRunner(config=config.env_runners(num_envs_per_env_runner=2))
+    try:
+        episodes = runner.sample(num_timesteps=40)
+        assert sum(len(episode) for episode in episodes) >= 40
+        assert episodes[0].get_observations(0).dtype == np.float32
+    finally:
+        runner.stop()
