@@ -40,6 +40,7 @@ class Task:
     stop_timesteps: int
     stop_reward: float
     gamma: float
+    inference_config: dict[str, Any] = field(default_factory=dict)  # the environment's, for the episodes afterwards
     training: dict[str, Any] = field(default_factory=dict)
 
 
@@ -180,3 +181,36 @@ def train(task: Task, args: argparse.Namespace) -> Path:
         return Path(checkpoint.path)
     finally:
         ray.shutdown()
+
+
+def infer(task: Task, args: argparse.Namespace, checkpoint: Path) -> None:
+    """Export the checkpoint and run episodes with the bundle, which acts as RLlib would: that is what export proves."""
+    from rich.console import Console
+
+    from rlservo.export.exporter import export_checkpoint
+    from rlservo.serve_app.policy import Policy
+    from rlservo.serve_app.rollout import rollout
+    from rlservo.serve_app.rollout_report import render_report
+
+    exported = export_checkpoint(checkpoint, args.storage / "policies", notify=print)
+    print(f"bundle: {exported.path}")
+    with Policy.load(exported.path) as policy:
+        report = rollout(
+            policy,
+            task.env_id,
+            episodes=args.num_episodes_during_inference,
+            seed=10_000,
+            explore=args.explore_during_inference,
+            env_kwargs=task.inference_config,
+        )
+    Console().print(render_report(report))
+
+
+def run(task: Task, parser: argparse.ArgumentParser) -> None:
+    """Parse the command line, train, and run inference episodes with the best checkpoint."""
+    args = parser.parse_args()
+    check_arguments(parser, args)
+    checkpoint = train(task, args)
+    print(f"best checkpoint: {checkpoint}")
+    if args.num_episodes_during_inference:
+        infer(task, args, checkpoint)

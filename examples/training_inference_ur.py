@@ -1,21 +1,22 @@
 """Train UR5 end-effector positioning with RLlib, then run episodes with the result.
 
-    python examples/training_inference_ur.py --stop-timesteps 3000000
+    python examples/training_inference_ur.py
 
-The arm starts anywhere around its start pose and moves at robo-gym's speed, a tenth of its joint velocity limits.
+It trains from starts drawn around the start pose, at robo-gym's speed (a tenth of the joint velocity limits); the
+inference episodes start at the start pose itself.
 The policy that ships in examples/checkpoints/ur5_positioning was made by this script; its README has the command.
 """
 
 from __future__ import annotations
 
-from training_inference import Task, argument_parser, check_arguments, train
+from training_inference import Task, argument_parser, run
 
 TASK = Task(
     env_id="rlservo/EndEffectorPositioningURSim-v0",
     # rs_state_to_info=False: robo-gym's own advice for RLlib, whose episodes would carry that dictionary along.
     env_config={"ur_model": "ur5", "rs_state_to_info": False, "randomize_start": True},
-    stop_timesteps=6_000_000,
-    stop_reward=1.95,
+    stop_timesteps=2_621_440,
+    stop_reward=2.0,
     gamma=0.99,
     training={
         "lr": [[0, 3e-4], [6_000_000, 5e-5]],
@@ -31,11 +32,7 @@ TASK = Task(
 
 
 def main() -> None:
-    parser = argument_parser(TASK, "Train UR5 end-effector positioning, then run episodes with the result.")
-    args = parser.parse_args()
-    check_arguments(parser, args)
-    checkpoint = train(TASK, args)
-    print(f"best checkpoint: {checkpoint}")
+    run(TASK, argument_parser(TASK, "Train UR5 end-effector positioning, then run episodes with the result."))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,38 @@
+# Each target does its own set-up on a fresh machine: a virtual environment in .venv with everything installed.
+VENV ?= .venv
+PYTHON ?= python3
+BIN := $(VENV)/bin
+FOLDERS := envs export serve_app deploy examples benchmarks
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test check bench wheel setup clean
+
+demo: setup  ## Export the two shipped checkpoints, serve them, drive both simulators; a table and a picture in demo/
+	$(BIN)/rlservo demo --out demo
+
+test: setup  ## All tests
+	$(BIN)/python -m pytest
+
+check: setup  ## Lint, format and types, as CI runs them
+	$(BIN)/python .ci/alias_stubs.py
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/pyright
+
+bench: setup  ## Simulator and serving speed, printed and written to bench/
+	$(BIN)/python benchmarks/simulators.py
+	$(BIN)/python benchmarks/serving.py
+
+wheel: setup  ## Build the wheel into dist/
+	$(BIN)/python -m build --wheel --outdir dist .
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt setup.py envs/rlservo-gymnasium.pth
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[all]'
+	touch $(STAMP)
+
+clean:  ## Remove what the other targets made, .venv included
+	rm -rf $(VENV) typings demo bench build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,298 @@
+"""The command line `rlservo`: composes the folders, owns nothing. Each command's work is done where it belongs.
+
+Heavy libraries are imported by the command that needs them, so that `rlservo inspect` works on a robot without Ray.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import Enum
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import click
+import typer
+from rich.console import Console
+
+from rlservo.export.errors import RlservoError, UsageError
+
+app = typer.Typer(
+    name="rlservo",
+    help="From a Ray RLlib checkpoint to a robot in the loop: export it, prove it, serve it, drive with it.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+_out = Console()
+_err = Console(stderr=True)
+
+
+class Rate(str, Enum):
+    """How fast the loop runs."""
+
+    real = "real"
+    max = "max"
+
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document for programs.")]
+
+
+def main() -> None:
+    """Run the command line: exit code 0 only on success, one sentence and no traceback on an error."""
+    try:
+        code = app(standalone_mode=False)
+    except RlservoError as error:
+        _err.print(f"rlservo: {error.message}", style="red", markup=False, highlight=False, soft_wrap=True)
+        raise SystemExit(2 if isinstance(error, UsageError) else 1) from None
+    except click.ClickException as error:
+        error.show()
+        raise SystemExit(error.exit_code) from None
+    except (click.Abort, KeyboardInterrupt):
+        _err.print("rlservo: interrupted", style="red")
+        raise SystemExit(130) from None
+    except BrokenPipeError:  # the reader of our output went away, as in `rlservo inspect ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+    raise SystemExit(code if isinstance(code, int) else 0)
+
+
+@contextmanager
+def _extra(name: str) -> Iterator[None]:
+    """Say which extra to install when an import inside fails."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("rlservo"):
+            raise
+        raise UsageError(
+            f"this command needs the Python package {error.name!r}: pip install 'rlservo[{name}]'"
+        ) from error
+
+
+def _print_json(document: Any) -> None:
+    print(json.dumps(document, indent=2))
+
+
+@app.callback(invoke_without_command=True)
+def _root(show_version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+    if show_version:
+        print(f"rlservo {version('rlservo')}")
+        raise typer.Exit
+
+
+@app.command()
+def export(
+    checkpoint: Annotated[Path, typer.Argument(help="RLlib checkpoint folder (or a Tune trial folder: its newest).")],
+    out: Annotated[Path, typer.Option(help="Repository folder; the bundle goes to OUT/<name>/<version>/.")],
+    name: Annotated[str | None, typer.Option(help="Policy name; the environment's by default.")] = None,
+    version: Annotated[str | None, typer.Option(help="Integer or x.y.z; the next integer by default.")] = None,
+    description: Annotated[str, typer.Option(help="A sentence for people, kept in the contract.")] = "",
+    module_id: Annotated[str | None, typer.Option(help="Which RLModule; needed when there are several.")] = None,
+    app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+    as_json: Json = False,
+) -> None:
+    """Turn an RLlib checkpoint into a policy bundle, proven equal to RLlib's own actions, or write nothing.
+
+    Example: `rlservo export examples/checkpoints/ur5_positioning --out policies`
+    """
+    with _extra("train"):
+        from rlservo.export.exporter import export_checkpoint
+        from rlservo.export.report import contract_report
+
+    def notify(line: str) -> None:
+        _err.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+
+    result = export_checkpoint(
+        checkpoint,
+        out,
+        name=name,
+        version=version,
+        description=description,
+        module_id=module_id,
+        app_dir=app_dir,
+        notify=notify,
+    )
+    if as_json:
+        _print_json({"path": str(result.path), "contract": result.contract.model_dump(mode="json")})
+    else:
+        _out.print(contract_report(result.contract))
+        _out.print(f"written: {result.path}", markup=False, highlight=False, soft_wrap=True)
+
+
+@app.command()
+def inspect(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
+    as_json: Json = False,
+) -> None:
+    """Show a bundle's contract: what goes in, what comes out, what is baked in, how it was proven.
+
+    Example: `rlservo inspect policies/ur5`
+    """
+    from rlservo.export.bundle import load_bundle
+    from rlservo.export.report import contract_report
+
+    loaded = load_bundle(bundle)
+    if as_json:
+        _print_json(loaded.contract.model_dump(mode="json"))
+    else:
+        _out.print(contract_report(loaded.contract))
+        _out.print(f"{loaded.path}: all hashes match", markup=False, highlight=False, soft_wrap=True)
+
+
+@app.command()
+def verify(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
+    checkpoint: Annotated[Path, typer.Option(help="The RLlib checkpoint to compare with.")],
+    env: Annotated[str | None, typer.Option(help="Environment id for a closed-loop comparison.")] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes of the closed loop.")] = 20,
+    seed: Annotated[int, typer.Option(help="Seed of the first episode.")] = 0,
+    app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+    as_json: Json = False,
+) -> None:
+    """Prove a bundle against its checkpoint again; with --env also in closed loop, written into the contract.
+
+    Example: `rlservo verify policies/ur5 --checkpoint runs/best --env rlservo/EndEffectorPositioningURSim-v0`
+    """
+    with _extra("train"):
+        from rlservo.export.report import verification_report
+        from rlservo.export.verify import verify_bundle
+
+    def notify(line: str) -> None:
+        _err.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+
+    result = verify_bundle(
+        bundle, checkpoint, env_id=env, episodes=episodes, first_seed=seed, app_dir=app_dir, notify=notify
+    )
+    if as_json:
+        _print_json(result.as_dict())
+    else:
+        _out.print(verification_report(result))
+
+
+@app.command()
+def serve(
+    directories: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Bundles, policy folders or repositories.")
+    ],
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
+    replicas: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
+) -> None:
+    """Serve policies over HTTP with Ray Serve until Ctrl-C; nothing is left running afterwards.
+
+    Example: `rlservo serve policies`, then
+    `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`
+    """
+    with _extra("serve"):
+        from rlservo.serve_app.launcher import serve_policies
+
+    def ready(url: str) -> None:
+        _out.print(f"ready: {url}/v1/policies   documentation: {url}/docs   Ctrl-C stops", highlight=False)
+
+    _err.print("starting Ray Serve ...", style="dim")
+    serve_policies(directories, host=host, port=port, replicas=replicas, on_ready=ready)
+
+
+@app.command()
+def rollout(
+    env: Annotated[str, typer.Argument(help="Gymnasium environment id.")],
+    url: Annotated[str | None, typer.Option(help="Server to ask for actions.")] = None,
+    policy: Annotated[str | None, typer.Option(help="Policy name on that server; its only one by default.")] = None,
+    bundle: Annotated[Path | None, typer.Option(help="Act in process with this bundle instead of a server.")] = None,
+    episodes: Annotated[int, typer.Option(min=1)] = 10,
+    seed: Annotated[int | None, typer.Option(help="Episode i is reset with seed + i.")] = None,
+    rate: Annotated[Rate, typer.Option(help="real: at the control rate, as on a robot; max: as fast as it goes.")] = (
+        Rate.max
+    ),
+    explore: Annotated[bool, typer.Option("--explore", help="Sample actions instead of taking the mode.")] = False,
+    env_arg: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
+    ] = None,
+    video: Annotated[Path | None, typer.Option(help="Write the first episode to this .mp4 file.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Drive an environment with a policy and report success, return, latency and deadline misses.
+
+    Example: `rlservo rollout rlservo/EndEffectorPositioningURSim-v0 --url http://127.0.0.1:8000 --policy ur5`
+    """
+    if (url is None) == (bundle is None):
+        raise UsageError("give either --url (a server) or --bundle (in process)")
+    if video is not None:
+        choose_gl_backend()
+    with _extra("client,sim"):
+        from rlservo.serve_app.client import PolicyClient
+        from rlservo.serve_app.policy import Policy
+        from rlservo.serve_app.rollout import rollout as run_rollout
+        from rlservo.serve_app.rollout_report import render_report
+
+    with Policy.load(bundle) if bundle is not None else PolicyClient(str(url), policy) as acting:
+        report = run_rollout(
+            acting,
+            env,
+            episodes=episodes,
+            seed=seed,
+            rate=rate.value,
+            explore=explore,
+            env_kwargs=parse_env_arguments(env_arg or []),
+            video=video,
+        )
+    if as_json:
+        _print_json(report.as_dict())
+    else:
+        _out.print(render_report(report))
+    if report.interrupted:
+        raise typer.Exit(130)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the bundles and the picture; made anew.")] = Path("demo"),
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes per robot.")] = 20,
+    checkpoints: Annotated[Path, typer.Option(help="Folder of the shipped checkpoints.")] = Path(
+        "examples/checkpoints"
+    ),
+) -> None:
+    """Export the two shipped checkpoints, serve them, drive both simulators, and show the result.
+
+    Example: `rlservo demo` in the checkout (`make demo` installs everything first)
+    """
+    choose_gl_backend()
+    with _extra("all"):
+        from rlservo.deploy.demo import run_demo
+
+    run_demo(out, checkpoints=checkpoints, episodes=episodes, console=_out)
+
+
+def parse_env_arguments(pairs: list[str]) -> dict[str, Any]:
+    """Parse NAME=VALUE pairs; a value that is not JSON is a string."""
+    arguments: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or not name.isidentifier():
+            raise UsageError(f"--env-arg {pair!r}: expected NAME=VALUE, for example ur_model=ur10e")
+        try:
+            arguments[name] = json.loads(value)
+        except json.JSONDecodeError:
+            arguments[name] = value
+    return arguments
+
+
+def choose_gl_backend() -> None:
+    """Let MuJoCo render off screen where there is no display. It must be said before mujoco is imported."""
+    if "MUJOCO_GL" in os.environ or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        return
+    for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
+        if ctypes.util.find_library(library):
+            os.environ["MUJOCO_GL"] = backend
+            return
+
+
+if __name__ == "__main__":
+    main()

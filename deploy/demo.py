@@ -1,0 +1,217 @@
+"""The whole path in one command: export two checkpoints, serve them, drive two robots, show what happened.
+
+Exporting and serving run as the very commands a user would type, in processes of their own; the loop runs here.
+"""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from typing_extensions import Self
+
+from rlservo.deploy.demo_picture import Robot, RobotRun, Trace, draw_picture, film
+from rlservo.export.bundle import Contract
+from rlservo.export.errors import RlservoError, UnavailableError, UsageError
+from rlservo.serve_app.acting import Observation
+from rlservo.serve_app.client import PolicyClient
+from rlservo.serve_app.rollout import rollout
+
+FIRST_SEED = 10_000  # not among the seeds the policies were trained with
+START_TIMEOUT_S = 120.0
+STOP_TIMEOUT_S = 30.0
+
+
+ROBOTS = (
+    Robot(
+        policy="ur5",
+        checkpoint="ur5_positioning",
+        env_id="rlservo/EndEffectorPositioningURSim-v0",
+        title="UR5 reaches a random target",
+        success_distance_m=0.1,
+    ),
+    Robot(
+        policy="mir100",
+        checkpoint="mir100_navigation",
+        env_id="rlservo/NoObstacleNavigationMir100Sim-v0",
+        title="MiR100 drives to a random target",
+        success_distance_m=0.2,
+    ),
+)
+
+
+def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -> None:
+    """Run the demo and leave bundles, `demo.png` and the server's log in `out`.
+
+    Raises UsageError when the checkpoints are not there, RlservoError when a step fails; the server is always stopped.
+    """
+    for robot in ROBOTS:
+        if not (checkpoints / robot.checkpoint).is_dir():
+            raise UsageError(
+                f"{checkpoints / robot.checkpoint} does not exist: run this in a checkout of rlservo, or name the "
+                "folder of its example checkpoints with --checkpoints"
+            )
+    repository = out / "policies"
+    shutil.rmtree(repository, ignore_errors=True)  # the only thing here that an earlier run would get in the way of
+    out.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic()
+
+    console.rule("1  export: RLlib checkpoint to policy bundle")
+    for robot in ROBOTS:
+        _command(
+            console, "export", str(checkpoints / robot.checkpoint), "--out", str(repository), "--name", robot.policy
+        )
+
+    console.rule("2  serve: both policies on one Ray Serve endpoint")
+    runs: list[RobotRun] = []
+    with _server(console, repository, out / "server.log") as url:
+        console.rule(f"3  drive: {episodes} episodes each, every action over HTTP")
+        for robot in ROBOTS:
+            _show(console, "rollout", robot.env_id, "--url", url, "--policy", robot.policy, "--episodes", str(episodes))
+            with PolicyClient(url, robot.policy) as policy, console.status("driving ..."):
+                traces: list[Trace] = []
+                report = rollout(_Recorder(policy, traces), robot.env_id, episodes=episodes, seed=FIRST_SEED)
+                if report.interrupted:
+                    raise KeyboardInterrupt
+                runs.append(RobotRun(robot, report, traces, film(policy, robot.env_id, seed=FIRST_SEED)))
+    picture = draw_picture(out / "demo.png", runs)
+    console.rule("4  result")
+    console.print(_table(runs))
+    console.print(
+        f"picture: {picture}   bundles: {repository}   {time.monotonic() - started:.0f} s in all", markup=False
+    )
+
+
+class _Recorder:
+    """Passes every call on to the policy and notes the observations, episode by episode."""
+
+    def __init__(self, policy: PolicyClient, traces: list[Trace]) -> None:
+        self._policy = policy
+        self._traces = traces
+
+    @property
+    def contract(self) -> Contract:
+        return self._policy.contract
+
+    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> NDArray[Any]:
+        self._traces[-1].append(float(np.asarray(obs)[0]))  # both robots' first element is the distance to the target
+        return self._policy.act(obs, explore=explore, seed=seed)
+
+    def reset(self) -> None:
+        self._traces.append([])
+        self._policy.reset()
+
+    def close(self) -> None:
+        self._policy.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _command(console: Console, *words: str) -> None:
+    """Show and run one rlservo command; its output goes to the terminal."""
+    _show(console, *words)
+    done = subprocess.run([sys.executable, "-m", "rlservo.deploy.cli", *words])
+    if done.returncode != 0:
+        raise RlservoError(f"`rlservo {words[0]}` ended with exit code {done.returncode}")
+
+
+def _show(console: Console, *words: str) -> None:
+    console.print(f"$ rlservo {shlex.join(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
+    """Run `rlservo serve` on a free port until the block ends; stop it as Ctrl-C would."""
+    port = _free_port()
+    words = ("serve", str(repository), "--port", str(port))
+    _show(console, *words)
+    url = f"http://127.0.0.1:{port}"
+    with log.open("wb") as stream:
+        # A session of its own: a Ctrl-C at the terminal reaches us alone, and we pass it on once.
+        server = subprocess.Popen(
+            [sys.executable, "-m", "rlservo.deploy.cli", *words],
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            with console.status("starting Ray Serve (about 10 s) ..."):
+                _wait_until_ready(server, url, log)
+            console.print(f"serving at {url} (its log: {log})", markup=False)
+            yield url
+        finally:
+            with console.status("stopping the server ..."):
+                _stop(server)
+
+
+def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> None:
+    deadline = time.monotonic() + START_TIMEOUT_S
+    with PolicyClient(url, ROBOTS[0].policy, timeout_s=2.0, retries=0) as probe:
+        while True:
+            if server.poll() is not None:
+                raise RlservoError(f"the server ended while starting: {_last_line(log)}")
+            try:
+                probe.wait_until_ready(timeout_s=1.0)
+                return
+            except UnavailableError:
+                if time.monotonic() > deadline:
+                    raise RlservoError(f"the server was not ready after {START_TIMEOUT_S:.0f} s: see {log}") from None
+
+
+def _last_line(log: Path) -> str:
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1] if lines else f"it printed nothing to {log}"
+
+
+def _stop(server: subprocess.Popen[bytes]) -> None:
+    if server.poll() is None:
+        server.send_signal(signal.SIGINT)
+    try:
+        server.wait(STOP_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        server.send_signal(signal.SIGTERM)
+        server.wait(STOP_TIMEOUT_S)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _table(runs: list[RobotRun]) -> Table:
+    table = Table(title="Served policies in closed loop")
+    table.add_column("robot")
+    for column in ("success", "return", "seconds to target", "answer p50", "p99", "late answers"):
+        table.add_column(column, justify="right")
+    for run in runs:
+        report = run.report
+        latency = report.latency_ms
+        rate = report.control_rate_hz or 10.0
+        table.add_row(
+            run.robot.title,
+            f"{report.successes} of {len(report.episodes)}",
+            f"{report.return_mean:.2f}",
+            f"{(report.length_mean or 0.0) / rate:.1f}",
+            f"{latency.p50:.2f} ms" if latency else "-",
+            f"{latency.p99:.2f} ms" if latency else "-",
+            f"{report.deadline_misses} of {report.steps}",
+        )
+    return table

@@ -1,0 +1,68 @@
+"""The wheel is what users get: it is built, compared with the tree, and installed alone in a clean environment."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = ("envs", "export", "serve_app", "deploy")
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("wheel")
+    source = tmp_path_factory.mktemp("source") / "tree"
+    # A copy without build leftovers: setuptools would take stale files from build/.
+    subprocess.run(["git", "-C", str(ROOT), "checkout-index", "-a", f"--prefix={source}/"], check=False)
+    for folder in FOLDERS:
+        subprocess.run(["cp", "-r", str(ROOT / folder), str(source)], check=True)
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        subprocess.run(["cp", str(ROOT / name), str(source)], check=True)
+    build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(out), str(source)]
+    done = subprocess.run(build, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return next(out.glob("*.whl"))
+
+
+def test_wheel_holds_every_module_and_asset_and_no_foreign_top_level(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    top_level = {name.split("/")[0] for name in names}
+    info = next(name for name in top_level if name.endswith(".dist-info"))
+    assert top_level == {"rlservo", "rlservo-gymnasium.pth", info}
+    for folder in FOLDERS:
+        for path in (ROOT / folder).rglob("*"):
+            if path.suffix in {".py", ".yaml"} or path.name == "py.typed":
+                assert f"rlservo/{path.relative_to(ROOT)}" in names
+
+
+@pytest.mark.slow
+def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -> None:
+    venv.create(tmp_path / "env", with_pip=True)
+    python = tmp_path / "env" / "bin" / "python"
+    install = [str(python), "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt"), str(wheel)]
+    done = subprocess.run(install, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stderr
+
+    def run(*command: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
+
+    listed = run(str(python), "-m", "pip", "list", "--format=freeze").stdout.lower()
+    for heavy in ("torch", "ray", "gymnasium", "mujoco", "fastapi", "onnx"):
+        assert f"\n{heavy}==" not in f"\n{listed}"
+    loaded = run(str(python), "-c", "from rlservo.serve_app.policy import Policy; print(Policy.load)")
+    assert loaded.returncode == 0, loaded.stderr
+    rlservo = str(tmp_path / "env" / "bin" / "rlservo")
+    assert run(rlservo, "--version").stdout.startswith("rlservo ")
+    refused = run(rlservo, "serve", ".")
+    assert refused.returncode == 2
+    assert "pip install 'rlservo[serve]'" in refused.stderr
+    assert "Traceback" not in refused.stderr
+    for folder in FOLDERS:
+        assert run(str(python), "-c", f"import {folder}").returncode != 0
