@@ -1,0 +1,206 @@
+"""What the MiR100's tasks share: drive to a target, scored by the distance gained and the power spent.
+
+A task adds where things start, what ends an episode badly, and which lasers it looks at. Source of every figure here:
+jr-robotics/robo-gym 2.0.1, envs/mir100.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlservo.envs.checks import ElementInfo, EnvDescription, as_vector, check_action, check_option_names
+from rlservo.envs.mir100.parameters import (
+    BEAM_COUNT,
+    CYCLE_S,
+    LASER_MAX,
+    LASER_NOISE,
+    MAX_ANGULAR_VELOCITY,
+    MAX_LINEAR_VELOCITY,
+)
+from rlservo.envs.mir100.simulation import Mir100Simulation, wrap_angle
+from rlservo.envs.mir100.worlds import Pose
+from rlservo.envs.rendering import RENDER_MODES, Camera
+
+LINEAR_SCALE, ANGULAR_SCALE = 0.5, 0.7  # [m/s], [rad/s], of an action of 1
+SUCCESS_DISTANCE = 0.2  # [m]
+MIN_TARGET_DISTANCE = 1.0  # [m], of a random target from the start
+MAX_STEPS = 500
+VELOCITY_TOLERANCE = 0.1  # [m/s], [rad/s], of the observation bounds above the robot's limits
+PROGRESS_REWARD = 50.0  # [1/m]
+LINEAR_COST, ANGULAR_COST = 0.30, 0.03  # of an action of 1
+FAILURE_REWARD = -200.0
+RESET_OPTIONS = ("start_pose", "target_pose")
+
+Observation = NDArray[np.float32]
+
+
+class Mir100Navigation(gym.Env[Observation, NDArray[np.float32]]):
+    """Drive the MiR100 to a target; the tasks that derive from it hold the data sheets."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
+
+    WORLD: ClassVar[str]
+    LASER_COUNT: ClassVar[int]  # how many of the readings are observed, evenly picked
+    SUCCESS_REWARD: ClassVar[float]
+    VIEW: ClassVar[dict[str, Any]]  # where the camera stands
+
+    def __init__(
+        self,
+        ip: str | None = None,
+        lower_bound_port: int | None = None,
+        upper_bound_port: int | None = None,
+        gui: bool = False,
+        *,
+        rs_address: str | None = None,
+        rs_state_to_info: bool = True,
+        laser_noise: float = LASER_NOISE,
+        render_mode: str | None = None,
+    ) -> None:
+        del ip, lower_bound_port, upper_bound_port, rs_address  # no robot server to reach
+        del rs_state_to_info  # robo-gym's MiR100 environments accept it and put nothing into info either
+        if gui and render_mode is None:
+            render_mode = "human"  # what robo-gym's `gui` shows
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(f"render_mode {render_mode!r} does not exist: expected one of {', '.join(RENDER_MODES)}")
+        self.render_mode = render_mode
+        self.simulation = Mir100Simulation(self.WORLD, laser_noise=laser_noise)
+        self._elements = self.describe()["action"]
+
+        high = np.array(
+            [
+                math.inf,
+                math.pi,
+                MAX_LINEAR_VELOCITY + VELOCITY_TOLERANCE,
+                MAX_ANGULAR_VELOCITY + VELOCITY_TOLERANCE,
+                *[LASER_MAX] * self.LASER_COUNT,
+            ],
+            dtype=np.float32,
+        )
+        low = -high
+        low[4:] = 0.0
+        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self._action_box = gym.spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+        self.action_space = self._action_box
+
+        self._camera = Camera(self.simulation.model, self.simulation.data, **self.VIEW)
+        self._observed_beams = np.rint(np.linspace(0, BEAM_COUNT - 1, self.LASER_COUNT)).astype(np.intp)
+        self._previous_distance: float | None = None
+        self._steps = 0
+
+    @classmethod
+    def describe(cls, **_constructor_arguments: Any) -> EnvDescription:
+        """Name the elements, without building a simulator; no constructor argument changes them."""
+        observation: list[ElementInfo] = [
+            {"name": "target_r", "unit": "m"},
+            {"name": "target_theta", "unit": "rad"},
+            {"name": "linear_velocity", "unit": "m/s"},
+            {"name": "angular_velocity", "unit": "rad/s"},
+        ]
+        lasers: list[ElementInfo] = [{"name": f"laser_{index}", "unit": "m"} for index in range(cls.LASER_COUNT)]
+        action: list[ElementInfo] = [
+            {"name": "linear_velocity_normalized", "unit": "1"},
+            {"name": "angular_velocity_normalized", "unit": "1"},
+        ]
+        return {"observation": observation + lasers, "action": action, "control_rate_hz": 1.0 / CYCLE_S}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; the class's docstring lists the options."""
+        super().reset(seed=seed)
+        options = options or {}
+        check_option_names(options, RESET_OPTIONS)
+        given_start, given_target = options.get("start_pose"), options.get("target_pose")
+        start = self._random_start() if given_start is None else as_vector("start_pose", given_start, 3).tolist()
+        target = self._random_target(start) if given_target is None else as_vector("target_pose", given_target, 3)
+        self.simulation.rng = self.np_random
+        self._place(start, target.tolist() if isinstance(target, np.ndarray) else target)
+        self._steps = 0
+        self._previous_distance = None
+        if self.render_mode == "human":
+            self._camera.show()
+        return self._observation(*self._target_polar()), {}
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Command velocities, let 0.1 s pass, and judge the outcome."""
+        linear, angular = check_action(action, self._action_box, self._elements).tolist()
+        self._steps += 1
+        self.simulation.command(linear * LINEAR_SCALE, angular * ANGULAR_SCALE)
+        self.simulation.advance()
+
+        distance, bearing = self._target_polar()
+        reward = -LINEAR_COST * abs(linear) - ANGULAR_COST * abs(angular)
+        if self._previous_distance is not None:  # robo-gym scores no progress in an episode's first step
+            reward += PROGRESS_REWARD * (self._previous_distance - distance)
+        self._previous_distance = distance
+
+        status = self._failure()
+        if status is not None:
+            reward = FAILURE_REWARD
+        if distance < SUCCESS_DISTANCE:  # in robo-gym's order: arriving outweighs a failure in the same step
+            reward, status = self.SUCCESS_REWARD, "success"
+        terminated = status is not None
+        truncated = not terminated and self._steps >= MAX_STEPS
+        if truncated:
+            status = "max_steps_exceeded"
+        info = {} if status is None else {"final_status": status, "is_success": status == "success"}
+        if self.render_mode == "human":
+            self._camera.show()
+        return self._observation(distance, bearing), reward, terminated, truncated, info
+
+    def render(self) -> Any:
+        """Return an (480, 640, 3) uint8 frame in mode rgb_array; the window of mode human refreshes by itself."""
+        return self._camera.frame() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Free the GL context and close the window."""
+        self._camera.close()
+
+    # -- what a task adds
+
+    @abstractmethod
+    def _random_start(self) -> Pose:
+        """Draw where the robot starts."""
+
+    @abstractmethod
+    def _random_target_position(self, start: Sequence[float]) -> tuple[float, float]:
+        """Draw x and y of a target; the base class draws again while it is too near the start."""
+
+    @abstractmethod
+    def _place(self, start: Sequence[float], target: Sequence[float]) -> None:
+        """Put everything in its place. Raises InvalidResetError where that cannot be."""
+
+    @abstractmethod
+    def _failure(self) -> str | None:
+        """Return the final status if the robot has failed, None if it has not."""
+
+    # -- parts
+
+    def _random_target(self, start: Sequence[float]) -> Pose:
+        while True:
+            x, y = self._random_target_position(start)
+            if math.hypot(x - start[0], y - start[1]) >= MIN_TARGET_DISTANCE:
+                return x, y, 0.0
+
+    def _target_polar(self) -> tuple[float, float]:
+        """Return distance [m] and direction [rad, -pi .. pi] of the target, seen from the robot."""
+        x, y, yaw = self.simulation.pose
+        target_x, target_y, _ = self.simulation.target
+        dx, dy = target_x - x, target_y - y
+        return math.hypot(dx, dy), wrap_angle(math.atan2(dy, dx) - yaw)
+
+    def _observation(self, distance: float, bearing: float) -> Observation:
+        observation = np.empty(4 + self.LASER_COUNT, dtype=np.float32)
+        observation[0] = distance
+        observation[1] = bearing
+        observation[2:4] = self.simulation.velocity
+        if self.LASER_COUNT:
+            observation[4:] = self.simulation.scan[self._observed_beams]
+        return observation

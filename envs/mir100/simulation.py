@@ -1,0 +1,243 @@
+"""The simulated robot: put it somewhere, command velocities, let a control cycle pass, read pose, lasers and contacts.
+
+It follows robo-gym's robot server and the diff_drive_controller below it. It knows nothing of observations, rewards or
+Gymnasium. Poses are x, y [m] and yaw [rad] of base_link in the map frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlservo.envs.mir100.lasers import LaserScanners
+from rlservo.envs.mir100.model import TIMESTEP, build_model
+from rlservo.envs.mir100.parameters import (
+    BEAM_COUNT,
+    COMMAND_TIMEOUT_S,
+    CYCLE_S,
+    FRONT_SCANNER,
+    LASER_NOISE,
+    MAX_ANGULAR_ACCELERATION,
+    MAX_ANGULAR_VELOCITY,
+    MAX_LINEAR_ACCELERATION,
+    MAX_LINEAR_VELOCITY,
+    SAFETY_DISTANCE,
+)
+from rlservo.envs.mir100.worlds import Pose, find_world
+
+SUBSTEPS = round(CYCLE_S / TIMESTEP)
+TIMEOUT_SUBSTEPS = round(COMMAND_TIMEOUT_S / TIMESTEP)
+LINEAR_INCREMENT = MAX_LINEAR_ACCELERATION * TIMESTEP  # [m/s] a substep
+HALF_STEP = TIMESTEP / 2  # [s]
+ANGULAR_INCREMENT = MAX_ANGULAR_ACCELERATION * TIMESTEP  # [rad/s] a substep
+
+Vector = NDArray[np.float64]
+
+
+class Mir100Simulation:
+    """One robot in one world ("empty" or "lab_6x8"), at 100 Hz physics.
+
+    `laser_noise` is the standard deviation of a reading [m]; 0 gives exact distances. The noise is drawn from `rng`,
+    which may be exchanged at any time; without one it differs from run to run.
+    """
+
+    def __init__(
+        self, world: str = "empty", *, laser_noise: float = LASER_NOISE, rng: np.random.Generator | None = None
+    ) -> None:
+        if not 0.0 <= laser_noise < math.inf:
+            raise ValueError(f"laser_noise is {laser_noise:g}: expected a standard deviation in m, 0 for none")
+        self.world = find_world(world)
+        self.model: mujoco.MjModel = build_model(self.world)
+        self.data = mujoco.MjData(self.model)
+        self.rng = np.random.default_rng() if rng is None else rng
+        self.in_collision = False
+        self._lasers = LaserScanners(self.model, self.data, laser_noise)
+        self._sees_something = bool(self.world.walls or self.world.cubes)
+        self._scan_is_fresh = False
+        self._target_mocap = int(self.model.body("target").mocapid[0])
+        self._cube_mocaps = [int(self.model.body(f"cube_{i}").mocapid[0]) for i in range(len(self.world.cubes))]
+        self._target: Pose = (0.0, 0.0, 0.0)
+        self._cubes = list(self.world.cubes)
+        self._command = (0.0, 0.0)  # [m/s], [rad/s], the last one, within the velocity limits
+        self._command_age = 0  # substeps
+        self._setpoint = (0.0, 0.0)  # [m/s], [rad/s], what the wheels are told: follows within the acceleration limits
+        self.place((0.0, 0.0, 0.0))
+
+    # -- placing
+
+    def place(
+        self, pose: ArrayLike, *, target: ArrayLike | None = None, cubes: Sequence[ArrayLike] | Vector | None = None
+    ) -> bool:
+        """Put the robot at rest at `pose`, and target and cubes where given. Return whether the robot touches anything.
+
+        Raises ValueError for a pose that is not three finite numbers, or for more or fewer cubes than the world has.
+        """
+        x, y, yaw = _pose("robot", pose)
+        target_pose = self._target if target is None else _pose("target", target)
+        cube_poses = self._cubes if cubes is None else [_pose(f"cube {i}", cube) for i, cube in enumerate(cubes)]
+        if len(cube_poses) != len(self._cubes):
+            raise ValueError(f"{len(cube_poses)} cubes were given, world {self.world.name!r} has {len(self._cubes)}")
+        self._target, self._cubes = target_pose, cube_poses
+
+        data = self.data
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:] = x, y, yaw
+        _place_mocap(data, self._target_mocap, self._target)
+        for mocap, cube in zip(self._cube_mocaps, self._cubes, strict=True):
+            _place_mocap(data, mocap, cube)
+        mujoco.mj_forward(self.model, data)
+        self._command = self._setpoint = (0.0, 0.0)
+        self._command_age = 0
+        self._scan_is_fresh = False
+        self.in_collision = data.ncon > 0
+        return self.in_collision
+
+    # -- moving
+
+    def command(self, linear: float, angular: float) -> bool:
+        """Ask for velocities [m/s], [rad/s]; they are clipped to the robot's limits and hold for 0.5 s.
+
+        Return False, and stop the robot, while anything is within 0.04 m of a scanner: the server refuses to move.
+        """
+        if not (math.isfinite(linear) and math.isfinite(angular)):
+            raise ValueError(f"the velocity command is ({linear:g} m/s, {angular:g} rad/s): expected finite numbers")
+        accepted = not self.is_blocked
+        self._command = (
+            (
+                max(-MAX_LINEAR_VELOCITY, min(MAX_LINEAR_VELOCITY, linear)),
+                max(-MAX_ANGULAR_VELOCITY, min(MAX_ANGULAR_VELOCITY, angular)),
+            )
+            if accepted
+            else (0.0, 0.0)
+        )
+        self._command_age = 0
+        return accepted
+
+    def advance(self) -> None:
+        """Let one control cycle of 0.1 s pass. `in_collision` tells of a contact at any moment of it."""
+        model, data, step = self.model, self.data, mujoco.mj_step
+        ctrl = data.ctrl
+        linear, angular = self._setpoint
+        touched = False
+        for _ in range(SUBSTEPS):
+            if self._command_age >= TIMEOUT_SUBSTEPS:
+                self._command = (0.0, 0.0)
+            self._command_age += 1
+            wanted_linear, wanted_angular = self._command
+            linear += max(-LINEAR_INCREMENT, min(LINEAR_INCREMENT, wanted_linear - linear))
+            angular += max(-ANGULAR_INCREMENT, min(ANGULAR_INCREMENT, wanted_angular - angular))
+            ctrl[0] = linear
+            ctrl[1] = linear * angular * HALF_STEP  # the motors act along the heading at the step's start, and a chord
+            ctrl[2] = angular  # of the arc points half a step's turn to the left of that
+            step(model, data)
+            if data.ncon:
+                touched = True
+        self._setpoint = (linear, angular)
+        # mj_step leaves poses and contacts of its start: bring them up to where the robot is now.
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        self.in_collision = touched or data.ncon > 0
+        self._scan_is_fresh = False
+
+    # -- reading
+
+    @property
+    def pose(self) -> Pose:
+        """The robot's x, y [m] and yaw [rad, -pi .. pi]."""
+        x, y, yaw = self.data.qpos.tolist()
+        return x, y, wrap_angle(yaw)
+
+    @property
+    def velocity(self) -> tuple[float, float]:
+        """Linear [m/s], along the robot's x, and angular velocity [rad/s], as its odometry gives them."""
+        vx, vy, angular = self.data.qvel.tolist()
+        yaw = float(self.data.qpos[2])
+        return vx * math.cos(yaw) + vy * math.sin(yaw), angular
+
+    @property
+    def target(self) -> Pose:
+        """Where the target is."""
+        return self._target
+
+    @property
+    def cubes(self) -> list[Pose]:
+        """Where the cubes are."""
+        return list(self._cubes)
+
+    @property
+    def scan(self) -> Vector:
+        """All readings [m], (1012,): the front scanner's 501, then the back scanner's 511, each counter-clockwise.
+
+        0.05 .. 29.0; 29.0 is also what a beam that meets nothing reads. The array is reused for the next cycle.
+        """
+        self._bring_scan_up_to_date()
+        return self._lasers.readings
+
+    @property
+    def front_scan(self) -> Vector:
+        """The front scanner's readings [m], (501,), a part of `scan`."""
+        return self.scan[: FRONT_SCANNER.count]
+
+    @property
+    def back_scan(self) -> Vector:
+        """The back scanner's readings [m], (511,), a part of `scan`."""
+        return self.scan[FRONT_SCANNER.count :]
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether anything is within 0.04 m of a scanner, noise aside. (A reading itself is never below 0.05 m.)"""
+        self._bring_scan_up_to_date()
+        return self._lasers.nearest < SAFETY_DISTANCE
+
+    def state(self) -> Vector:
+        """Return the robot server's `state`, (1030,).
+
+        Target pose (3), robot pose (3), linear and angular velocity (2), front scan (501), back scan (511),
+        collision (1), cube poses (9; zeros where there are no cubes).
+        """
+        state = np.zeros(8 + BEAM_COUNT + 1 + 9)
+        state[0:3] = self._target
+        state[3:6] = self.pose
+        state[6:8] = self.velocity
+        state[8 : 8 + BEAM_COUNT] = self.scan
+        state[8 + BEAM_COUNT] = self.in_collision
+        for index, cube in enumerate(self._cubes):
+            start = 9 + BEAM_COUNT + 3 * index
+            state[start : start + 3] = cube
+        return state
+
+    def touched(self) -> list[str]:
+        """Return the names of the walls and cubes the robot touches now, for messages."""
+        model: Any = self.model
+        names = {model.geom(geom).name for contact in self.data.contact[: self.data.ncon] for geom in contact.geom}
+        return sorted(names - {"body"})
+
+    def _bring_scan_up_to_date(self) -> None:
+        if not self._scan_is_fresh:
+            if self._sees_something:
+                self._lasers.measure(self.rng)
+            self._scan_is_fresh = True
+
+
+def wrap_angle(angle: float) -> float:
+    """Return the same direction within -pi .. pi [rad]."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def _pose(what: str, pose: ArrayLike) -> Pose:
+    values = np.asarray(pose, dtype=np.float64)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise ValueError(f"the pose of the {what} is {values.tolist()}: expected three finite numbers, x, y and yaw")
+    x, y, yaw = values.tolist()
+    return x, y, yaw
+
+
+def _place_mocap(data: mujoco.MjData, index: int, pose: Pose) -> None:
+    x, y, yaw = pose
+    data.mocap_pos[index, :2] = x, y
+    data.mocap_quat[index] = math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
