@@ -76,6 +76,11 @@ def _extra(name: str) -> Iterator[None]:
         ) from error
 
 
+def _note(line: str) -> None:
+    """Print a line that a program reading our output should not see."""
+    _err.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+
+
 def _print_json(document: Any) -> None:
     print(json.dumps(document, indent=2))
 
@@ -106,9 +111,6 @@ def export(
         from rlservo.export.exporter import export_checkpoint
         from rlservo.export.report import contract_report
 
-    def notify(line: str) -> None:
-        _err.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
-
     result = export_checkpoint(
         checkpoint,
         out,
@@ -117,13 +119,30 @@ def export(
         description=description,
         module_id=module_id,
         app_dir=app_dir,
-        notify=notify,
+        notify=_note,
     )
     if as_json:
         _print_json({"path": str(result.path), "contract": result.contract.model_dump(mode="json")})
     else:
         _out.print(contract_report(result.contract))
         _out.print(f"written: {result.path}", markup=False, highlight=False, soft_wrap=True)
+
+
+@app.command()
+def prune(
+    checkpoint: Annotated[Path, typer.Argument(help="RLlib checkpoint folder.")],
+    out: Annotated[Path, typer.Option(help="Folder to make; it must not exist.")],
+    module_id: Annotated[str | None, typer.Option(help="Which RLModule; needed when there are several.")] = None,
+    app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+) -> None:
+    """Copy only what export needs out of a checkpoint: small enough to commit or to mail.
+
+    Example: `rlservo prune runs/PPO-.../checkpoint_000015 --out examples/checkpoints/mine`
+    """
+    with _extra("train"):
+        from rlservo.export.prune import prune_checkpoint
+
+    prune_checkpoint(checkpoint, out, module_id=module_id, app_dir=app_dir, notify=_note)
 
 
 @app.command()
@@ -164,11 +183,8 @@ def verify(
         from rlservo.export.report import verification_report
         from rlservo.export.verify import verify_bundle
 
-    def notify(line: str) -> None:
-        _err.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
-
     result = verify_bundle(
-        bundle, checkpoint, env_id=env, episodes=episodes, first_seed=seed, app_dir=app_dir, notify=notify
+        bundle, checkpoint, env_id=env, episodes=episodes, first_seed=seed, app_dir=app_dir, notify=_note
     )
     if as_json:
         _print_json(result.as_dict())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import mujoco
@@ -31,22 +32,26 @@ class Camera:
         self._view = mujoco.MjvCamera()
         self._view.lookat[:] = lookat
         self._view.distance, self._view.azimuth, self._view.elevation = distance, azimuth, elevation
-        self._renderer: mujoco.Renderer | None = None
+        self._renderer: Any = None
         self._viewer: Any = None
+        self._viewer_threads: set[threading.Thread] = set()
 
     def frame(self) -> NDArray[np.uint8]:
         """Return the current view as (height, width, 3) uint8."""
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(self._model, height=self._height, width=self._width)
-        self._renderer.update_scene(self._data, camera=self._view)
-        return np.asarray(self._renderer.render(), dtype=np.uint8)
+        renderer = self._renderer
+        if renderer is None:
+            renderer = self._renderer = mujoco.Renderer(self._model, height=self._height, width=self._width)
+        renderer.update_scene(self._data, camera=self._view)
+        return np.asarray(renderer.render(), dtype=np.uint8)
 
     def show(self) -> None:
         """Open the viewer window at the first call, refresh it at the next ones. Needs a display."""
         if self._viewer is None:
             import mujoco.viewer  # opens a display connection when imported, so only where one is wanted
 
+            before = set(threading.enumerate())
             self._viewer = mujoco.viewer.launch_passive(self._model, self._data)
+            self._viewer_threads = set(threading.enumerate()) - before
             self._viewer.cam.lookat[:] = self._view.lookat
             self._viewer.cam.distance = self._view.distance
             self._viewer.cam.azimuth = self._view.azimuth
@@ -59,5 +64,8 @@ class Camera:
             self._renderer.close()
             self._renderer = None
         if self._viewer is not None:
+            # The window lives in threads of its own. Left to themselves they crash a second window, or Python's exit.
             self._viewer.close()
+            for thread in self._viewer_threads:
+                thread.join(timeout=10.0)
             self._viewer = None

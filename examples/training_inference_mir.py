@@ -1,6 +1,6 @@
 """Train MiR100 navigation with RLlib, then run episodes with the result.
 
-    python examples/training_inference_mir.py --stop-timesteps 1000000
+    python examples/training_inference_mir.py
 
 Without obstacles by default; `--obstacles` trains robo-gym's obstacle avoidance instead. The policy that ships in
 examples/checkpoints/mir100_navigation was made by this script; its README has the command.
@@ -26,7 +26,7 @@ PPO = {
 NAVIGATION = Task(
     env_id="rlservo/NoObstacleNavigationMir100Sim-v0",
     env_config={"rs_state_to_info": False},
-    stop_timesteps=1_500_000,
+    stop_timesteps=491_520,
     stop_reward=1_000.0,
     gamma=0.99,
     training={**PPO, "lr": [[0, 3e-4], [1_500_000, 5e-5]]},

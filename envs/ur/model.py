@@ -86,7 +86,7 @@ def _document(arm: URParameters) -> str:
     </body>
     <body name="base_link" pos="0 0 {BASE_HEIGHT}">
       <body name="base" euler="0 0 {math.pi}">
-        {capsule((0, 0, SHOULDER_RADIUS * s), (0, 0, arm.d1), SHOULDER_RADIUS, m[0], housing)}
+        {capsule((0, 0, SHOULDER_RADIUS * s), (0, 0, arm.d1), SHOULDER_RADIUS, m[0], cap)}
         <geom class="seen" type="cylinder" fromto="0 0 0 0 0 0.02" size="{0.075 * s}" rgba="0.3 0.31 0.33 1"/>
         <body name="shoulder" pos="0 0 {arm.d1}" gravcomp="1">
           {joint(0)}
@@ -103,7 +103,7 @@ def _document(arm: URParameters) -> str:
                 {capsule((0, 0, arm.elbow_offset - arm.d4), (0, 0, 0), WRIST_RADIUS, m[4], cap)}
                 <body name="wrist_2" pos="0 {-arm.d5} 0" euler="{math.pi / 2} 0 0" gravcomp="1">
                   {joint(4)}
-                  {capsule((0, 0, -arm.d5 / 2), (0, 0, 0), WRIST_RADIUS, m[5], housing)}
+                  {capsule((0, 0, -arm.d5 / 2), (0, 0, 0), WRIST_RADIUS, m[5], cap)}
                   <body name="wrist_3" pos="0 {arm.d6} 0" euler="{-math.pi / 2} 0 0" gravcomp="1">
                     {joint(5)}
                     {capsule((0, 0, -arm.d6), (0, 0, -flange), WRIST_RADIUS, m[6], cap)}
