@@ -348,6 +348,8 @@ def wrk(server: Server, folder: Path, connections: int, seconds: int) -> float:
     url = f"http://127.0.0.1:{server.port}{server.path}"
     command = ["wrk", "-t1", f"-c{connections}", f"-d{seconds}s", "-s", str(script), url]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    if "Non-2xx" in text or "Socket errors" in text:
+        raise SystemExit(f"{server.name} failed under wrk with {connections} connections:\n{text}")
     line = next(line for line in text.splitlines() if line.startswith("Requests/sec"))
     return float(line.split(":")[1])
 

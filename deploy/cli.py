@@ -16,7 +16,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
-import click
 import typer
 from rich.console import Console
 
@@ -47,20 +46,13 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document for 
 def main() -> None:
     """Run the command line: exit code 0 only on success, one sentence and no traceback on an error."""
     try:
-        code = app(standalone_mode=False)
+        app()
     except RlservoError as error:
         _err.print(f"rlservo: {error.message}", style="red", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(2 if isinstance(error, UsageError) else 1) from None
-    except click.ClickException as error:
-        error.show()
-        raise SystemExit(error.exit_code) from None
-    except (click.Abort, KeyboardInterrupt):
-        _err.print("rlservo: interrupted", style="red")
-        raise SystemExit(130) from None
     except BrokenPipeError:  # the reader of our output went away, as in `rlservo inspect ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
-    raise SystemExit(code if isinstance(code, int) else 0)
 
 
 @contextmanager
@@ -109,7 +101,7 @@ def export(
     """
     with _extra("train"):
         from rlservo.export.exporter import export_checkpoint
-        from rlservo.export.report import contract_report
+        from rlservo.export.report import export_report
 
     result = export_checkpoint(
         checkpoint,
@@ -124,8 +116,8 @@ def export(
     if as_json:
         _print_json({"path": str(result.path), "contract": result.contract.model_dump(mode="json")})
     else:
-        _out.print(contract_report(result.contract))
-        _out.print(f"written: {result.path}", markup=False, highlight=False, soft_wrap=True)
+        _out.print(export_report(result.contract), soft_wrap=True)
+        _out.print(f"written   {result.path}", markup=False, highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -187,9 +179,15 @@ def verify(
         bundle, checkpoint, env_id=env, episodes=episodes, first_seed=seed, app_dir=app_dir, notify=_note
     )
     if as_json:
-        _print_json(result.as_dict())
+        _print_json(
+            {
+                "parity": result.parity.model_dump(mode="json"),
+                "evaluation": result.evaluation.model_dump(mode="json") if result.evaluation else None,
+                "same_checkpoint": result.same_checkpoint,
+            }
+        )
     else:
-        _out.print(verification_report(result))
+        _out.print(verification_report(result.parity, result.evaluation))
 
 
 @app.command()
@@ -207,10 +205,14 @@ def serve(
     `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`
     """
     with _extra("serve"):
-        from rlservo.serve_app.launcher import serve_policies
+        from rlservo.serve_app.launcher import Served, serve_policies
 
-    def ready(url: str) -> None:
-        _out.print(f"ready: {url}/v1/policies   documentation: {url}/docs   Ctrl-C stops", highlight=False)
+    def ready(served: Served) -> None:
+        for name, default in served.policies:
+            _out.print(f"{served.url}/v1/policies/{name}  (version {default})", highlight=False, soft_wrap=True)
+        if not served.haproxy:
+            _err.print("HAProxy is not installed here: Ray's own proxy answers, at several times the latency")
+        _out.print(f"ready; documentation at {served.url}/docs; Ctrl-C stops", highlight=False, soft_wrap=True)
 
     _err.print("starting Ray Serve ...", style="dim")
     serve_policies(directories, host=host, port=port, replicas=replicas, on_ready=ready)

@@ -74,9 +74,10 @@ def draw_picture(file: Path, runs: list[RobotRun]) -> Path:
     for row, run in enumerate(runs):
         for column, frame in enumerate(run.frames):
             axes = figure.add_subplot(grid[row, column])
-            axes.imshow(frame)
+            height, width, _ = frame.shape
+            axes.imshow(frame[height // 8 : -height // 8, width // 8 : -width // 8])  # the robot is in the middle
             axes.set_axis_off()
-            axes.set_title(("start", "midway", "end")[column], fontsize=10)
+            axes.set_title(f"{run.robot.title}, {('start', 'midway', 'end')[column]}", fontsize=10)
         _draw_curves(figure.add_subplot(grid[row, -1]), run)
     figure.savefig(file, dpi=110)
     return file
@@ -106,4 +107,6 @@ def _draw_curves(axes: Any, run: RobotRun) -> None:
     axes.grid(alpha=0.25)
     latency = run.report.latency_ms
     answer = f", answer in {latency.p50:.2f} ms (median)" if latency else ""
-    axes.set_title(f"{run.robot.title}: {run.report.successes} of {len(run.report.episodes)}{answer}", fontsize=10)
+    axes.set_title(
+        f"{run.robot.title}: {run.report.successes} of {len(run.report.episodes)} at the target{answer}", fontsize=10
+    )

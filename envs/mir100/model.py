@@ -57,7 +57,7 @@ def _document(world: World) -> str:
   <visual>
     <global offwidth="1280" offheight="960"/>
     <headlight ambient="0.42 0.42 0.43" diffuse="0.22 0.22 0.22" specular="0.05 0.05 0.05"/>
-    <quality shadowsize="8192" offsamples="8"/>
+    <quality shadowsize="4096" offsamples="8"/>
     <map znear="0.01" zfar="40" shadowclip="1.2"/>
   </visual>
   <default>

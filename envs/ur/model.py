@@ -61,7 +61,7 @@ def _document(arm: URParameters) -> str:
   <visual>
     <global offwidth="1280" offheight="960"/>
     <headlight ambient="0.35 0.35 0.35" diffuse="0.45 0.45 0.45" specular="0.1 0.1 0.1"/>
-    <quality shadowsize="4096"/>
+    <quality shadowsize="2048"/>
   </visual>
   <default>
     <default class="link"><geom type="capsule" contype="1" conaffinity="3" friction="0.6"/></default>

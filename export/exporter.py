@@ -1,0 +1,263 @@
+"""Turn a checkpoint into a policy bundle: restore, build the graph, write it, prove it, and only then give it its name.
+
+Everything is written into a temporary folder beside the target, which is renamed at the end or removed: a bundle is
+there whole or not at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from rlservo.export.bundle import (
+    NAME_PATTERN,
+    ONNX_FILE,
+    TORCHSCRIPT_FILE,
+    VERSION_PATTERN,
+    Contract,
+    Distribution,
+    Parity,
+    Provenance,
+    TensorSpec,
+    contract_json,
+    load_bundle,
+    version_key,
+    write_contract,
+    write_golden,
+)
+from rlservo.export.elements import read_elements
+from rlservo.export.errors import ParityError, UsageError
+from rlservo.export.facts import CheckpointFacts, read_facts
+from rlservo.export.location import CheckpointFiles, locate_checkpoint
+from rlservo.export.parity import Outputs, Recorded, prove, record, ties
+from rlservo.export.samples import BATCH_SIZES, draw_batches
+from rlservo.export.spaces import space_spec
+from rlservo.export.steps import baked_steps
+from rlservo.export.unpickle import user_code
+
+if TYPE_CHECKING:
+    from rlservo.export.checkpoint import Checkpoint
+
+GOLDEN_SAMPLES = {"likely": 48, "wide": 8, "extreme": 8}
+SEED = 20240
+LOADING_RUNS_CODE = "loading {path}: checkpoints are pickles and run code when loaded; export only those you trust"
+
+
+@dataclass(frozen=True)
+class ExportResult:
+    """The bundle that was written."""
+
+    path: Path
+    contract: Contract
+
+
+def export_checkpoint(
+    checkpoint: str | Path,
+    out: str | Path,
+    *,
+    name: str | None = None,
+    version: str | None = None,
+    description: str = "",
+    module_id: str | None = None,
+    app_dir: str | Path = ".",
+    value: bool = True,
+    notify: Callable[[str], None],
+) -> ExportResult:
+    """Export one policy of an RLlib checkpoint to `out/<name>/<version>/`.
+
+    `checkpoint` is what `locate_checkpoint` takes. `name` defaults to the environment's, `version` to the next integer
+    after the newest one present. `app_dir` holds the user's own classes, if the checkpoint needs any. `value` False
+    leaves the value head out, which costs a third of a small policy's time. `notify` gets one sentence for each thing
+    a person should know.
+
+    Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
+    cannot be exported, ParityError when the graph does not give RLlib's own actions. Nothing is left behind then.
+    """
+    files = locate_checkpoint(checkpoint, module_id)
+    _check_names(name, version)
+    notify(LOADING_RUNS_CODE.format(path=files.root))
+    with user_code(app_dir):
+        facts = read_facts(files.root, notify)
+        name = name or default_name(facts.env_id, files.root)
+        target = _target(Path(out), name, version)
+        restored = _load(files, notify, value)
+        elements = read_elements(facts.env_id, facts.env_config, restored.recipe, notify)
+        with _temporary_folder(target) as folder:
+            parity, golden = _write_graphs(folder, restored, [element.name for element in elements.action])
+            recipe = restored.recipe
+            contract = Contract(
+                name=name,
+                version=target.name,
+                description=description,
+                observation_space=space_spec(recipe.observation_space, elements.observation),
+                action_space=space_spec(recipe.action_space, elements.action),
+                inputs=(_tensor("obs", golden.inputs),),
+                outputs=tuple(_tensor(output, values) for output, values in golden.outputs.items()),
+                distribution=(
+                    Distribution(kind=recipe.distribution, transform=recipe.transform) if recipe.distribution else None
+                ),
+                baked_in=baked_steps(recipe, restored.module_class, restored.network.module),
+                control_rate_hz=elements.control_rate_hz,
+                provenance=_provenance(files, facts, restored),
+                parity=parity,
+            )
+            _write_rest(folder, contract, golden)
+            folder.rename(target)
+    return ExportResult(target, contract)
+
+
+def default_name(env_id: str | None, root: Path) -> str:
+    """Return a policy name: 'rlservo/EndEffectorPositioningURSim-v0' gives 'end-effector-positioning-ur'.
+
+    Without an environment it is the checkpoint folder's name.
+    """
+    stem = re.split(r"[/:.]", env_id)[-1] if env_id else root.name
+    stem = re.sub(r"-v\d+$", "", stem)
+    stem = re.sub(r"(Sim|Rob|Env)$", "", stem) or stem
+    words = re.findall(r"[A-Z]+(?![a-z])\d*|[A-Z]?[a-z]+\d*|[A-Z]|\d+", stem)
+    return "-".join(word.lower() for word in words)[:64].strip("-") or "policy"
+
+
+def _load(files: CheckpointFiles, notify: Callable[[str], None], value: bool) -> Checkpoint:
+    # Here and not at the top: RLlib takes seconds to import, and a wrong path should not have to wait for it.
+    from rlservo.export.checkpoint import load_checkpoint
+
+    return load_checkpoint(files, notify, value=value)
+
+
+def _check_names(name: str | None, version: str | None) -> None:
+    if name is not None and not re.match(NAME_PATTERN, name):
+        raise UsageError(f"'{name}' cannot be a policy's name: expected up to 64 letters, digits, '.', '_' and '-'")
+    if version is not None and not re.match(VERSION_PATTERN, version):
+        raise UsageError(f"'{version}' cannot be a version: expected a positive integer or a form like 1.2.0")
+
+
+def _target(out: Path, name: str, version: str | None) -> Path:
+    """Return the folder to write, which does not exist yet."""
+    policy = out / name
+    if (out.exists() and not out.is_dir()) or (policy.exists() and not policy.is_dir()):
+        raise UsageError(f"{policy if out.is_dir() else out} is a file: expected a folder to write bundles into")
+    present = [child.name for child in policy.iterdir()] if policy.is_dir() else []
+    taken = [entry for entry in present if re.match(VERSION_PATTERN, entry)]
+    if version is None:
+        version = str(max((version_key(entry)[0] for entry in taken), default=0) + 1)
+    if version in present:
+        raise UsageError(f"{policy / version} exists already: versions are never overwritten; leave the version out "
+                         f"for the next one")  # fmt: skip
+    return policy / version
+
+
+@contextlib.contextmanager
+def _temporary_folder(target: Path) -> Iterator[Path]:
+    """Give a folder beside `target`; whatever happens, it and the parents made for it are gone or in use afterwards."""
+    made = [parent for parent in (target.parent, target.parent.parent) if not parent.exists()]
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=".export-", dir=target.parent))
+        folder.chmod(0o755)  # mkdtemp's own mode would keep a server under another user out
+    except OSError as error:
+        raise UsageError(f"{target.parent} cannot be written: {error.strerror or error}") from error
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        for parent in made:
+            with contextlib.suppress(OSError):  # not empty: the export succeeded
+                parent.rmdir()
+
+
+@dataclass(frozen=True)
+class _Golden:
+    inputs: NDArray[Any]
+    outputs: Outputs
+
+
+def _write_graphs(folder: Path, restored: Checkpoint, labels: list[str]) -> tuple[Parity, _Golden]:
+    """Write both formats, prove them, and return the proof and the golden vectors."""
+    from rlservo.export.actor import PolicyGraph
+    from rlservo.export.onnx import run_onnx, write_onnx
+    from rlservo.export.torchscript import run_torchscript, write_torchscript
+
+    graph = PolicyGraph(restored.recipe, restored.network)
+    batches = draw_batches(restored.recipe, SEED)
+    recorded = record(restored.reference, batches)
+    example = next(batch.obs for batch in batches if len(batch.obs) == BATCH_SIZES[1])
+    write_torchscript(graph, example, folder / TORCHSCRIPT_FILE)
+    write_onnx(graph, example, folder / ONNX_FILE)
+    onnx = run_onnx(folder / ONNX_FILE)
+    formats = {"onnx": onnx, "torchscript": run_torchscript(folder / TORCHSCRIPT_FILE, graph.output_names)}
+    parity = prove(restored.recipe, recorded, formats, labels)
+    inputs = _golden_inputs(recorded, discrete=not isinstance(restored.recipe.action_space, Box))
+    outputs = onnx(inputs)
+    return parity, _Golden(inputs, {name: outputs[name] for name in graph.output_names})
+
+
+def _golden_inputs(recorded: list[Recorded], discrete: bool) -> NDArray[Any]:
+    """Return observations of every kind; those where two choices tie stay out, as another machine may choose either."""
+    chosen = []
+    for kind, count in GOLDEN_SAMPLES.items():
+        one = max((one for one in recorded if one.batch.kind == kind), key=lambda one: len(one.batch.obs))
+        clear = ~ties(one.outputs) if discrete else np.ones(len(one.batch.obs), np.bool_)
+        chosen.append(one.batch.obs[clear][:count])
+    golden = np.concatenate(chosen)
+    # A policy that never has a clear favourite still needs vectors; its runtime excuses ties as the gate does.
+    return golden if len(golden) else recorded[0].batch.obs[: sum(GOLDEN_SAMPLES.values())]
+
+
+def _tensor(name: str, values: NDArray[Any]) -> TensorSpec:
+    return TensorSpec(name=name, dtype=str(values.dtype), shape=(-1, *values.shape[1:]))
+
+
+def _provenance(files: CheckpointFiles, facts: CheckpointFacts, restored: Checkpoint) -> Provenance:
+    import ray
+    import torch
+
+    return Provenance(
+        algorithm=facts.algorithm,
+        api_stack="new",
+        module_id=files.module_id,
+        module_class=restored.module_class,
+        checkpoint_sha256=files.sha256(),
+        training_iterations=facts.training_iterations,
+        env_steps=facts.env_steps,
+        env_id=facts.env_id,
+        env_config=facts.env_config,
+        ray_version=facts.ray_version or ray.__version__,
+        torch_version=torch.__version__,
+        rlservo_version=_own_version(),
+        exported_at=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+    )
+
+
+def _own_version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("rlservo")
+    except PackageNotFoundError:  # run from a source tree that was never installed
+        return "unknown"
+
+
+def _write_rest(folder: Path, contract: Contract, golden: _Golden) -> None:
+    """Write golden vectors, contract and hashes, and check that the finished files are what was proven."""
+    from rlservo.export.onnx import CONTRACT_KEY, add_metadata, run_onnx
+
+    add_metadata(folder / ONNX_FILE, {CONTRACT_KEY: contract_json(contract)})
+    write_golden(folder, {"obs": golden.inputs}, golden.outputs)
+    write_contract(folder, contract)
+    inputs, outputs = load_bundle(folder).golden()
+    replayed = run_onnx(folder / ONNX_FILE)(inputs["obs"])
+    for name, values in outputs.items():
+        if not np.array_equal(values, replayed[name], equal_nan=True):
+            raise ParityError(f"the finished file's '{name}' is not what was proven: is the disk full or failing?")

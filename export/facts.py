@@ -1,0 +1,121 @@
+"""What a checkpoint says of itself: algorithm, environment, progress.
+
+None of it changes what the policy does, so none of it may stop an export: what cannot be read is left out, with a
+notice. A pruned checkpoint holds these facts as JSON; a full one holds them in RLlib's configuration pickles, which
+this file opens without importing RLlib itself.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rlservo.export.errors import CheckpointError
+from rlservo.export.location import CTOR_FILE, FACTS_FILE
+from rlservo.export.unpickle import unpickle
+
+# Where RLlib (ray 2.60) keeps its counters in algorithm_state.pkl.
+_ENV_STEPS = "env_runners--num_env_steps_sampled_lifetime"
+
+
+@dataclass(frozen=True)
+class CheckpointFacts:
+    """Facts for the contract's provenance; None where the checkpoint does not tell."""
+
+    algorithm: str = "unknown"
+    env_id: str | None = None
+    env_config: dict[str, Any] = field(default_factory=dict)
+    training_iterations: int | None = None
+    env_steps: int | None = None
+    ray_version: str | None = None
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self), indent=2) + "\n"
+
+
+def read_facts(root: Path, notify: Callable[[str], None]) -> CheckpointFacts:
+    """Return what the algorithm checkpoint at `root` says of itself, with a notice for each part that is unreadable."""
+    if (root / FACTS_FILE).is_file():
+        return _from_json(root / FACTS_FILE, notify)
+    algorithm: str = "unknown"
+    config: Mapping[str, Any] = {}
+    if (opened := _open(root / CTOR_FILE, "algorithm and environment", notify)) is not None:
+        algorithm = getattr(opened.get("class"), "__name__", "unknown")
+        config = _config(opened.get("ctor_args_and_kwargs"))
+    state = _open(root / "algorithm_state.pkl", "training progress", notify) or {}
+    stats = state.get("metrics_logger", {}).get("stats", {})
+    return CheckpointFacts(
+        algorithm=algorithm,
+        env_id=_env_name(config.get("env")),
+        env_config=_json_values(config.get("env_config") or {}, notify),
+        training_iterations=_whole(state.get("training_iteration")),
+        env_steps=_whole(stats.get(_ENV_STEPS, {}).get("lifetime_sum")),
+        ray_version=_ray_version(root),
+    )
+
+
+def _from_json(file: Path, notify: Callable[[str], None]) -> CheckpointFacts:
+    try:
+        return CheckpointFacts(**json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        notify(f"{file} cannot be read ({error}): algorithm, environment and progress stay unnamed")
+        return CheckpointFacts()
+
+
+def _open(file: Path, what: str, notify: Callable[[str], None]) -> dict[str, Any] | None:
+    if not file.is_file():
+        return None
+    try:
+        opened = unpickle(file)
+    except CheckpointError as error:
+        notify(f"the checkpoint's {what} cannot be told: {error}")
+        return None
+    return opened if isinstance(opened, dict) else None
+
+
+def _config(ctor_args_and_kwargs: Any) -> Mapping[str, Any]:
+    """Return the algorithm's configuration as a mapping, wherever RLlib put it among the constructor's arguments."""
+    if not isinstance(ctor_args_and_kwargs, tuple) or len(ctor_args_and_kwargs) != 2:
+        return {}
+    args, kwargs = ctor_args_and_kwargs
+    config = kwargs.get("config", args[0] if args else {})
+    if isinstance(config, Mapping):
+        return config
+    return {name: getattr(config, name, None) for name in ("env", "env_config")}
+
+
+def _env_name(env: Any) -> str | None:
+    """Return the id the environment was made by; for a class given directly, its import path."""
+    if isinstance(env, str):
+        return env
+    if isinstance(env, type):
+        return f"{env.__module__}:{env.__qualname__}"
+    return None
+
+
+def _json_values(env_config: Mapping[str, Any], notify: Callable[[str], None]) -> dict[str, Any]:
+    """Return the part of an env_config that JSON can hold."""
+    kept: dict[str, Any] = {}
+    for key, value in dict(env_config).items():
+        try:
+            kept[str(key)] = json.loads(json.dumps(value, allow_nan=False))
+        except (TypeError, ValueError):
+            notify(f"env_config['{key}'] is a {type(value).__name__}, which JSON cannot hold: left out of the contract")
+    return kept
+
+
+def _whole(number: Any) -> int | None:
+    try:
+        return int(number)
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def _ray_version(root: Path) -> str | None:
+    try:
+        return str(json.loads((root / "rllib_checkpoint.json").read_text(encoding="utf-8"))["ray_version"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,164 @@
+"""Find the files of a checkpoint: from whatever folder a person points at to the folders the exporter reads.
+
+This file only looks at names. It opens no pickle and knows nothing of RLlib, so it can say what is wrong with a path
+before anything heavy is imported or any code in the checkpoint is run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from rlservo.export.errors import CheckpointError, UnsupportedError
+
+MODULES = Path("learner_group") / "learner" / "rl_module"
+ENV_TO_MODULE = Path("env_runner") / "env_to_module_connector"
+MODULE_TO_ENV = Path("env_runner") / "module_to_env_connector"
+CTOR_FILE = "class_and_ctor_args.pkl"
+STATE_STEMS = {"module": "module_state", "connector": "state"}
+STATE_SUFFIXES = (".pkl", ".msgpack")
+FACTS_FILE = "rlservo_facts.json"
+"""Written by `prune.py` in place of RLlib's own configuration pickles."""
+
+_TUNE_CHECKPOINT = re.compile(r"checkpoint_(\d{6,})")
+
+
+@dataclass(frozen=True)
+class CheckpointFiles:
+    """The folders of one policy in one new-stack algorithm checkpoint; all of them exist."""
+
+    root: Path
+    module_id: str
+
+    @property
+    def module(self) -> Path:
+        return self.root / MODULES / self.module_id
+
+    @property
+    def env_to_module(self) -> Path:
+        return self.root / ENV_TO_MODULE
+
+    @property
+    def module_to_env(self) -> Path:
+        return self.root / MODULE_TO_ENV
+
+    def files(self) -> list[Path]:
+        """Return every file that decides what the policy does, in a fixed order."""
+        folders = (self.module, self.env_to_module, self.module_to_env)
+        return sorted(file for folder in folders for file in folder.rglob("*") if file.is_file())
+
+    def sha256(self) -> str:
+        """Return a hash over those files' names and contents: the same for a checkpoint and its pruned copy."""
+        digest = hashlib.sha256()
+        for file in self.files():
+            digest.update(file.relative_to(self.root).as_posix().encode() + b"\0")
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+        return digest.hexdigest()
+
+
+def locate_checkpoint(path: str | Path, module_id: str | None = None) -> CheckpointFiles:
+    """Return the files of one policy.
+
+    `path` may be an algorithm checkpoint, a folder inside one (such as its RLModule folder), or a Tune trial folder,
+    of which the newest `checkpoint_NNNNNN` is taken.
+
+    Raises CheckpointError when there is nothing to read, UnsupportedError when it is of a kind that is not exported.
+    """
+    given = Path(path).expanduser().absolute()
+    if not given.exists():
+        raise CheckpointError(f"{given} does not exist: expected the folder of an RLlib checkpoint")
+    if not given.is_dir():
+        raise CheckpointError(f"{given} is a file: expected the folder of an RLlib checkpoint")
+    root = _find_root(given)
+    if root != given and (root / MODULES) in given.parents and module_id is None:
+        module_id = given.relative_to(root / MODULES).parts[0]
+    files = CheckpointFiles(root, _choose_module(root, module_id))
+    _check_complete(files)
+    return files
+
+
+def _find_root(given: Path) -> Path:
+    """Return the algorithm checkpoint that `given` is, lies in, or holds."""
+    for folder in (given, *given.parents):
+        if (folder / MODULES).is_dir():
+            return folder
+    _refuse_old_stack(given)
+    if newest := _newest_checkpoint(given):
+        return _find_root(newest)
+    trials = [trial for trial in sorted(given.iterdir()) if trial.is_dir() and _newest_checkpoint(trial)]
+    if len(trials) == 1:
+        return _find_root(trials[0])
+    if trials:
+        names = ", ".join(trial.name for trial in trials[:4]) + (", ..." if len(trials) > 4 else "")
+        raise CheckpointError(f"{given} holds {len(trials)} trials with checkpoints ({names}): name one of them")
+    if any((given / f"module_state{suffix}").is_file() for suffix in STATE_SUFFIXES):
+        raise UnsupportedError(
+            f"{given} is an RLModule on its own: the observation filter and the action scaling are kept outside it, in "
+            "the algorithm checkpoint's env_runner folder; give the whole algorithm checkpoint"
+        )
+    raise CheckpointError(
+        f"{given} is not an RLlib checkpoint: looked for {MODULES}/ (an algorithm checkpoint of the new API stack), "
+        "policies/ (the old stack) and checkpoint_NNNNNN/ (a Tune trial), found none of them"
+    )
+
+
+def _newest_checkpoint(folder: Path) -> Path | None:
+    numbered = [
+        (int(match[1]), child)
+        for child in folder.iterdir()
+        if (match := _TUNE_CHECKPOINT.fullmatch(child.name)) and child.is_dir()
+    ]
+    return max(numbered)[1] if numbered else None
+
+
+def _refuse_old_stack(folder: Path) -> None:
+    """Raise UnsupportedError when `folder` was written by RLlib's old API stack."""
+    old_files = any((folder / "policies").glob("*/policy_state.*")) or any(folder.glob("policy_state.*"))
+    very_old = any(re.fullmatch(r"checkpoint-\d+", child.name) for child in folder.iterdir())
+    if old_files or very_old or _recorded_version(folder) in ("0", "1"):
+        raise UnsupportedError(
+            f"{folder} is a checkpoint of RLlib's old API stack, which is not exported yet: its filter, preprocessor "
+            "and action connectors live in the policy state; train with the new API stack (RLlib's default), or wait "
+            "for old-stack support"
+        )
+
+
+def _recorded_version(folder: Path) -> str | None:
+    """Return the major checkpoint version in rllib_checkpoint.json, if that can be read."""
+    try:
+        recorded = json.loads((folder / "rllib_checkpoint.json").read_text(encoding="utf-8"))
+        return str(recorded["checkpoint_version"]).split(".")[0]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _choose_module(root: Path, module_id: str | None) -> str:
+    present = sorted(child.name for child in (root / MODULES).iterdir() if (child / CTOR_FILE).is_file())
+    if module_id is not None and module_id not in present:
+        raise CheckpointError(f"{root} has no module '{module_id}': it holds {', '.join(present) or 'none'}")
+    if not present:
+        raise CheckpointError(f"{root / MODULES} holds no module: looked for <module id>/{CTOR_FILE}")
+    if len(present) > 1:
+        raise UnsupportedError(
+            f"{root} is a multi-agent checkpoint (modules {', '.join(present)}), which is not exported yet: it would "
+            "need the agent-to-module mapping and each agent's own connectors"
+        )
+    return present[0]
+
+
+def _check_complete(files: CheckpointFiles) -> None:
+    needed = (
+        (files.module, STATE_STEMS["module"], "the weights"),
+        (files.env_to_module, STATE_STEMS["connector"], "the observation filter and other steps before the network"),
+        (files.module_to_env, STATE_STEMS["connector"], "the action scaling and other steps after the network"),
+    )
+    for folder, stem, what in needed:
+        for present, name in (
+            ((folder / CTOR_FILE).is_file(), CTOR_FILE),
+            (any((folder / f"{stem}{suffix}").is_file() for suffix in STATE_SUFFIXES), f"{stem}.pkl"),
+        ):
+            if not present:
+                raise CheckpointError(f"{files.root} is incomplete: {folder.relative_to(files.root) / name} ({what})")

@@ -1,0 +1,57 @@
+"""Write a policy graph as TorchScript, and run such a file.
+
+TorchScript is what C++ programs with libtorch and ROS nodes load; torch itself calls it deprecated in favour of
+torch.export. It knows nothing of RLlib and does not judge the numbers.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from torch.jit._trace import TracerWarning
+
+from rlservo.export.actor import PolicyGraph
+from rlservo.export.errors import UnsupportedError
+from rlservo.export.unpickle import first_line
+
+
+def write_torchscript(graph: PolicyGraph, example: NDArray[Any], file: Path) -> None:
+    """Write `graph` to `file`: one input, a tuple of the graph's outputs; freezing drops what inference does not use.
+
+    Raises UnsupportedError when the network cannot be traced.
+    """
+    with warnings.catch_warnings():
+        _ignore_deprecation()
+        # A constant baked in by tracing is what the parity gate is there to find.
+        warnings.filterwarnings("ignore", category=TracerWarning)
+        try:
+            with torch.no_grad():
+                traced = torch.jit.trace(  # type: ignore[no-untyped-call]  # torch annotates it only in part
+                    graph, (torch.from_numpy(example),), check_trace=False
+                )
+                torch.jit.freeze(traced).save(str(file))
+        except Exception as error:  # the network's own forward may raise anything
+            raise UnsupportedError(f"the network cannot be traced: {first_line(error)}") from error
+
+
+def run_torchscript(file: Path, names: tuple[str, ...]) -> Callable[[NDArray[Any]], dict[str, NDArray[Any]]]:
+    """Return a function from raw observations `[batch, *obs_shape]` to the outputs, which are called `names`."""
+    with warnings.catch_warnings():
+        _ignore_deprecation()
+        script = torch.jit.load(str(file))  # type: ignore[no-untyped-call]  # torch annotates it only in part
+
+    def run(obs: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        with torch.no_grad():
+            values = script(torch.from_numpy(obs))
+        return {name: value.numpy() for name, value in zip(names, values, strict=True)}
+
+    return run
+
+
+def _ignore_deprecation() -> None:
+    warnings.filterwarnings("ignore", r"`torch\.jit\.\w+` is deprecated", DeprecationWarning)

@@ -1,0 +1,69 @@
+"""Open a checkpoint's pickles, and say in one sentence why one cannot be opened.
+
+Loading a pickle runs the code it names; callers say so first. This file knows nothing of what is in them.
+"""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rlservo.export.errors import CheckpointError
+
+
+@contextmanager
+def user_code(app_dir: str | Path) -> Iterator[None]:
+    """Let the checkpoint import the user's own modules from `app_dir`, before anything else of that name."""
+    folder = str(Path(app_dir).expanduser().absolute())
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        if folder in sys.path:  # imported code may have changed the path itself
+            sys.path.remove(folder)
+
+
+def unpickle(file: Path) -> Any:
+    """Return the object pickled in `file` (cloudpickle writes ordinary pickles).
+
+    Raises CheckpointError when the file is missing or damaged, or the code it names cannot be imported.
+    """
+    try:
+        with file.open("rb") as stream:
+            return pickle.load(stream)
+    except OSError as error:
+        raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # a damaged pickle raises almost anything, and so does the code it runs
+        raise CheckpointError(f"{file} cannot be loaded: {explain(error)}") from error
+
+
+def explain(error: BaseException) -> str:
+    """Return in one clause why loading failed."""
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        return (
+            f"it needs the Python module '{error.name}', which was not found in {searched()}; "
+            "give the folder that holds it with --app-dir"
+        )
+    if isinstance(error, ImportError | AttributeError):
+        return (
+            f"its code does not fit what is installed ({first_line(error)}); looked in {searched()}, and --app-dir "
+            "names another folder"
+        )
+    if isinstance(error, EOFError | pickle.UnpicklingError | UnicodeDecodeError | IndexError | KeyError | MemoryError):
+        return f"the file is truncated or damaged ({first_line(error)})"
+    return first_line(error)
+
+
+def searched() -> str:
+    """Return the import path as a person reads it: without the standard library, which holds no user code."""
+    own = [entry or "." for entry in sys.path if "lib/python" not in entry and not entry.endswith(".zip")]
+    return ", ".join(dict.fromkeys([*own, "the installed packages"]))
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an exception's text, or its type where it has none."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:300]

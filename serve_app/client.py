@@ -1,0 +1,243 @@
+"""A policy that runs on a server, used like one that runs in process: `PolicyClient` is an `ActingPolicy` over HTTP.
+
+It needs numpy, pydantic and httpx. It knows of the server only its `/v1` addresses, and nothing of ray, onnxruntime or
+environments. A robot's loop gets an action that belongs to the observation it just sent, in time, or an error: every
+request carries a running number `seq`, and an answer with another number, a late one or a malformed one is never used.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
+from typing_extensions import Self
+
+from rlservo.export.bundle import Contract
+from rlservo.export.errors import (
+    ActionError,
+    DeadlineError,
+    ObservationError,
+    UnavailableError,
+    UnknownPolicyError,
+    UsageError,
+)
+from rlservo.serve_app.acting import Observation
+from rlservo.serve_app.transport import Transport, encode
+
+POLL_S = 0.1  # between two looks at a server that is starting
+
+
+class PolicyClient:
+    """One policy of an rlservo server.
+
+    ```python
+    with PolicyClient("http://127.0.0.1:8000", "ur5") as policy:
+        action = policy.act(obs)
+    ```
+
+    The version is settled at the first contact (the newest, unless `version` names one) and stays: a newer one that
+    the server loads meanwhile does not change a running loop.
+
+    Thread-safe for stateless policies: threads share the connections and each gets the answer to its own request.
+    A recurrent policy's state is kept here and sent along, so such a client belongs to one loop.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        policy: str | None = None,
+        *,
+        version: str | None = None,
+        timeout_s: float = 5.0,
+        retries: int = 2,
+        api_key: str | None = None,
+    ) -> None:
+        """Check the arguments; the server is first asked when `contract` or `act` needs it.
+
+        `policy` may be None where the server has exactly one. `timeout_s` bounds one call, its retries included;
+        `retries` counts further attempts after a failed connection or a 503, nothing else is ever sent twice.
+        """
+        if policy == "":
+            raise UsageError("the policy's name is empty: give a name, or None where the server has only one policy")
+        if version is not None and policy is None:
+            raise UsageError(f"version {version!r} was given without the policy's name")
+        self._transport = Transport(url, timeout_s=timeout_s, retries=retries, api_key=api_key)
+        self._deadline_ms = 1e3 * timeout_s
+        self._policy = policy
+        self._version = version
+        self._contract: Contract | None = None
+        self._numbers = itertools.count(1)  # next() is atomic: no two requests share a number
+        self._state: dict[str, Any] | None = None
+
+    @property
+    def contract(self) -> Contract:
+        """The policy's contract, fetched once.
+
+        Raises UnavailableError, DeadlineError, UnknownPolicyError, or UsageError when no policy was named and the
+        server has several.
+        """
+        if self._contract is None:
+            self._contract = self._fetch()
+        return self._contract
+
+    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> NDArray[Any]:
+        """Return the action for `obs`, as `ActingPolicy.act` describes.
+
+        Raises ObservationError (non-finite numbers are refused here, the rest by the server), ActionError when the
+        answer is not an action of this policy, DeadlineError after `timeout_s`, UnavailableError when the server
+        cannot be reached, is not ready, or answers another request than this one.
+        """
+        contract = self.contract
+        number = next(self._numbers)
+        plain, batch = _sendable(obs, contract)
+        # The server drops what it could not answer in time, instead of working through a queue of abandoned questions.
+        request: dict[str, Any] = {"obs": plain, "seq": number, "deadline_ms": self._deadline_ms}
+        if explore:
+            request["explore"] = True
+        if seed is not None:
+            request["seed"] = seed
+        if self._state is not None:
+            request["state"] = self._state
+        path = ("v1", "policies", contract.name, "versions", contract.version, "act")
+        reply = self._transport.post(*path, body=encode(request))
+        self._check_sender(reply, number, contract)
+        action = _restored(reply.get("action"), batch, contract)
+        if contract.state:
+            self._state = reply.get("state")
+        return action
+
+    def reset(self) -> None:
+        """Start an episode: the next request carries no recurrent state. Sends nothing."""
+        self._state = None
+
+    def wait_until_ready(self, timeout_s: float = 60.0) -> None:
+        """Return as soon as the server offers the policy.
+
+        Raises UnavailableError with the last reason after `timeout_s`, and at once what waiting cannot cure, such as
+        UnknownPolicyError.
+        """
+        deadline = time.monotonic() + timeout_s
+        while self._contract is None:
+            remaining = deadline - time.monotonic()
+            try:
+                self._contract = self._fetch(timeout_s=max(min(remaining, 5.0), 0.01), retries=0)
+            except (UnavailableError, DeadlineError) as error:
+                if time.monotonic() + POLL_S >= deadline:
+                    raise UnavailableError(
+                        f"{self._transport.url} was not ready within {timeout_s:g} s: {error.message}", error.details
+                    ) from error
+                time.sleep(POLL_S)
+
+    def close(self) -> None:
+        """Close the connections; later calls raise UsageError."""
+        self._transport.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _fetch(self, *, timeout_s: float | None = None, retries: int | None = None) -> Contract:
+        name = self._policy
+        if name is None:
+            name = _only_policy(self._transport.get("v1", "policies", timeout_s=timeout_s, retries=retries))
+        versions = () if self._version is None else ("versions", self._version)
+        document = self._transport.get("v1", "policies", name, *versions, timeout_s=timeout_s, retries=retries)
+        try:
+            return Contract.model_validate(document)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(str(part) for part in first["loc"]) or "the document"
+            raise UnavailableError(
+                f"{self._transport.url} sent a contract for {name!r} that this client cannot read: {where}: "
+                f"{first['msg']} (is the server another version of rlservo?)"
+            ) from error
+
+    def _check_sender(self, reply: Any, number: int, contract: Contract) -> None:
+        """Refuse an answer to another request or from another policy: it must not move this robot."""
+        if not isinstance(reply, dict):
+            raise UnavailableError(f"{self._transport.url} answered with {type(reply).__name__}, expected an object")
+        if reply.get("seq") != number:
+            raise UnavailableError(
+                f"{self._transport.url} answered request {reply.get('seq')!r}, expected {number}: "
+                "the action was dropped",
+                {"expected": number, "actual": reply.get("seq")},
+            )
+        sender = (reply.get("policy"), reply.get("version"))
+        if sender != (contract.name, contract.version):
+            raise UnavailableError(
+                f"{self._transport.url} answered for policy {sender[0]!r} version {sender[1]!r}, expected "
+                f"{contract.name!r} version {contract.version!r}: the action was dropped"
+            )
+
+
+def _only_policy(listing: Any) -> str:
+    """Return the name of the server's one policy, or raise an error that lists them."""
+    policies = listing.get("policies") if isinstance(listing, dict) else None
+    if not isinstance(policies, list):
+        raise UnavailableError("the server's list of policies cannot be read: is it another version of rlservo?")
+    names = sorted({str(entry["name"]) for entry in policies if isinstance(entry, dict) and "name" in entry})
+    if not names:
+        raise UnknownPolicyError("the server has no policy loaded")
+    if len(names) > 1:
+        raise UsageError(f"the server has {len(names)} policies: name one of {', '.join(names)}", {"policies": names})
+    return names[0]
+
+
+def _sendable(obs: Observation, contract: Contract) -> tuple[Any, tuple[int, ...]]:
+    """Return (what goes into the JSON, the batch axis as () or (B,)); the server checks shapes and names."""
+    space = contract.observation_space
+    if isinstance(obs, Mapping):
+        named = {str(name): _finite(value, f"element {name!r}") for name, value in obs.items()}
+        return named, next((value.shape[:1] for value in named.values()), ())
+    array = _finite(obs, "")
+    batch = array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
+    return array, batch
+
+
+def _finite(value: ArrayLike, where: str) -> NDArray[Any]:
+    """Return `value` as a contiguous array of finite numbers, or raise ObservationError naming the element."""
+    try:
+        array = np.ascontiguousarray(value).reshape(np.shape(value))  # ascontiguousarray makes a scalar an array of 1
+    except ValueError as error:
+        raise ObservationError(f"the observation is ragged: expected numbers in one shape ({error})") from error
+    if array.dtype.kind not in "fiub":
+        got = type(value).__name__ if array.dtype.kind == "O" else array.dtype.name
+        raise ObservationError(f"the observation{where and f', {where},'} holds {got}, expected numbers")
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)  # orjson takes the machine's own byte order only
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        first = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        which = where or f"element {first[0] if len(first) == 1 else first}"
+        raise ObservationError(
+            f"the observation's {which} is {array[first]}: expected a finite number", {"element": list(first)}
+        )
+    return array
+
+
+def _restored(action: Any, batch: tuple[int, ...], contract: Contract) -> NDArray[Any]:
+    """Return the JSON action as an array of the contract's dtype and shape, or raise ActionError."""
+    space = contract.action_space
+    expected = (*batch, *space.shape)
+    try:
+        array = np.asarray(action)
+    except ValueError:
+        array = np.asarray(None)
+    if array.dtype.kind not in "fiu" and array.size:
+        raise ActionError(f"the server's action for {contract.name!r} is {str(action)[:80]}, expected numbers")
+    if array.shape != expected:
+        raise ActionError(f"the server's action for {contract.name!r} has shape {array.shape}, expected {expected}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ActionError(f"the server's action for {contract.name!r} has an element that is not finite")
+    typed = array.astype(space.dtype)
+    if typed.dtype.kind in "iu" and not np.array_equal(typed, array):
+        raise ActionError(f"the server's action for {contract.name!r} is {str(action)[:80]}, expected {space.dtype}")
+    return typed

@@ -1,0 +1,103 @@
+"""The launcher's child: a private Ray cluster with the policy server in it, for as long as its standard input is open.
+
+`launcher.py` starts it as `python -m rlservo.serve_app.cluster PLAN`, with the environment Ray's processes are to
+inherit. It reports on the file descriptor the plan names, one JSON object per line, and shuts everything down when its
+standard input ends: because the launcher closed it, or because the launcher is no more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import os
+import signal
+import sys
+import threading
+from typing import Any
+
+from rlservo.serve_app.processes import end_marked
+
+OBJECT_STORE_BYTES = 80 << 20  # Ray's least is 75 MiB; requests do not go through it
+
+
+def main() -> int:
+    plan: dict[str, Any] = json.loads(sys.argv[1])
+    # A terminal's Ctrl-C reaches the whole process group. What to do about it is the launcher's decision.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    stop = threading.Event()
+    started = threading.Event()
+    threading.Thread(target=_watch_input, args=(stop, started, plan["mark"]), daemon=True).start()
+    import ray
+
+    from rlservo.serve_app import app
+
+    _leave_out_monitors()
+    try:
+        ray.init(
+            address="local",  # whatever RAY_ADDRESS or a running cluster says
+            num_cpus=max(1, plan["replicas"]),
+            num_gpus=0,
+            object_store_memory=OBJECT_STORE_BYTES,
+            include_dashboard=False,
+            log_to_driver=False,
+            configure_logging=False,
+            _temp_dir=plan["folder"],
+            _node_ip_address="127.0.0.1",  # Ray's own ports stay on this machine
+            _system_config={"enable_worker_prestart": False},
+        )
+        app.start(
+            plan["policies"],
+            host=plan["host"],
+            port=plan["port"],
+            replicas=plan["replicas"],
+            settings=plan["settings"],
+        )
+    except Exception as error:
+        _report(plan, {"error": _sentence(error)})
+        raise
+    started.set()
+    _report(plan, {"ready": True})
+    stop.wait()
+    app.stop()
+    ray.shutdown()
+    return 0
+
+
+def _leave_out_monitors() -> None:
+    """Keep Ray from starting its autoscaler's monitor and its log forwarder: 165 MB, a second, and no use here.
+
+    `ray start` has flags for both and `ray.init` has none (ray 2.60). Where the private class has moved, they start.
+    """
+    from ray._private import parameter
+
+    with contextlib.suppress(AttributeError):
+        parameter.RayParams = functools.partial(  # type: ignore[misc, assignment]
+            parameter.RayParams,
+            no_monitor=True,
+            include_log_monitor=False,  # type: ignore[arg-type]
+        )
+
+
+def _watch_input(stop: threading.Event, started: threading.Event, mark: str) -> None:
+    while os.read(0, 4096):
+        pass
+    stop.set()
+    if not started.is_set():
+        # Nothing has been served yet, so there is nothing to drain; a half-started cluster has no orderly end.
+        end_marked(mark)
+        os._exit(0)
+
+
+def _report(plan: dict[str, Any], message: dict[str, Any]) -> None:
+    os.write(plan["report_fd"], json.dumps(message).encode() + b"\n")
+
+
+def _sentence(error: Exception) -> str:
+    """Return the line that says what went wrong: the last one, since Ray puts the remote traceback before it."""
+    text = str(error).strip() or type(error).__name__
+    return text.splitlines()[-1].strip()[:500]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

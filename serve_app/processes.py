@@ -1,0 +1,114 @@
+"""What a launcher must know of the machine: free ports, who holds one, and how to leave no process behind.
+
+Every process of a launch inherits one environment variable with the launch's own mark, so that whatever is left of it
+can be found and ended whatever became of its parents. Reads /proc (Linux). It knows nothing of ray or policies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import signal
+import socket
+import time
+from pathlib import Path
+
+from rlservo.export.errors import UsageError
+
+MARK = "RLSERVO_LAUNCH"
+PROC = Path("/proc")
+
+
+def check_port(host: str, port: int) -> None:
+    """Raise UsageError unless a server could listen on host:port right now; say who holds it."""
+    if not 0 < port < 65536:
+        raise UsageError(f"port must be in 1..65535, got {port}")
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except OSError as error:
+        raise UsageError(f"host '{host}' is not an address of this machine: {error.strerror}") from error
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # closed connections lingering are no obstacle
+        try:
+            probe.bind(address)
+            probe.listen(1)
+        except OSError as error:
+            raise UsageError(_why_not(host, port, error)) from error
+
+
+def _why_not(host: str, port: int, error: OSError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        holder = port_holder(port)
+        if holder is None:
+            return f"port {port} on {host} is in use: stop what listens there, or choose another with --port"
+        pid, name = holder
+        message = f"port {port} on {host} is in use by '{name}' (process {pid})"
+        if name == "haproxy":
+            return (
+                f"{message}: a proxy that an earlier Ray Serve left behind, it would answer in our place; "
+                f"end it with 'kill {pid}', or choose another port with --port"
+            )
+        return f"{message}: stop it, or choose another with --port"
+    if error.errno == errno.EACCES:
+        return f"port {port} needs more rights than this user has: choose one above 1023 with --port"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return f"host '{host}' is not an address of this machine: use 127.0.0.1, or 0.0.0.0 for all of its addresses"
+    return f"cannot listen on {host}:{port}: {error.strerror}"
+
+
+def port_holder(port: int) -> tuple[int, str] | None:
+    """Return (pid, command name) of a process listening on a TCP port, where /proc shows it to this user."""
+    inodes: set[str] = set()
+    for table in ("net/tcp", "net/tcp6"):
+        with contextlib.suppress(OSError):
+            for line in (PROC / table).read_text().splitlines()[1:]:
+                fields = line.split()
+                if fields[3] == "0A" and int(fields[1].rsplit(":", 1)[1], 16) == port:  # 0A: LISTEN
+                    inodes.add(f"socket:[{fields[9]}]")
+    for pid in _pids():
+        with contextlib.suppress(OSError):
+            if any(str(link.readlink()) in inodes for link in (PROC / str(pid) / "fd").iterdir()):
+                return pid, (PROC / str(pid) / "comm").read_text().strip()
+    return None
+
+
+def free_ports(count: int) -> list[int]:
+    """Return ports free at the moment of asking, all different."""
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) for _ in range(count)]
+        for each in sockets:
+            each.bind(("", 0))
+        return [int(each.getsockname()[1]) for each in sockets]
+
+
+def marked(mark: str) -> list[int]:
+    """Return the living processes, other than this one, that carry the launch's mark."""
+    wanted = f"{MARK}={mark}".encode()
+    found = []
+    for pid in _pids():
+        if pid == os.getpid():
+            continue
+        with contextlib.suppress(OSError):
+            # A zombie's environment reads as empty: it is gone but for its parent's notice.
+            if wanted in (PROC / str(pid) / "environ").read_bytes().split(b"\0"):
+                found.append(pid)
+    return found
+
+
+def end_marked(mark: str, *, timeout_s: float = 10.0) -> list[int]:
+    """Kill every process that carries the mark, and those they start meanwhile; return what would not go."""
+    deadline = time.monotonic() + timeout_s
+    while (left := marked(mark)) and time.monotonic() < deadline:
+        for pid in left:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(0.05)
+    return left
+
+
+def _pids() -> list[int]:
+    try:
+        return [int(entry.name) for entry in PROC.iterdir() if entry.name.isdigit()]
+    except OSError:
+        return []

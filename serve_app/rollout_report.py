@@ -1,0 +1,187 @@
+"""What a closed-loop run came to: its numbers, as JSON and as a table. Knows nothing of environments or policies."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from rich.table import Table
+
+Rate = Literal["max", "real"]
+
+
+@dataclass(frozen=True)
+class EpisodeRow:
+    """One finished episode."""
+
+    index: int
+    seed: int | None
+    steps: int
+    episode_return: float
+    success: bool | None  # None: the environment does not say
+    final_status: str | None
+    latency_p50_ms: float
+    latency_max_ms: float
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Time spent in `act`, over every step of the run, unfinished episodes included [ms]."""
+
+    p50: float
+    p95: float
+    p99: float
+    max: float
+
+
+@dataclass(frozen=True)
+class RolloutReport:
+    """A run of several episodes. Figures of episodes count finished ones; None means there is nothing to count."""
+
+    env_id: str
+    policy: str
+    version: str
+    rate: Rate
+    seed: int | None
+    requested_episodes: int
+    interrupted: bool
+    episodes: tuple[EpisodeRow, ...]
+    successes: int | None
+    success_rate: float | None
+    success_interval: tuple[float, float] | None  # 95%, Wilson
+    return_mean: float | None
+    return_std: float | None
+    length_mean: float | None
+    final_status: dict[str, int]
+    steps: int
+    wall_s: float  # first reset to last step
+    steps_per_s: float
+    latency_ms: Latency | None
+    control_rate_hz: float | None
+    deadline_ms: float | None  # one control period
+    deadline_misses: int | None  # steps whose `act` alone took longer than that
+    overruns: int | None  # rate 'real': steps after which the loop was late for the next one
+    video: str | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain JSON types."""
+        document = asdict(self)
+        document["episodes"] = [asdict(row) for row in self.episodes]
+        document["success_interval"] = None if self.success_interval is None else list(self.success_interval)
+        return document
+
+
+def summarise(
+    rows: Sequence[EpisodeRow],
+    latencies_s: Sequence[float],
+    *,
+    env_id: str,
+    policy: str,
+    version: str,
+    rate: Rate,
+    seed: int | None,
+    requested_episodes: int,
+    interrupted: bool,
+    wall_s: float,
+    control_rate_hz: float | None,
+    overruns: int,
+    video: str | None,
+) -> RolloutReport:
+    """Return the report of what was recorded."""
+    judged = [row.success for row in rows if row.success is not None]
+    returns = np.array([row.episode_return for row in rows])
+    deadline_s = None if control_rate_hz is None else 1 / control_rate_hz
+    return RolloutReport(
+        env_id=env_id,
+        policy=policy,
+        version=version,
+        rate=rate,
+        seed=seed,
+        requested_episodes=requested_episodes,
+        interrupted=interrupted,
+        episodes=tuple(rows),
+        successes=sum(judged) if judged else None,
+        success_rate=sum(judged) / len(judged) if judged else None,
+        success_interval=wilson_interval(sum(judged), len(judged)) if judged else None,
+        return_mean=float(returns.mean()) if rows else None,
+        return_std=float(returns.std(ddof=1)) if len(rows) > 1 else None,
+        length_mean=float(np.mean([row.steps for row in rows])) if rows else None,
+        final_status=dict(Counter(row.final_status for row in rows if row.final_status is not None).most_common()),
+        steps=len(latencies_s),
+        wall_s=wall_s,
+        steps_per_s=len(latencies_s) / wall_s if wall_s > 0 else 0.0,
+        latency_ms=latency_of(latencies_s),
+        control_rate_hz=control_rate_hz,
+        deadline_ms=None if deadline_s is None else 1e3 * deadline_s,
+        deadline_misses=None if deadline_s is None else sum(latency > deadline_s for latency in latencies_s),
+        overruns=overruns if rate == "real" else None,
+        video=video,
+    )
+
+
+def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Return the 95% score interval of a proportion (E. B. Wilson, 1927); sound at 0% and 100%, unlike +-1.96 sigma."""
+    if not 0 <= successes <= trials or trials == 0:
+        raise ValueError(f"{successes} successes of {trials} trials is not a proportion")
+    p = successes / trials
+    centre = p + z * z / (2 * trials)
+    half = z * math.sqrt(p * (1 - p) / trials + z * z / (4 * trials * trials))
+    scale = 1 + z * z / trials
+    return max((centre - half) / scale, 0.0), min((centre + half) / scale, 1.0)
+
+
+def latency_of(latencies_s: Sequence[float]) -> Latency | None:
+    """Return the percentiles of latencies given in seconds, in milliseconds."""
+    if not latencies_s:
+        return None
+    p50, p95, p99 = (float(p) for p in np.percentile(latencies_s, (50, 95, 99)))
+    return Latency(1e3 * p50, 1e3 * p95, 1e3 * p99, 1e3 * max(latencies_s))
+
+
+def render_report(report: RolloutReport) -> Table:
+    """Return the report as a rich table of two columns."""
+    version = f"{report.policy} version {report.version}"
+    table = Table(title=f"{report.env_id}  <-  {version}", title_justify="left", show_header=False)
+    table.add_column(style="bold")
+    table.add_column()
+    done = len(report.episodes)
+    note = "  (interrupted)" if report.interrupted else ""
+    table.add_row("episodes", f"{done} of {report.requested_episodes}{note}")
+    if report.success_rate is not None and report.success_interval is not None:
+        low, high = report.success_interval
+        table.add_row("success", f"{report.success_rate:.1%}  (95% interval {low:.1%} to {high:.1%})")
+    else:
+        table.add_row("success", "the environment does not report it")
+    if report.return_mean is not None and report.length_mean is not None:
+        spread = "" if report.return_std is None else f" +- {report.return_std:.3g}"
+        table.add_row("return", f"{report.return_mean:.4g}{spread}")
+        table.add_row("episode length", f"{report.length_mean:.1f} steps")
+    if report.final_status:
+        table.add_row("endings", ", ".join(f"{status}: {count}" for status, count in report.final_status.items()))
+    if report.latency_ms is not None:
+        latency = report.latency_ms
+        table.add_row(
+            "latency of act",
+            f"p50 {latency.p50:.3g}  p95 {latency.p95:.3g}  p99 {latency.p99:.3g}  max {latency.max:.3g} ms",
+        )
+    if report.deadline_ms is None:
+        table.add_row("deadline misses", "no control rate is known")
+    else:
+        table.add_row(
+            "deadline misses",
+            f"{report.deadline_misses} of {report.steps} steps over {report.deadline_ms:.4g} ms "
+            f"({report.control_rate_hz:g} Hz)",
+        )
+    if report.overruns is not None:
+        table.add_row(
+            "overruns",
+            f"{report.overruns} of {report.steps} steps (the whole loop, env.step included, took longer than a period)",
+        )
+    table.add_row("speed", f"{report.steps_per_s:,.0f} steps/s over {report.wall_s:.1f} s, rate '{report.rate}'")
+    if report.video is not None:
+        table.add_row("video", report.video)
+    return table

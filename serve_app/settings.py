@@ -1,0 +1,67 @@
+"""The server's settings: one class, one environment prefix, a sentence under each field.
+
+`RLSERVO_MAX_BODY_BYTES=1000000 rlservo serve ...` sets one. Nothing here is read at import.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from typing_extensions import Self
+
+from rlservo.export.errors import UsageError
+
+PREFIX = "RLSERVO_"
+
+
+class ServerSettings(BaseModel):
+    """What may be set about a policy server."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    threads: int = Field(1, ge=1, le=256)
+    """onnxruntime threads per session; one is fastest for networks of kilobytes and keeps concurrent requests apart."""
+
+    max_body_bytes: int = Field(16 << 20, ge=1024)
+    """A larger request body is refused with 413 before it is read to the end."""
+
+    max_batch: int = Field(4096, ge=1)
+    """More observations in one request are refused with 413: the event loop computes a batch in one go."""
+
+    body_timeout_s: float = Field(10.0, gt=0, allow_inf_nan=False)
+    """[s] A client that takes longer to send its body is answered 408."""
+
+    max_ongoing_requests: int = Field(256, ge=1)
+    """Requests one replica works on at once; beyond it Ray Serve answers 503."""
+
+    docs: bool = True
+    """Serve the interactive API documentation at /docs, from files that come with the server."""
+
+    @classmethod
+    def from_environment(
+        cls, given: Mapping[str, Any] | None = None, *, environment: Mapping[str, str] | None = None
+    ) -> Self:
+        """Return settings from `given`, then `RLSERVO_*` of the environment, then the defaults.
+
+        Variables of other parts of rlservo share the prefix and are not this class's to judge. Raises UsageError.
+        """
+        given = given or {}
+        environment = os.environ if environment is None else environment
+        values: dict[str, Any] = {
+            name: environment[PREFIX + name.upper()]
+            for name in cls.model_fields
+            if PREFIX + name.upper() in environment
+        }
+        values.update(given)
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            name = str(first["loc"][0]) if first["loc"] else "settings"
+            source = PREFIX + name.upper() if name in values and name not in given else f"the setting '{name}'"
+            known = ", ".join(cls.model_fields)
+            hint = f"; known: {known}" if first["type"] == "extra_forbidden" else ""
+            raise UsageError(f"{source} is not usable: {first['msg']} (given: {first['input']!r}){hint}") from error

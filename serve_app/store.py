@@ -1,0 +1,134 @@
+"""The policies a server holds: names, versions, and the one call every protocol makes, `PolicyStore.act`.
+
+It knows nothing of HTTP, gRPC or WebSockets; each of those is a thin file over it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from rlservo.export.bundle import find_bundles, version_key
+from rlservo.export.errors import BundleError, RlservoError, UnknownPolicyError, UnknownVersionError, UsageError
+from rlservo.serve_app.acting import Observation
+from rlservo.serve_app.policy import Policy
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """An action, and who decided it how fast."""
+
+    action: NDArray[Any]
+    name: str
+    version: str
+    infer_ms: float  # [ms] checking the observation, the network, checking the action
+
+
+class PolicyStore:
+    """Several policies in several versions; the newest version of a name is its default."""
+
+    def __init__(self, policies: Iterable[Policy]) -> None:
+        """Take loaded policies. Raises UsageError when two have the same name and version, or when there is none."""
+        self._policies: dict[str, dict[str, Policy]] = {}
+        for policy in policies:
+            name, version = policy.contract.name, policy.contract.version
+            versions = self._policies.setdefault(name, {})
+            # '1' and '1.0.0' compare equal, so neither would be the newest.
+            same = next((v for v in versions if version_key(v) == version_key(version)), None)
+            if same is not None:
+                raise UsageError(
+                    f"policy '{name}' version {version} is in both {versions[same].path} and {policy.path}: "
+                    "serve one of them, or export one under another name or version"
+                )
+            versions[version] = policy
+        if not self._policies:
+            raise UsageError("no policy to serve: give at least one bundle folder")
+        for name, versions in self._policies.items():
+            self._policies[name] = dict(sorted(versions.items(), key=lambda item: version_key(item[0])))
+        self._newest = {
+            name: (list(versions)[-1], list(versions.values())[-1]) for name, versions in self._policies.items()
+        }
+
+    @classmethod
+    def load(cls, paths: Iterable[str | Path], *, threads: int = 1) -> PolicyStore:
+        """Load every bundle at or below `paths` (bundles, policy folders, repositories).
+
+        Hashes, graphs and golden vectors are checked. A server with some of its policies would be found out by a
+        robot, so one bad bundle refuses the start: raises BundleError that lists every bad one, or UsageError.
+        """
+        folders: dict[Path, Path] = {}  # resolved -> as given: the same folder given twice is loaded once
+        failures: list[RlservoError] = []
+        for path in paths:
+            try:
+                folders.update({folder.resolve(): folder for folder in find_bundles(path)})
+            except BundleError as error:
+                failures.append(error)
+        policies: list[Policy] = []
+        for folder in folders.values():
+            try:
+                policies.append(Policy.load(folder, threads=threads))
+            except BundleError as error:
+                failures.append(error)
+        if len(failures) == 1:
+            raise failures[0]
+        if failures:
+            sentences = "; ".join(error.message for error in failures)
+            raise BundleError(f"{len(failures)} bundles cannot be served: {sentences}")
+        return cls(policies)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The policies' names, sorted."""
+        return tuple(sorted(self._policies))
+
+    def versions(self, name: str) -> tuple[str, ...]:
+        """The versions of a policy, oldest first; the last one is the default. Raises UnknownPolicyError."""
+        return tuple(self._versions(name))
+
+    def get(self, name: str, version: str | None = None) -> Policy:
+        """Return a policy; None is its newest version. Raises UnknownPolicyError or UnknownVersionError."""
+        if version is None:
+            newest = self._newest.get(name)
+            if newest is not None:
+                return newest[1]
+        versions = self._versions(name)
+        policy = versions.get(version or "")
+        if policy is None:
+            raise UnknownVersionError(
+                f"policy '{name}' has no version '{str(version)[:32]}': loaded are {', '.join(versions)}",
+                {"policy": name, "versions": list(versions)},
+            )
+        return policy
+
+    def act(
+        self, name: str, version: str | None, obs: Observation, *, explore: bool = False, seed: int | None = None
+    ) -> Decision:
+        """Decide for `obs`: an action for one observation, a batch for a batch.
+
+        Raises UnknownPolicyError, UnknownVersionError and what `Policy.act` raises.
+        """
+        policy = self.get(name, version)
+        started = time.perf_counter()
+        action = policy.act(obs, explore=explore, seed=seed)
+        infer_ms = (time.perf_counter() - started) * 1e3
+        return Decision(action, name, policy.contract.version, infer_ms)
+
+    def close(self) -> None:
+        """Close every policy."""
+        for versions in self._policies.values():
+            for policy in versions.values():
+                policy.close()
+
+    def _versions(self, name: str) -> Mapping[str, Policy]:
+        versions = self._policies.get(name)
+        if versions is None:
+            raise UnknownPolicyError(
+                f"no policy '{name[:64]}' is loaded: this server has {', '.join(self.names)}",
+                {"policies": list(self.names)},
+            )
+        return versions

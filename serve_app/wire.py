@@ -1,0 +1,203 @@
+"""What travels as JSON under /v1: the act request and reply, errors, and listings.
+
+The pydantic models describe the wire in the OpenAPI document. Act requests themselves are read by `read_request`, by
+hand: it costs a microsecond where a model costs ten, and its sentences name what a robot's programmer got wrong.
+It knows nothing of HTTP and nothing of policies.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import orjson
+from pydantic import BaseModel, ConfigDict, Field
+
+from rlservo.export.errors import ObservationError, RequestError
+from rlservo.serve_app.store import Decision
+
+MAX_SEED = 2**63 - 1
+LONGEST_LENIENT_BODY = 1 << 20  # a larger body with NaN in it is refused without saying where the NaN is
+OBS = (
+    "One observation or a batch (told apart by shape): nested lists as the observation space is shaped, or, where the "
+    "contract names the elements, a map from each name to a number (a batch: to a list of numbers)."
+)
+
+
+class ActRequest(BaseModel):
+    """Ask for an action."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    obs: Any = Field(description=OBS)
+    explore: bool = Field(False, description="Sample the policy's action distribution instead of taking its mode.")
+    seed: int | None = Field(None, ge=0, le=MAX_SEED, description="Makes an exploring action repeatable.")
+    seq: int | None = Field(None, description="Echoed in the reply, so that a late reply is not taken for a new one.")
+    deadline_ms: float | None = Field(
+        None,
+        description="Milliseconds left, from when the server receives the request. Work that cannot arrive in time is "
+        "not done: 408.",
+    )
+    state: Any = Field(None, description="Recurrent state. Refused: the policies this server runs are stateless.")
+    session_id: str | None = Field(None, description="Server-held state. Refused, as `state` is.")
+
+
+class ActReply(BaseModel):
+    """An action, ready for the environment's `step`."""
+
+    action: Any = Field(description="Shaped as the action space is; for a batch, one such action per observation.")
+    policy: str
+    version: str
+    seq: int | None = Field(None, description="As sent.")
+    infer_ms: float = Field(description="Milliseconds spent on checking the observation, the network and the action.")
+
+
+class ErrorReply(BaseModel):
+    """Every answer that is not a success."""
+
+    error: str = Field(description="A sentence: what was given, what was expected, which element.")
+    code: str = Field(description="Kebab-case, for programs: for example `bad-observation`.")
+    details: dict[str, Any] | None = None
+
+
+class PolicySummary(BaseModel):
+    """A line of `GET /v1/policies`."""
+
+    name: str
+    version: str = Field(description="The default: the newest.")
+    versions: list[str] = Field(description="Oldest first.")
+    description: str
+    control_rate_hz: float | None
+
+
+class PolicyList(BaseModel):
+    policies: list[PolicySummary]
+
+
+@dataclass(frozen=True, slots=True)
+class Act:
+    """An act request whose form has been checked; the observation itself is the policy's to judge."""
+
+    obs: Any
+    explore: bool
+    seed: int | None
+    seq: int | None
+    deadline_ms: float | None
+    non_finite: bool = False  # the body held NaN or Infinity, which JSON does not have
+
+
+KNOWN = frozenset(ActRequest.model_fields)
+STATEFUL = ("state", "session_id")
+
+
+def read_request(body: bytes | bytearray) -> Act:
+    """Parse the body of an act request.
+
+    Raises RequestError when it is not a JSON object of the known fields, or ObservationError when it has no `obs`.
+    """
+    non_finite = False
+    try:
+        document = orjson.loads(body)
+    except orjson.JSONDecodeError as error:
+        document = _read_lenient(body, error)
+        non_finite = True
+    if type(document) is not dict:
+        raise RequestError(
+            f'the request body must be a JSON object such as {{"obs": [...]}}, got {_json_type(document)}'
+        )
+    if "obs" not in document:
+        _check_fields(document)
+        raise ObservationError("the request has no 'obs': send {\"obs\": [...]}")
+    if len(document) == 1 and not non_finite:  # the usual request
+        return Act(document["obs"], False, None, None, None)
+    _check_fields(document)
+    explore = document.get("explore")
+    if explore is not None and type(explore) is not bool:
+        raise RequestError(f"'explore' must be true or false, got {_json_type(explore)}")
+    seed = _integer(document, "seed")
+    if seed is not None and not 0 <= seed <= MAX_SEED:
+        raise RequestError(f"'seed' must be in 0..{MAX_SEED}, got {seed}")
+    return Act(document["obs"], bool(explore), seed, _integer(document, "seq"), _deadline(document), non_finite)
+
+
+def encode_decision(decision: Decision, seq: int | None) -> bytes:
+    """Return the reply's JSON."""
+    action = decision.action
+    reply = {
+        "action": action if action.ndim else action.item(),  # orjson takes no 0-d arrays
+        "policy": decision.name,
+        "version": decision.version,
+        "infer_ms": round(decision.infer_ms, 4),
+    }
+    if seq is not None:
+        reply["seq"] = seq
+    return orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
+
+
+def encode_json(document: Mapping[str, Any]) -> bytes:
+    """Return any small document's JSON; text that UTF-8 cannot hold is escaped rather than refused."""
+    try:
+        return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
+    except TypeError:
+        return json.dumps(document, default=str).encode()
+
+
+def _read_lenient(body: bytes | bytearray, error: orjson.JSONDecodeError) -> Any:
+    """Parse what only Python's own parser takes: NaN, Infinity and numbers too large for a double.
+
+    A policy's client that sends them has a broken sensor or a division by zero; "invalid JSON" would not help it.
+    """
+    if len(body) <= LONGEST_LENIENT_BODY:
+        try:
+            return json.loads(body)
+        except (ValueError, RecursionError):
+            pass
+    if not body.strip():
+        raise RequestError('the request body is empty: send a JSON object such as {"obs": [...]}') from error
+    raise RequestError(f"the request body is not JSON: {error}") from error
+
+
+def _check_fields(document: dict[str, Any]) -> None:
+    unknown = sorted(document.keys() - KNOWN)
+    if unknown:
+        shown = ", ".join(repr(name[:64]) for name in unknown[:8])
+        raise RequestError(
+            f"unknown field{'s' if len(unknown) > 1 else ''} {shown}: known are {', '.join(sorted(KNOWN))}",
+            {"known": sorted(KNOWN)},
+        )
+    for name in STATEFUL:
+        if document.get(name) is not None:
+            raise RequestError(f"'{name}' is for recurrent policies; this one keeps no state: leave it out")
+
+
+def _integer(document: dict[str, Any], name: str) -> int | None:
+    value = document.get(name)
+    if value is None or type(value) is int:
+        return value
+    raise RequestError(f"'{name}' must be an integer, got {_json_type(value)}")
+
+
+def _deadline(document: dict[str, Any]) -> float | None:
+    value = document.get("deadline_ms")
+    if value is None:
+        return None
+    if type(value) not in (int, float) or not math.isfinite(value):
+        raise RequestError(f"'deadline_ms' must be a number of milliseconds, got {_json_type(value)}")
+    return float(value)
+
+
+def _json_type(value: Any) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    names: dict[type, str] = {str: "a string", list: "a list", dict: "an object"}
+    return names.get(type(value)) or f"the number {value!r:.40}"
+
+
+def refuse_non_finite() -> NoReturn:
+    """Refuse a body with NaN or Infinity outside of the observation."""
+    raise RequestError("the request body holds NaN or Infinity, which JSON does not have: send finite numbers")

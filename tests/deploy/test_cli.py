@@ -1,0 +1,189 @@
+"""The command line as a user types it: real commands, their output, their exit codes, their one-sentence errors."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rlservo.deploy.cli import parse_env_arguments
+from rlservo.export.errors import UsageError
+
+ROOT = Path(__file__).resolve().parents[2]
+UR5 = ROOT / "examples" / "checkpoints" / "ur5_positioning"
+
+
+def rlservo(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rlservo.deploy.cli", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd)
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A repository with the UR5 policy, exported by the command line."""
+    out = tmp_path_factory.mktemp("policies")
+    done = rlservo("export", UR5, "--out", out, "--name", "ur5")
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.fixture
+def bundle(policies: Path, tmp_path: Path) -> Path:
+    """A copy of the bundle to spoil."""
+    return Path(shutil.copytree(policies / "ur5" / "1", tmp_path / "ur5" / "1"))
+
+
+def refused(done: subprocess.CompletedProcess[str], code: int, *fragments: str) -> None:
+    assert done.returncode == code, done.stdout + done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("rlservo: ")]
+    assert len(errors) == 1, done.stderr
+    for fragment in fragments:
+        assert fragment in errors[0]
+
+
+def test_export_says_what_it_proved_and_where_it_wrote(tmp_path: Path) -> None:
+    began = time.monotonic()
+    done = rlservo("export", UR5, "--out", tmp_path, "--name", "arm", "--version", "1.2.0")
+    assert done.returncode == 0, done.stderr
+    print(f"export took {time.monotonic() - began:.1f} s")
+    assert str(tmp_path / "arm" / "1.2.0") in done.stdout
+    assert "checkpoints are pickles and run code when loaded" in done.stderr
+    files = {path.name for path in (tmp_path / "arm" / "1.2.0").iterdir()}
+    assert files == {"policy.onnx", "policy.ts", "contract.json", "golden.npz", "SHA256SUMS"}
+    checked = subprocess.run(["sha256sum", "-c", "SHA256SUMS"], cwd=tmp_path / "arm" / "1.2.0", capture_output=True)
+    assert checked.returncode == 0
+
+
+def test_export_as_json_prints_one_document(tmp_path: Path) -> None:
+    done = rlservo("export", UR5, "--out", tmp_path, "--json")
+    document = json.loads(done.stdout)
+    assert Path(document["path"]).is_dir()
+    assert document["contract"]["observation_space"]["elements"][0] == {"name": "target_r", "unit": "m"}
+    assert document["contract"]["control_rate_hz"] == 10.0
+
+
+def test_exporting_twice_makes_the_next_version(policies: Path, tmp_path: Path) -> None:
+    for version in ("1", "2"):
+        done = rlservo("export", UR5, "--out", tmp_path, "--name", "ur5")
+        assert str(tmp_path / "ur5" / version) in done.stdout
+
+
+def test_inspect_shows_names_units_and_proof(policies: Path) -> None:
+    done = rlservo("inspect", policies)
+    assert done.returncode == 0
+    for text in ("target_r", "rad/s", "base_position_normalized", "mean_std_filter", "torchscript"):
+        assert text in done.stdout
+    document = json.loads(rlservo("inspect", policies, "--json").stdout)
+    assert document["name"] == "ur5"
+
+
+def test_verify_proves_the_bundle_again(policies: Path) -> None:
+    done = rlservo("verify", policies, "--checkpoint", UR5)
+    assert done.returncode == 0, done.stderr
+
+
+def test_verify_refuses_another_policys_checkpoint(policies: Path) -> None:
+    done = rlservo("verify", policies, "--checkpoint", UR5.parent / "mir100_navigation")
+    refused(done, 2, "shape (27,), the checkpoint's have (4,): they do not belong together")
+
+
+def test_rollout_in_process_reports_success_as_json(policies: Path) -> None:
+    done = rlservo(
+        "rollout", "rlservo/EndEffectorPositioningURSim-v0", "--bundle", policies, "--episodes", 20, "--seed", 700,
+        "--json",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report: dict[str, Any] = json.loads(done.stdout)
+    assert report["successes"] >= 18
+    assert [row["seed"] for row in report["episodes"]] == list(range(700, 720))
+    assert report["latency_ms"]["p50"] < report["deadline_ms"] == 100.0
+
+
+@pytest.mark.parametrize(
+    ("words", "fragments"),
+    [
+        (("export", "nowhere", "--out", "x"), ("nowhere", "does not exist")),
+        (("export", ROOT / "envs", "--out", "x"), ("envs", "checkpoint")),
+        (("export", ROOT / "README.md", "--out", "x"), ("README.md",)),
+        (("inspect", "nowhere"), ("nowhere does not exist: expected a policy bundle",)),
+        (("inspect", ROOT / "envs"), ("holds no policy bundle", "contract.json")),
+    ],
+)
+def test_wrong_path_is_one_sentence(words: tuple[object, ...], fragments: tuple[str, ...], tmp_path: Path) -> None:
+    refused(rlservo(*words, cwd=tmp_path), 1, *fragments)
+    assert not (tmp_path / "x").exists()
+
+
+def test_changed_byte_is_refused(bundle: Path) -> None:
+    onnx = bundle / "policy.onnx"
+    content = bytearray(onnx.read_bytes())
+    content[len(content) // 2] ^= 1
+    onnx.write_bytes(content)
+    refused(rlservo("inspect", bundle), 1, "policy.onnx is not the file that was exported")
+
+
+@pytest.mark.parametrize("name", ["policy.onnx", "policy.ts", "contract.json", "golden.npz", "SHA256SUMS"])
+def test_truncated_or_missing_file_is_refused(bundle: Path, name: str) -> None:
+    file = bundle / name
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2])
+    refused(rlservo("inspect", bundle), 1, name)
+    file.unlink()
+    refused(rlservo("inspect", bundle), 1, name)
+
+
+@pytest.mark.parametrize(
+    ("words", "fragment"),
+    [
+        (("rollout", "CartPole-v1"), "give either --url (a server) or --bundle"),
+        (("rollout", "NoSuchEnv-v0", "--bundle", "{bundle}"), "NoSuchEnv"),
+        (("rollout", "CartPole-v1", "--bundle", "{bundle}"), "CartPole-v1"),
+        (("rollout", "CartPole-v1", "--bundle", "{bundle}", "--env-arg", "x"), "expected NAME=VALUE"),
+    ],
+)
+def test_wrong_use_of_rollout_exits_with_2(policies: Path, words: tuple[str, ...], fragment: str) -> None:
+    refused(rlservo(*(word.format(bundle=policies) for word in words)), 2, fragment)
+
+
+def test_rollout_without_a_server_says_so(policies: Path) -> None:
+    done = rlservo("rollout", "rlservo/EndEffectorPositioningURSim-v0", "--url", "http://127.0.0.1:9", "--policy", "x")
+    refused(done, 1, "http://127.0.0.1:9 cannot be reached")
+
+
+def test_serve_refuses_a_broken_bundle_before_anything_starts(bundle: Path) -> None:
+    (bundle / "golden.npz").unlink()
+    began = time.monotonic()
+    refused(rlservo("serve", bundle.parent), 1, "golden.npz")
+    assert time.monotonic() - began < 15.0
+
+
+def test_every_command_has_help_with_an_example() -> None:
+    for command in ("export", "prune", "inspect", "verify", "serve", "rollout", "demo"):
+        done = rlservo(command, "--help")
+        assert done.returncode == 0
+        assert "Example" in done.stdout
+
+
+def test_unknown_command_and_option_exit_with_2() -> None:
+    assert rlservo("deploy").returncode == 2
+    assert rlservo("inspect", "--colour", "red").returncode == 2
+
+
+def test_prune_keeps_what_export_needs(tmp_path: Path) -> None:
+    done = rlservo("prune", UR5, "--out", tmp_path / "small")
+    assert done.returncode == 0, done.stderr
+    assert rlservo("export", tmp_path / "small", "--out", tmp_path / "out").returncode == 0
+
+
+def test_env_arguments_are_json_or_strings() -> None:
+    parsed = parse_env_arguments(["ur_model=ur10e", "randomize_start=true", "rate=2.5", 'a="b"'])
+    assert parsed == {"ur_model": "ur10e", "randomize_start": True, "rate": 2.5, "a": "b"}
+    with pytest.raises(UsageError, match="expected NAME=VALUE"):
+        parse_env_arguments(["ur-model=ur5"])

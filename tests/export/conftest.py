@@ -1,0 +1,55 @@
+"""Real checkpoints for the export tests, trained once a session in a process and a Ray cluster of their own."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+APP = HERE / "app"
+
+
+@pytest.fixture
+def notices() -> list[str]:
+    """What an export told its user: give it as `notify=notices.append`."""
+    return []
+
+
+@pytest.fixture(scope="session")
+def app() -> Path:
+    """The folder with the user's own code that some of the checkpoints need."""
+    return APP
+
+
+@pytest.fixture(scope="session")
+def zoo() -> Iterator[Path]:
+    """A folder of checkpoints `<name>/` and what the environment saw, `<name>.npz`."""
+    # A short path: Ray's sockets live below it, and a socket's path may have 107 characters.
+    folder = Path(tempfile.mkdtemp(prefix="zoo-"))
+    # With the token in its environment Ray writes none to the user's home.
+    environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
+    command = [sys.executable, "-W", "ignore", str(HERE / "train_zoo.py"), str(folder)]
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+        assert done.returncode == 0, done.stderr[-3000:]
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+def copy_of(zoo: Path, tmp_path: Path) -> Callable[[str], Path]:
+    """Return a function that copies a checkpoint to where a test may damage it."""
+
+    def copy(name: str) -> Path:
+        return Path(shutil.copytree(zoo / name, tmp_path / "damaged" / name))
+
+    return copy

@@ -1,0 +1,167 @@
+"""What a person may point at, and what they are told when it is not a checkpoint."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rlservo.export.checkpoint import load_checkpoint
+from rlservo.export.errors import CheckpointError, UnsupportedError
+from rlservo.export.location import locate_checkpoint
+
+MODULE = "learner_group/learner/rl_module/default_policy"
+
+
+def test_a_folder_inside_a_checkpoint_means_the_checkpoint(zoo: Path) -> None:
+    whole = locate_checkpoint(zoo / "pendulum")
+    for inside in (MODULE, "learner_group", "env_runner/env_to_module_connector"):
+        assert locate_checkpoint(zoo / "pendulum" / inside) == whole
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: None, "does not exist"),
+        (lambda path: path.write_text("x"), "is a file"),
+        (lambda path: path.mkdir(), r"is not an RLlib checkpoint: looked for .*checkpoint_NNNNNN/ \(a Tune trial\)"),
+    ],
+)
+def test_what_is_no_checkpoint_is_said_in_one_sentence(
+    tmp_path: Path, make: Callable[[Path], object], words: str
+) -> None:
+    make(tmp_path / "given")
+    with pytest.raises(CheckpointError, match=words):
+        locate_checkpoint(tmp_path / "given")
+
+
+def test_a_module_on_its_own_is_refused_with_what_would_be_needed(
+    zoo: Path, tmp_path: Path, copy_of: Callable[[str], Path]
+) -> None:
+    (copy_of("pendulum") / MODULE).rename(tmp_path / "alone")
+    with pytest.raises(UnsupportedError, match="give the whole algorithm checkpoint"):
+        locate_checkpoint(tmp_path / "alone")
+
+
+def test_old_stack_checkpoints_are_refused_with_what_would_be_needed(zoo: Path) -> None:
+    for path in (zoo / "old_stack", zoo / "old_stack" / "policies" / "default_policy"):
+        with pytest.raises(UnsupportedError, match="old API stack, which is not exported yet"):
+            locate_checkpoint(path)
+
+
+def test_several_trials_are_not_guessed_between(zoo: Path, tmp_path: Path) -> None:
+    for trial in ("a", "b"):
+        (tmp_path / trial).mkdir()
+        (tmp_path / trial / "checkpoint_000001").symlink_to(zoo / "pendulum")
+    with pytest.raises(CheckpointError, match=r"holds 2 trials with checkpoints \(a, b\)"):
+        locate_checkpoint(tmp_path)
+    (tmp_path / "b" / "checkpoint_000001").unlink()
+    assert locate_checkpoint(tmp_path).root == tmp_path / "a" / "checkpoint_000001"
+
+
+def test_several_modules_are_refused_by_name(copy_of: Callable[[str], Path]) -> None:
+    damaged = copy_of("pendulum")
+    (damaged / MODULE).parent.joinpath("other").symlink_to(damaged / MODULE)
+    with pytest.raises(UnsupportedError, match=r"multi-agent checkpoint \(modules default_policy, other\)"):
+        locate_checkpoint(damaged)
+
+
+def test_the_hash_covers_weights_filter_and_scaling(zoo: Path, copy_of: Callable[[str], Path]) -> None:
+    damaged = copy_of("pendulum")
+    original = locate_checkpoint(zoo / "pendulum").sha256()
+    assert locate_checkpoint(damaged).sha256() == original
+    (damaged / "algorithm_state.pkl").unlink()  # not part of the policy
+    assert locate_checkpoint(damaged).sha256() == original
+    (damaged / "env_runner/env_to_module_connector/MeanStdFilter/state.pkl").write_bytes(b"other")
+    assert locate_checkpoint(damaged).sha256() != original
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        f"{MODULE}/module_state.pkl",
+        f"{MODULE}/class_and_ctor_args.pkl",
+        "env_runner/env_to_module_connector/class_and_ctor_args.pkl",
+        "env_runner/env_to_module_connector/MeanStdFilter/state.pkl",
+        "env_runner/module_to_env_connector/class_and_ctor_args.pkl",
+    ],
+)
+def test_a_truncated_pickle_is_named(copy_of: Callable[[str], Path], notices: list[str], file: str) -> None:
+    damaged = copy_of("pendulum")
+    whole = (damaged / file).read_bytes()
+    (damaged / file).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CheckpointError, match=r"truncated or damaged") as caught:
+        load_checkpoint(locate_checkpoint(damaged), notices.append)
+    assert str(damaged) in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("missing", "words"),
+    [
+        (f"{MODULE}/module_state.pkl", "module_state.pkl .the weights."),
+        ("env_runner/module_to_env_connector/class_and_ctor_args.pkl", "the action scaling"),
+    ],
+)
+def test_a_missing_file_is_named_with_what_it_held(copy_of: Callable[[str], Path], missing: str, words: str) -> None:
+    damaged = copy_of("pendulum")
+    (damaged / missing).unlink()
+    with pytest.raises(CheckpointError, match=words):
+        locate_checkpoint(damaged)
+
+
+def test_a_lost_filter_state_is_refused_and_not_replaced_by_an_empty_filter(
+    copy_of: Callable[[str], Path], notices: list[str]
+) -> None:
+    damaged = copy_of("pendulum")
+    folder = damaged / "env_runner/env_to_module_connector/MeanStdFilter"
+    folder.rename(damaged / "elsewhere")
+    with pytest.raises(CheckpointError, match="the observation filter's statistics"):
+        load_checkpoint(locate_checkpoint(damaged), notices.append)
+
+
+def rewrite_weights(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    file = folder / MODULE / "module_state.pkl"
+    state = pickle.loads(file.read_bytes())
+    change(state)
+    file.write_bytes(pickle.dumps(state))
+
+
+def test_missing_weights_of_the_policy_are_refused_and_not_left_random(
+    copy_of: Callable[[str], Path], notices: list[str]
+) -> None:
+    damaged = copy_of("pendulum")
+    rewrite_weights(damaged, lambda state: state.pop("pi.net.mlp.0.weight"))
+    with pytest.raises(CheckpointError, match=r"lacks weights .* pi\.net\.mlp\.0\.weight"):
+        load_checkpoint(locate_checkpoint(damaged), notices.append)
+
+
+def test_without_the_critics_weights_there_is_no_value_output_and_a_notice(
+    copy_of: Callable[[str], Path], notices: list[str]
+) -> None:
+    damaged = copy_of("pendulum")
+
+    def drop_critic(state: dict[str, Any]) -> None:
+        for key in [key for key in state if key.startswith(("vf.", "encoder.critic_encoder."))]:
+            del state[key]
+
+    rewrite_weights(damaged, drop_critic)
+    assert load_checkpoint(locate_checkpoint(damaged), notices.append).network.names == ("action_dist_inputs",)
+    assert "no value head" in " ".join(notices)
+
+
+def test_weights_that_are_not_finite_are_refused(copy_of: Callable[[str], Path], notices: list[str]) -> None:
+    damaged = copy_of("pendulum")
+    rewrite_weights(damaged, lambda state: np.copyto(state["pi.net.mlp.0.bias"], np.nan))
+    with pytest.raises(CheckpointError, match="training diverged"):
+        load_checkpoint(locate_checkpoint(damaged), notices.append)
+
+
+def test_a_version_one_marker_is_enough_to_tell_the_old_stack(tmp_path: Path) -> None:
+    (tmp_path / "rllib_checkpoint.json").write_text(json.dumps({"checkpoint_version": "1.1"}))
+    with pytest.raises(UnsupportedError, match="old API stack"):
+        locate_checkpoint(tmp_path)

@@ -1,0 +1,265 @@
+"""Small real bundles for the runtime and the server: an ONNX graph, TorchScript, golden vectors and hashes.
+
+They are written with `onnx.helper` and `rlservo.export.bundle` alone, so that these tests need no exporter.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from rlservo.export import bundle as bundle_files
+from rlservo.export.bundle import (
+    BakedStep,
+    BoxSpec,
+    Contract,
+    DiscreteSpec,
+    Distribution,
+    Element,
+    FormatParity,
+    Parity,
+    Provenance,
+    TensorSpec,
+)
+
+OBS = 27
+HIDDEN = 256
+ACTIONS = 6
+UR5_ELEMENTS = tuple(Element(name=f"element_{i}", unit="rad") for i in range(OBS))
+PROVENANCE = Provenance(
+    algorithm="PPO",
+    api_stack="new",
+    module_id="default_policy",
+    module_class="DefaultPPOTorchRLModule",
+    checkpoint_sha256="0" * 64,
+    ray_version="2.60.0",
+    torch_version="2.13.0",
+    rlservo_version="0.1.0",
+    exported_at="2026-01-01T00:00:00Z",
+)
+PARITY = Parity(
+    reference="tests",
+    samples=8,
+    batch_sizes=(8,),
+    rtol=1e-5,
+    atol=1e-6,
+    formats={"onnx": FormatParity(max_abs=0, max_rel=0)},
+)
+
+
+def weights(rng: np.random.Generator, rows: int, columns: int) -> NDArray[np.float32]:
+    return (rng.standard_normal((rows, columns)) / np.sqrt(rows)).astype(np.float32)
+
+
+def save_graph(
+    file: Path,
+    nodes: list[onnx.NodeProto],
+    constants: dict[str, NDArray[Any]],
+    inputs: list[tuple[str, int, list[Any]]],
+    outputs: list[tuple[str, int, list[Any]]],
+) -> None:
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [helper.make_tensor_value_info(*tensor) for tensor in inputs],
+        [helper.make_tensor_value_info(*tensor) for tensor in outputs],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    onnx.checker.check_model(model)
+    onnx.save(model, file)
+
+
+def write_bundle(folder: Path, contract: Contract, obs: NDArray[Any]) -> Path:
+    """Complete a folder that holds policy.onnx: TorchScript, golden vectors of `obs`, contract and hashes."""
+    import torch
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # torch 2.13 prefers torch.export; bundles hold TorchScript
+        scripted = torch.jit.trace(torch.nn.Tanh(), torch.zeros(1, 2))  # never opened here, but its hash is checked
+        torch.jit.save(scripted, folder / bundle_files.TORCHSCRIPT_FILE)
+    session = onnxruntime.InferenceSession(folder / bundle_files.ONNX_FILE)
+    names = [tensor.name for tensor in contract.outputs]
+    outputs = dict(zip(names, session.run(names, {"obs": obs}), strict=True))
+    bundle_files.write_golden(folder, {"obs": obs}, outputs)
+    bundle_files.write_contract(folder, contract)
+    return folder
+
+
+def write_box_policy(
+    root: Path,
+    *,
+    name: str = "ur5",
+    version: str = "1",
+    seed: int = 0,
+    action_scale: float = 1.0,
+    unbounded: bool = False,
+    named: bool = True,
+) -> Path:
+    """A 27 -> 6 Gaussian policy with a 2x256 tanh network, unsquashed to [-1, 1] x [-2, 2] ... and clipped.
+
+    `action_scale` above 1 leaves the clip out and lets actions walk out of the space.
+    """
+    rng = np.random.default_rng(seed)
+    folder = root / name / version
+    folder.mkdir(parents=True)
+    high = np.array([1, 1, 1, 2, 1, 1], np.float32)
+    constants = {
+        "w1": weights(rng, OBS, HIDDEN),
+        "w2": weights(rng, HIDDEN, HIDDEN),
+        "w3": weights(rng, HIDDEN, ACTIONS),
+        "b1": np.zeros(HIDDEN, np.float32),
+        "b2": np.zeros(HIDDEN, np.float32),
+        "b3": np.zeros(ACTIONS, np.float32),
+        "log_std": np.full((1, ACTIONS), -1.0, np.float32),
+        "low": -high,
+        "high": high,
+        "scale": high * np.float32(action_scale),
+        "batch_of": np.array([0], np.int64),
+        "six": np.array([ACTIONS], np.int64),
+    }
+    nodes = [
+        helper.make_node("Gemm", ["obs", "w1", "b1"], ["z1"]),
+        helper.make_node("Tanh", ["z1"], ["h1"]),
+        helper.make_node("Gemm", ["h1", "w2", "b2"], ["z2"]),
+        helper.make_node("Tanh", ["z2"], ["h2"]),
+        helper.make_node("Gemm", ["h2", "w3", "b3"], ["mean"]),
+        helper.make_node("Shape", ["obs"], ["shape"]),
+        helper.make_node("Gather", ["shape", "batch_of"], ["batch"]),
+        helper.make_node("Concat", ["batch", "six"], ["wide"], axis=0),
+        helper.make_node("Expand", ["log_std", "wide"], ["log_stds"]),
+        helper.make_node("Concat", ["mean", "log_stds"], ["action_dist_inputs"], axis=1),
+        helper.make_node("Mul", ["mean", "scale"], ["scaled"]),
+    ]
+    if action_scale > 1 or unbounded:
+        nodes.append(helper.make_node("Identity", ["scaled"], ["action"]))
+    else:
+        nodes.append(helper.make_node("Max", ["scaled", "low"], ["floored"]))
+        nodes.append(helper.make_node("Min", ["floored", "high"], ["action"]))
+    save_graph(
+        folder / bundle_files.ONNX_FILE,
+        nodes,
+        constants,
+        [("obs", TensorProto.FLOAT, ["batch", OBS])],
+        [("action", TensorProto.FLOAT, ["batch", ACTIONS]), ("action_dist_inputs", TensorProto.FLOAT, ["batch", 12])],
+    )
+    bounds = tuple(high.tolist())
+    contract = Contract(
+        name=name,
+        version=version,
+        observation_space=BoxSpec(
+            shape=(OBS,), dtype="float32", low=None, high=None, elements=UR5_ELEMENTS if named else ()
+        ),
+        action_space=BoxSpec(
+            shape=(ACTIONS,),
+            dtype="float32",
+            low=None if unbounded else tuple(-b for b in bounds),
+            high=None if unbounded else bounds,
+            elements=tuple(Element(name=f"joint_{i}", unit="rad") for i in range(ACTIONS)),
+        ),
+        inputs=(TensorSpec(name="obs", dtype="float32", shape=(-1, OBS)),),
+        outputs=(
+            TensorSpec(name="action", dtype="float32", shape=(-1, ACTIONS)),
+            TensorSpec(name="action_dist_inputs", dtype="float32", shape=(-1, 12)),
+        ),
+        distribution=Distribution(kind="diag_gaussian", transform="none" if unbounded else "unsquash"),
+        baked_in=(BakedStep(step="network"), BakedStep(step="clip")),
+        control_rate_hz=10.0,
+        provenance=PROVENANCE,
+        parity=PARITY,
+    )
+    # Small golden observations keep the actions of an unclipped policy inside its space.
+    obs = (rng.standard_normal((8, OBS)) * (0.05 if action_scale > 1 else 1.0)).astype(np.float32)
+    return write_bundle(folder, contract, obs)
+
+
+def write_discrete_policy(root: Path, *, name: str = "gridworld", version: str = "1", start: int = 0) -> Path:
+    """A Discrete(5) observation, one-hot, to a Discrete(3) action by argmax of a linear layer."""
+    rng = np.random.default_rng(1)
+    folder = root / name / version
+    folder.mkdir(parents=True)
+    constants = {
+        "depth": np.array(5, np.int64),
+        "zero_one": np.array([0, 1], np.float32),
+        "w": weights(rng, 5, 3),
+        "b": np.zeros(3, np.float32),
+        "start": np.array(start, np.int64),
+    }
+    nodes = [
+        helper.make_node("OneHot", ["obs", "depth", "zero_one"], ["hot"]),
+        helper.make_node("Gemm", ["hot", "w", "b"], ["action_dist_inputs"]),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["index"], axis=1, keepdims=0),
+        helper.make_node("Add", ["index", "start"], ["action"]),
+    ]
+    save_graph(
+        folder / bundle_files.ONNX_FILE,
+        nodes,
+        constants,
+        [("obs", TensorProto.INT64, ["batch"])],
+        [("action", TensorProto.INT64, ["batch"]), ("action_dist_inputs", TensorProto.FLOAT, ["batch", 3])],
+    )
+    contract = Contract(
+        name=name,
+        version=version,
+        observation_space=DiscreteSpec(n=5),
+        action_space=DiscreteSpec(n=3, start=start),
+        inputs=(TensorSpec(name="obs", dtype="int64", shape=(-1,)),),
+        outputs=(
+            TensorSpec(name="action", dtype="int64", shape=(-1,)),
+            TensorSpec(name="action_dist_inputs", dtype="float32", shape=(-1, 3)),
+        ),
+        distribution=Distribution(kind="categorical", transform="none"),
+        baked_in=(BakedStep(step="one_hot"), BakedStep(step="network")),
+        control_rate_hz=None,
+        provenance=PROVENANCE,
+        parity=PARITY,
+    )
+    return write_bundle(folder, contract, np.arange(5, dtype=np.int64))
+
+
+@pytest.fixture(scope="session")
+def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A repository: ur5 in versions 1, 2 and 10 (different weights), gridworld in version 1."""
+    root = tmp_path_factory.mktemp("policies")
+    for seed, version in enumerate(("1", "2", "10")):
+        write_box_policy(root, version=version, seed=seed)
+    write_discrete_policy(root)
+    return root
+
+
+@pytest.fixture(scope="session")
+def ur5(policies: Path) -> Path:
+    """The newest ur5 bundle."""
+    return policies / "ur5" / "10"
+
+
+@pytest.fixture
+def rewrite_contract() -> Callable[..., None]:
+    """Change fields of a bundle's contract and record the hashes anew: tampering that hashes cannot see."""
+
+    def rewrite(folder: Path, **changes: Any) -> None:
+        contract = bundle_files.read_contract(folder).model_copy(update=changes)
+        bundle_files.write_contract(folder, contract)
+
+    return rewrite
+
+
+@pytest.fixture(scope="session")
+def box_policy() -> Callable[..., Path]:
+    """`write_box_policy`: fixtures are how test modules reach this file."""
+    return write_box_policy
+
+
+@pytest.fixture(scope="session")
+def discrete_policy() -> Callable[..., Path]:
+    """`write_discrete_policy`."""
+    return write_discrete_policy
