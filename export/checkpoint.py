@@ -1,9 +1,8 @@
 """Restore a policy from an RLlib checkpoint, and run it as RLlib itself would. The one file that imports ray.rllib.
 
 Restoring starts nothing: no `ray.init`, no environment, no worker. The module and both connector pipelines come from
-their own folders in the checkpoint. What the pipelines do is read off them into a `Recipe`; a piece that is not known
-is refused by its class name, because leaving it out would change the policy. `Checkpoint.reference` is the truth every
-export is compared with: RLlib's own pipelines around RLlib's own forward pass.
+their own folders in the checkpoint; `connectors.py` reads off them what they do. `Checkpoint.reference` is the truth
+every export is compared with: RLlib's own pipelines around RLlib's own forward pass.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from ray.rllib.connectors.connector_pipeline_v2 import ConnectorPipelineV2
 from ray.rllib.connectors.env_to_module.env_to_module_pipeline import EnvToModulePipeline
-from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter
 from ray.rllib.connectors.module_to_env.module_to_env_pipeline import ModuleToEnvPipeline
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.apis import InferenceOnlyAPI, QNetAPI, ValueFunctionAPI
@@ -30,34 +28,13 @@ from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from torch import Tensor, nn
 
+from rlservo.export.connectors import check_spaces, read_observation_steps, read_transform
 from rlservo.export.errors import CheckpointError, UnsupportedError
 from rlservo.export.heads import replace_heads
 from rlservo.export.location import CTOR_FILE, STATE_STEMS, CheckpointFiles
-from rlservo.export.recipe import (
-    AnyDiscrete,
-    DistributionKind,
-    Flatten,
-    Mode,
-    ObservationFilter,
-    ObservationStep,
-    Recipe,
-    Transform,
-)
+from rlservo.export.recipe import AnyDiscrete, DistributionKind, Mode, Recipe
 from rlservo.export.unpickle import explain, first_line, unpickle
 
-# Pieces that move data about without changing a number of a stateless single-agent policy.
-PLUMBING = frozenset({
-    "AddObservationsFromEpisodesToBatch",
-    "AddTimeDimToBatchAndZeroPad",
-    "AddStatesFromEpisodesToBatch",
-    "BatchIndividualItems",
-    "NumpyToTensor",
-    "GetActions",
-    "TensorToNumpy",
-    "UnBatchToIndividualItems",
-    "RemoveSingleTsTimeRankFromBatch",
-    "ListifyDataForVectorEnv",
-})  # fmt: skip
 DISTRIBUTIONS: dict[str, DistributionKind] = {
     "TorchDiagGaussian": "diag_gaussian",
     "TorchSquashedGaussian": "squashed_gaussian",
@@ -148,7 +125,13 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
         )
     module.eval().requires_grad_(False)
     no_value = _check_weights(files, module)
-    recipe = _read_recipe(module, env_to_module, module_to_env, files)
+    observation_space = env_to_module.input_observation_space
+    action_space: Any = module_to_env.input_action_space or module.action_space
+    check_spaces(observation_space, action_space)
+    steps = read_observation_steps(env_to_module, files)
+    distribution, mode = _action_rule(module, action_space)
+    transform = read_transform(module_to_env, action_space)
+    recipe = Recipe(observation_space, action_space, steps, mode, transform, distribution)
     if recipe.filter is not None and recipe.filter.count == 0:
         notify("the observation filter has seen nothing yet: RLlib divides by 1e-6 and clips, and so does the export")
     if isinstance(recipe.action_space, Discrete) and recipe.action_space.start != 0:
@@ -203,94 +186,6 @@ def _check_weights(files: CheckpointFiles, module: Any) -> str:
     if needed := sorted(key for key in missing if not any(key.startswith(f"{prefix}.") for prefix in unneeded)):
         raise CheckpointError(f"{state_file} lacks weights that {type(module).__name__} needs: {', '.join(needed[:3])}")
     return f"{len(missing)} weights are missing" if missing else ""
-
-
-def _read_recipe(module: Any, env_to_module: Any, module_to_env: Any, files: CheckpointFiles) -> Recipe:
-    observation_space = env_to_module.input_observation_space
-    action_space = module_to_env.input_action_space or module.action_space
-    _check_spaces(observation_space, action_space)
-    steps: list[ObservationStep] = []
-    for piece in env_to_module.connectors:
-        if step := _observation_step(piece, files):
-            steps.append(step)
-    if sum(isinstance(step, ObservationFilter) for step in steps) > 1:
-        raise UnsupportedError("the pipeline has two MeanStdFilter pieces, of which RLlib's checkpoint keeps only one")
-    distribution, mode = _action_rule(module, action_space)
-    return Recipe(
-        observation_space, action_space, tuple(steps), mode, _transform(module_to_env, action_space), distribution
-    )
-
-
-def _check_spaces(observation_space: Any, action_space: Any) -> None:
-    if not isinstance(observation_space, Box):
-        raise UnsupportedError(
-            f"observation space {observation_space} is not exported yet: only Box is (others need one-hot or "
-            "flattening in the graph)"
-        )
-    if not isinstance(action_space, Box | Discrete):
-        raise UnsupportedError(f"action space {action_space} is not exported yet: only Box and Discrete are")
-    for space in (observation_space, action_space):
-        if isinstance(space, Box) and space.dtype not in (np.float32, np.float64):
-            raise UnsupportedError(f"{space} is not exported yet: only float32 and float64 Boxes are")
-
-
-def _observation_step(piece: Any, files: CheckpointFiles) -> ObservationStep | None:
-    """Return what an env-to-module piece does to an observation (None: nothing); freeze it while at it."""
-    kind = type(piece)
-    if kind is MeanStdFilter:
-        if not (files.env_to_module / kind.__name__).is_dir():
-            raise CheckpointError(
-                f"{files.env_to_module / kind.__name__} is missing: the observation filter's statistics"
-            )
-        piece._update_stats = False  # a restored filter goes on learning from whatever it is shown
-        return _filter(piece)
-    if kind.__name__ == "FlattenObservations" and _is_rllibs(kind):
-        return Flatten()
-    if kind.__name__ == "NumpyToTensor" and _is_rllibs(kind):
-        piece._device = None  # a checkpoint from a GPU is read on a CPU
-    if kind.__name__ in PLUMBING and _is_rllibs(kind):
-        return None
-    raise UnsupportedError(
-        f"the env-to-module connector {kind.__name__} ({kind.__module__}) is not exported yet: "
-        "without it the network would see other numbers"
-    )
-
-
-def _is_rllibs(kind: type) -> bool:
-    """Return whether a piece is RLlib's own, not the user's of the same name."""
-    return kind.__module__.startswith("ray.rllib.connectors.")
-
-
-def _filter(piece: Any) -> ObservationFilter:
-    if set(piece.get_state()) != {None}:
-        raise UnsupportedError("MeanStdFilter is set up for several agents, which is not exported yet")
-    restored = piece._filters[None]
-    stats = restored.running_stats
-    mean, std = np.asarray(stats.mean, np.float64), np.asarray(stats.std, np.float32)
-    if not (np.isfinite(mean).all() and np.isfinite(std).all()):
-        raise CheckpointError("the observation filter's mean or standard deviation is not finite: training diverged")
-    clip = float(restored.clip) if restored.clip else None  # RLlib tests for truth: 0 means no clipping, too
-    return ObservationFilter(int(stats.n), mean, std, clip, bool(restored.demean), bool(restored.destd))
-
-
-def _transform(module_to_env: Any, action_space: Box | AnyDiscrete) -> Transform:
-    """Return what the module-to-env pipeline does to an action (`unsquash_action`, `clip_action` in ray 2.60)."""
-    transform: Transform = "none"
-    for piece in module_to_env.connectors:
-        kind = type(piece)
-        if kind.__name__ == "NormalizeAndClipActions" and _is_rllibs(kind):
-            if isinstance(action_space, Box):
-                bounded = bool(action_space.bounded_below.all() and action_space.bounded_above.all())
-                if piece.normalize_actions:
-                    transform = "unsquash" if bounded else "none"
-                elif piece.clip_actions:
-                    transform = "clip"
-        elif kind.__name__ not in PLUMBING or not _is_rllibs(kind):
-            raise UnsupportedError(
-                f"the module-to-env connector {kind.__name__} ({kind.__module__}) is not exported yet: "
-                "without it the environment would get other actions"
-            )
-    return transform
 
 
 def _action_rule(module: Any, action_space: Box | AnyDiscrete) -> tuple[DistributionKind | None, Mode]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -21,10 +20,8 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from rlservo.export.bundle import (
-    NAME_PATTERN,
     ONNX_FILE,
     TORCHSCRIPT_FILE,
-    VERSION_PATTERN,
     Contract,
     Distribution,
     Parity,
@@ -32,7 +29,6 @@ from rlservo.export.bundle import (
     TensorSpec,
     contract_json,
     load_bundle,
-    version_key,
     write_contract,
     write_golden,
 )
@@ -40,6 +36,7 @@ from rlservo.export.elements import read_elements
 from rlservo.export.errors import ParityError, UsageError
 from rlservo.export.facts import CheckpointFacts, read_facts
 from rlservo.export.location import CheckpointFiles, locate_checkpoint
+from rlservo.export.naming import check_names, choose_target, default_name
 from rlservo.export.parity import Outputs, Recorded, prove, record, ties
 from rlservo.export.samples import BATCH_SIZES, draw_batches
 from rlservo.export.spaces import space_spec
@@ -85,12 +82,12 @@ def export_checkpoint(
     cannot be exported, ParityError when the graph does not give RLlib's own actions. Nothing is left behind then.
     """
     files = locate_checkpoint(checkpoint, module_id)
-    _check_names(name, version)
+    check_names(name, version)
     notify(LOADING_RUNS_CODE.format(path=files.root))
     with user_code(app_dir):
         facts = read_facts(files.root, notify)
         name = name or default_name(facts.env_id, files.root)
-        target = _target(Path(out), name, version)
+        target = choose_target(Path(out), name, version)
         restored = _load(files, notify, value)
         elements = read_elements(facts.env_id, facts.env_config, restored.recipe, notify)
         with _temporary_folder(target) as folder:
@@ -117,45 +114,11 @@ def export_checkpoint(
     return ExportResult(target, contract)
 
 
-def default_name(env_id: str | None, root: Path) -> str:
-    """Return a policy name: 'rlservo/EndEffectorPositioningURSim-v0' gives 'end-effector-positioning-ur'.
-
-    Without an environment it is the checkpoint folder's name.
-    """
-    stem = re.split(r"[/:.]", env_id)[-1] if env_id else root.name
-    stem = re.sub(r"-v\d+$", "", stem)
-    stem = re.sub(r"(Sim|Rob|Env)$", "", stem) or stem
-    words = re.findall(r"[A-Z]+(?![a-z])\d*|[A-Z]?[a-z]+\d*|[A-Z]|\d+", stem)
-    return "-".join(word.lower() for word in words)[:64].strip("-") or "policy"
-
-
 def _load(files: CheckpointFiles, notify: Callable[[str], None], value: bool) -> Checkpoint:
     # Here and not at the top: RLlib takes seconds to import, and a wrong path should not have to wait for it.
     from rlservo.export.checkpoint import load_checkpoint
 
     return load_checkpoint(files, notify, value=value)
-
-
-def _check_names(name: str | None, version: str | None) -> None:
-    if name is not None and not re.match(NAME_PATTERN, name):
-        raise UsageError(f"'{name}' cannot be a policy's name: expected up to 64 letters, digits, '.', '_' and '-'")
-    if version is not None and not re.match(VERSION_PATTERN, version):
-        raise UsageError(f"'{version}' cannot be a version: expected a positive integer or a form like 1.2.0")
-
-
-def _target(out: Path, name: str, version: str | None) -> Path:
-    """Return the folder to write, which does not exist yet."""
-    policy = out / name
-    if (out.exists() and not out.is_dir()) or (policy.exists() and not policy.is_dir()):
-        raise UsageError(f"{policy if out.is_dir() else out} is a file: expected a folder to write bundles into")
-    present = [child.name for child in policy.iterdir()] if policy.is_dir() else []
-    taken = [entry for entry in present if re.match(VERSION_PATTERN, entry)]
-    if version is None:
-        version = str(max((version_key(entry)[0] for entry in taken), default=0) + 1)
-    if version in present:
-        raise UsageError(f"{policy / version} exists already: versions are never overwritten; leave the version out "
-                         f"for the next one")  # fmt: skip
-    return policy / version
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +26,13 @@ from numpy.typing import NDArray
 
 from rlservo.export.actor import PolicyGraph
 from rlservo.export.errors import UnsupportedError
+from rlservo.export.parity import Runner
 from rlservo.export.unpickle import first_line
 
 TORCHSCRIPT_OPSET = 17
 DYNAMO_OPSET = 18  # its lowest
 IR_VERSION = 8
 CONTRACT_KEY = "rlservo.contract"
-
-Runner = Callable[[NDArray[Any]], dict[str, NDArray[Any]]]
-"""Raw observations `[batch, *obs_shape]` to every output by name."""
 
 
 def write_onnx(graph: PolicyGraph, example: NDArray[Any], file: Path) -> None:

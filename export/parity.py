@@ -4,15 +4,16 @@ It compares functions from observations to named outputs and does not know what 
 
 A difference passes when it is at most `RTOL * max(|reference|, scale) + ATOL`. The scale is half the range of a
 bounded action element; elsewhere the largest number in the same row of the output, at least 1, because the rounding
-of a matrix product grows with its terms and not with their sum. A discrete action must be the same, unless RLlib's
-own scores for the two choices are that close.
+of a matrix product grows with its terms and not with their sum. `value` has one number a row, which may be a small
+difference of large terms: its scale is the largest value seen over all observations. A discrete action must be the
+same, unless RLlib's own scores for the two choices are that close.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete
@@ -30,8 +31,9 @@ REFERENCE = (
     "checkpoint, observation filter frozen, exploration off"
 )
 
-Outputs = dict[str, NDArray[Any]]
-Runner = Callable[[NDArray[Any]], Outputs]
+Outputs: TypeAlias = dict[str, NDArray[Any]]
+Runner: TypeAlias = Callable[[NDArray[Any]], Outputs]
+"""Raw observations `[batch, *obs_shape]` to every output by name."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ def _prove_format(
     name: str, recipe: Recipe, recorded: Sequence[Recorded], run: Runner, labels: Sequence[str]
 ) -> FormatParity:
     max_abs = max_rel = 0.0
+    largest_value = max((_largest(one.outputs["value"]) for one in recorded if "value" in one.outputs), default=1.0)
     for one in recorded:
         where = f"{name}, a batch of {len(one.batch.obs)} {one.batch.kind} observations"
         try:
@@ -84,7 +87,8 @@ def _prove_format(
             if output == "action" and isinstance(recipe.action_space, Discrete):
                 _check_choices(where, got[output], one)
                 continue
-            difference, scale = _compare(where, output, got[output], expected, recipe, one, labels)
+            least = largest_value if output == "value" else 1.0
+            difference, scale = _compare(where, output, got[output], expected, recipe, one, labels, least)
             max_abs = max(max_abs, float(difference.max(initial=0.0)))
             max_rel = max(max_rel, float((difference / scale).max(initial=0.0)))
     return FormatParity(max_abs=max_abs, max_rel=max_rel)
@@ -109,13 +113,14 @@ def _compare(
     recipe: Recipe,
     one: Recorded,
     labels: Sequence[str],
+    least_scale: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return (difference, scale), both of the output's shape."""
     a, b = got.astype(np.float64), expected.astype(np.float64)
     with np.errstate(invalid="ignore"):
         same = (a == b) | (np.isnan(a) & np.isnan(b))  # overflow in both is no difference
         difference = np.where(same, 0.0, np.abs(a - b))
-    scale = np.maximum(np.where(np.isfinite(b), np.abs(b), 1.0), _scale(output, b, recipe))
+    scale = np.maximum(np.where(np.isfinite(b), np.abs(b), 1.0), _scale(output, b, recipe, least_scale))
     allowed = RTOL * scale + ATOL
     bad = ~(difference <= allowed)
     if bad.any():
@@ -134,14 +139,19 @@ def _compare(
     return difference, scale
 
 
-def _scale(output: str, expected: NDArray[np.float64], recipe: Recipe) -> NDArray[np.float64]:
+def _scale(output: str, expected: NDArray[np.float64], recipe: Recipe, least: float) -> NDArray[np.float64]:
     """Return the size of number that rounding is measured against, broadcastable to `expected`."""
     space = recipe.action_space
     if output == "action" and isinstance(space, Box) and bool((space.bounded_below & space.bounded_above).all()):
         return (space.high.astype(np.float64) - space.low.astype(np.float64))[None] / 2
     finite = np.where(np.isfinite(expected), np.abs(expected), 0.0)
     axes = tuple(range(1, expected.ndim))
-    return np.maximum(finite.max(axis=axes, keepdims=True) if axes else finite, 1.0)
+    return np.maximum(finite.max(axis=axes, keepdims=True) if axes else finite, least)
+
+
+def _largest(values: NDArray[Any]) -> float:
+    finite = values[np.isfinite(values)]
+    return max(1.0, float(np.abs(finite).max(initial=0.0)))
 
 
 def _check_choices(where: str, got: NDArray[Any], one: Recorded) -> None:

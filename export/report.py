@@ -26,7 +26,7 @@ def contract_report(contract: Contract) -> RenderableType:
         _baked_table(contract.baked_in),
         _space_table("Comes out: action", contract.action_space, None),
         _tensor_table(contract),
-        _proof_table(contract.parity),
+        _proof(contract.parity),
     ]
     if contract.evaluations:
         parts.append(_evaluation_table(contract.evaluations))
@@ -49,7 +49,7 @@ def export_report(contract: Contract) -> Text:
 
 def verification_report(parity: Parity, evaluation: Evaluation | None) -> RenderableType:
     """Return what `rlservo verify` found: the parity and, where episodes were run, both sides of the closed loop."""
-    parts: list[RenderableType] = [_proof_table(parity)]
+    parts: list[RenderableType] = [_proof(parity)]
     if evaluation is not None:
         parts.append(_evaluation_table([evaluation]))
     return Group(*parts)
@@ -93,7 +93,7 @@ def _exploration(contract: Contract) -> str:
 
 
 def _space_table(title: str, space: BoxSpec | DiscreteSpec, frozen: BakedStep | None) -> Table:
-    """Return one row an element: index, name, unit, bounds and, behind a filter, what the filter has seen."""
+    """Return one row an element: index, name, unit, bounds and, behind a filter, its numbers."""
     if isinstance(space, DiscreteSpec):
         table = Table(title=f"{title} (one of {space.n} choices)", title_justify="left")
         table.add_column("value", justify="right")
@@ -111,8 +111,8 @@ def _space_table(title: str, space: BoxSpec | DiscreteSpec, frozen: BakedStep | 
     table.add_column("high", justify="right", no_wrap=True)
     mean, std = _seen(frozen, space.size)
     if mean:
-        table.add_column("seen: mean", justify="right", no_wrap=True)
-        table.add_column("std", justify="right", no_wrap=True)
+        table.add_column("filter mean", justify="right", no_wrap=True)
+        table.add_column("filter std", justify="right", no_wrap=True)
     low, high = (bound.ravel().tolist() for bound in space.bounds())
     for index in _shown(space.size):
         if index is None:
@@ -170,43 +170,33 @@ def _tensor_table(contract: Contract) -> Table:
     return table
 
 
-def _proof_table(parity: Parity) -> Table:
-    sizes = ", ".join(str(size) for size in parity.batch_sizes)
-    table = Table(
-        title=f"Proven on {parity.samples:,} observations in batches of {sizes}",
-        title_justify="left",
-        caption=f"against {parity.reference}; allowed: {parity.rtol:g} relative, {parity.atol:g} absolute",
-        caption_justify="left",
-    )
-    table.add_column("format")
-    table.add_column("largest difference", justify="right")
-    table.add_column("relative", justify="right")
+def _proof(parity: Parity) -> RenderableType:
+    table = Table(title="Proven", title_justify="left")
+    table.add_column("format", no_wrap=True)
+    table.add_column("largest difference", justify="right", no_wrap=True)
+    table.add_column("relative", justify="right", no_wrap=True)
     for name, result in parity.formats.items():
         table.add_row(name, f"{result.max_abs:.2e}", f"{result.max_rel:.2e}")
-    return table
+    sizes = ", ".join(str(size) for size in parity.batch_sizes)
+    how = (
+        f"{parity.samples:,} observations in batches of {sizes}, against {parity.reference}; "
+        f"allowed: {parity.rtol:g} relative, {parity.atol:g} absolute"
+    )
+    return Group(table, Text(how))
 
 
 def _evaluation_table(evaluations: Sequence[Evaluation]) -> Table:
-    table = Table(title="Closed loop, the same seeds", title_justify="left")
-    for column in (
-        "environment",
-        "episodes",
-        "first seed",
-        "return: bundle",
-        "checkpoint",
-        "success: bundle",
-        "checkpoint",
-    ):
-        table.add_column(column, justify="left" if column == "environment" else "right")
+    table = Table(title="Closed loop on the same seeds: bundle / checkpoint", title_justify="left")
+    table.add_column("environment", overflow="fold")
+    for column in ("episodes", "first seed", "return", "success"):
+        table.add_column(column, justify="right", no_wrap=True)
     for one in evaluations:
         table.add_row(
             one.env_id,
             str(one.episodes),
             str(one.first_seed),
-            f"{one.return_bundle:.4g}",
-            f"{one.return_checkpoint:.4g}",
-            _rate(one.success_rate_bundle),
-            _rate(one.success_rate_checkpoint),
+            f"{one.return_bundle:.4g} / {one.return_checkpoint:.4g}",
+            f"{_rate(one.success_rate_bundle)} / {_rate(one.success_rate_checkpoint)}",
         )
     return table
 

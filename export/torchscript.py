@@ -7,7 +7,6 @@ torch.export. It knows nothing of RLlib and does not judge the numbers.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from torch.jit._trace import TracerWarning
 
 from rlservo.export.actor import PolicyGraph
 from rlservo.export.errors import UnsupportedError
+from rlservo.export.parity import Runner
 from rlservo.export.unpickle import first_line
 
 
@@ -39,7 +39,7 @@ def write_torchscript(graph: PolicyGraph, example: NDArray[Any], file: Path) -> 
             raise UnsupportedError(f"the network cannot be traced: {first_line(error)}") from error
 
 
-def run_torchscript(file: Path, names: tuple[str, ...]) -> Callable[[NDArray[Any]], dict[str, NDArray[Any]]]:
+def run_torchscript(file: Path, names: tuple[str, ...]) -> Runner:
     """Return a function from raw observations `[batch, *obs_shape]` to the outputs, which are called `names`."""
     with warnings.catch_warnings():
         _ignore_deprecation()

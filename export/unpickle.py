@@ -12,13 +12,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.errors import CheckpointError
+from rlservo.export.errors import CheckpointError, UsageError
 
 
 @contextmanager
 def user_code(app_dir: str | Path) -> Iterator[None]:
     """Let the checkpoint import the user's own modules from `app_dir`, before anything else of that name."""
     folder = str(Path(app_dir).expanduser().absolute())
+    if not Path(folder).is_dir():
+        raise UsageError(f"{folder} is not a folder: expected the one that holds your own classes (--app-dir)")
     sys.path.insert(0, folder)
     try:
         yield

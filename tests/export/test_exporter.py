@@ -13,9 +13,10 @@ import onnxruntime
 import pytest
 
 from rlservo.export import exporter, parity
-from rlservo.export.bundle import contract_json, load_bundle
+from rlservo.export.bundle import DiscreteSpec, contract_json, load_bundle
 from rlservo.export.errors import CheckpointError, ParityError, RlservoError, UnsupportedError, UsageError
-from rlservo.export.exporter import default_name, export_checkpoint
+from rlservo.export.exporter import export_checkpoint
+from rlservo.export.naming import default_name
 from rlservo.export.onnx import run_onnx
 from rlservo.export.torchscript import run_torchscript
 
@@ -85,8 +86,9 @@ def test_the_onnx_file_carries_names_a_dynamic_batch_and_the_contract(
     session = onnxruntime.InferenceSession(str(result.path / "policy.onnx"), providers=["CPUExecutionProvider"])
     assert [tensor.shape for tensor in session.get_inputs()] == [["batch", 5]]
     assert [tensor.name for tensor in session.get_outputs()] == ["action", "action_dist_inputs", "value"]
+    run = run_onnx(result.path / "policy.onnx")
     for size in (1, 2, 3, 1024):
-        assert session.run(["action"], {"obs": np.zeros((size, 5), np.float32)})[0].shape == (size, 3)
+        assert run(np.zeros((size, 5), np.float32))["action"].shape == (size, 3)
 
 
 def test_golden_vectors_are_finite_and_reproduced(zoo: Path, tmp_path: Path, notices: list[str]) -> None:
@@ -118,7 +120,7 @@ def test_a_discrete_space_that_starts_elsewhere_is_told(
 ) -> None:
     result = export_checkpoint(zoo / "started", tmp_path, app_dir=app, notify=notices.append)
     assert set(np.load(zoo / "started.npz")["action"]) <= {0, 1, 2}  # what RLlib sent, in a space of 5, 6, 7
-    assert (result.contract.action_space.kind, result.contract.action_space.start) == ("discrete", 0)
+    assert result.contract.action_space == DiscreteSpec(n=3, start=0)
     assert "RLlib sends 0..2" in " ".join(notices)
 
 
@@ -228,9 +230,10 @@ def test_without_an_environment_a_policy_is_named_after_its_folder() -> None:
 def test_names_and_versions_that_cannot_be_used_are_refused_before_anything_is_loaded(
     zoo: Path, tmp_path: Path, notices: list[str]
 ) -> None:
-    for arguments in ({"name": "../up"}, {"version": "v1"}, {"version": "0"}):
+    for name, version in (("../up", None), (None, "v1"), (None, "0")):
         with pytest.raises(UsageError):
-            export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append, **arguments)
+            export_checkpoint(zoo / "pendulum", tmp_path, name=name, version=version, notify=notices.append)
+    assert notices == []
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="is a file"):
         export_checkpoint(zoo / "pendulum", tmp_path / "file", notify=notices.append)

@@ -75,7 +75,7 @@ def test_swapped_mean_and_std_are_caught(load: Callable[[str], Checkpoint], tmp_
 
 def test_a_missing_filter_clip_is_caught(load: Callable[[str], Checkpoint], tmp_path: Path) -> None:
     checkpoint = load("pendulum")
-    with pytest.raises(ParityError, match="wide|extreme"):
+    with pytest.raises(ParityError, match=r"wide|extreme"):
         prove_as(checkpoint, tampered_filter(checkpoint.recipe, clip=None), tmp_path)
 
 

@@ -12,7 +12,7 @@ import gymnasium
 import pytest
 from rich.console import Console
 
-from rlservo.export.bundle import load_bundle, read_contract
+from rlservo.export.bundle import Element, load_bundle, read_contract
 from rlservo.export.elements import read_elements
 from rlservo.export.errors import BundleError, ParityError, UsageError
 from rlservo.export.exporter import export_checkpoint
@@ -141,12 +141,9 @@ def test_the_report_shows_names_bounds_baked_steps_and_proof(
     zoo: Path, tmp_path: Path, notices: list[str], width: int
 ) -> None:
     exported = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
-    element = exported.contract.observation_space.model_copy(
-        update={"elements": tuple({"name": name, "unit": "rad/s"} for name in ("cos_angle", "sin_angle", "speed"))}
-    )
-    contract = type(exported.contract).model_validate(
-        {**exported.contract.model_dump(), "observation_space": element.model_dump()}
-    )
+    elements = tuple(Element(name=name, unit="rad/s") for name in ("cos_angle", "sin_angle", "speed"))
+    space = exported.contract.observation_space.model_copy(update={"elements": elements})
+    contract = exported.contract.model_copy(update={"observation_space": space})
     file = io.StringIO()
     Console(width=width, file=file).print(contract_report(contract))
     shown = file.getvalue()

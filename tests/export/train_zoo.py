@@ -26,7 +26,7 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
 sys.path.insert(0, str(Path(__file__).parent / "app"))
-import zoo_parts
+import zoo_parts  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
 
 SMALL = DefaultModelConfig(fcnet_hiddens=[16, 16])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -269,3 +270,11 @@ def test_the_runtime_imports_no_framework() -> None:
     code = f"import sys, rlservo.serve_app.policy; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_loading_a_policy_starts_no_telemetry(ur5: Path, tmp_path: Path) -> None:
+    """onnxruntime's uploader writes its session file, `.ses`, into the temporary folder as soon as it runs."""
+    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    code = f"from rlservo.serve_app.policy import Policy; Policy.load({str(ur5)!r}).act([0.0] * 27)"
+    subprocess.run([sys.executable, "-c", code], check=True, env={**environment, "TMPDIR": str(tmp_path)})
+    assert list(tmp_path.iterdir()) == []

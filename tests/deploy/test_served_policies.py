@@ -1,0 +1,81 @@
+"""What the project promises of its shipped policies: served over HTTP, with seeds that training never saw."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rlservo.export.exporter import export_checkpoint
+from rlservo.export.verify import verify_bundle
+from rlservo.serve_app.client import PolicyClient
+from rlservo.serve_app.rollout import rollout
+
+ROOT = Path(__file__).resolve().parents[2]
+CHECKPOINTS = ROOT / "examples" / "checkpoints"
+UR5, MIR100 = "rlservo/EndEffectorPositioningURSim-v0", "rlservo/NoObstacleNavigationMir100Sim-v0"
+
+pytestmark = [pytest.mark.serve, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("served")
+    for checkpoint, name in (("ur5_positioning", "ur5"), ("mir100_navigation", "mir100")):
+        export_checkpoint(CHECKPOINTS / checkpoint, out, name=name, notify=lambda line: None)
+    return out
+
+
+@pytest.fixture(scope="module")
+def url(policies: Path) -> Iterator[str]:
+    """The two policies behind `rlservo serve`, as a user starts it."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    server = subprocess.Popen(
+        [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(policies), "--port", str(port)],
+        stdout=subprocess.DEVNULL,
+        start_new_session=True,
+        env={**os.environ},
+    )
+    try:
+        with PolicyClient(f"http://127.0.0.1:{port}", "ur5") as probe_client:
+            probe_client.wait_until_ready(120.0)
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        server.send_signal(signal.SIGINT)
+        server.wait(60)
+
+
+def test_ur5_reaches_95_percent_of_random_targets(url: str) -> None:
+    with PolicyClient(url, "ur5") as policy:
+        report = rollout(policy, UR5, episodes=200, seed=31_000)
+    assert report.success_rate is not None
+    assert report.success_rate >= 0.95, report.final_status
+
+
+def test_mir100_reaches_98_percent_of_random_targets(url: str) -> None:
+    with PolicyClient(url, "mir100") as policy:
+        report = rollout(policy, MIR100, episodes=200, seed=32_000)
+    assert report.success_rate is not None
+    assert report.success_rate >= 0.98, report.final_status
+
+
+@pytest.mark.parametrize(("name", "checkpoint", "env_id"), [
+    ("ur5", "ur5_positioning", UR5), ("mir100", "mir100_navigation", MIR100),
+])  # fmt: skip
+def test_returns_are_the_rllib_checkpoints_own(policies: Path, name: str, checkpoint: str, env_id: str) -> None:
+    result = verify_bundle(
+        policies / name, CHECKPOINTS / checkpoint, env_id=env_id, episodes=10, first_seed=33_000,
+        notify=lambda line: None,
+    )  # fmt: skip
+    found = result.evaluation
+    assert found is not None
+    assert found.success_rate_bundle == found.success_rate_checkpoint
+    assert found.return_bundle == pytest.approx(found.return_checkpoint, rel=1e-2)
