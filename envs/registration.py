@@ -8,6 +8,8 @@ from __future__ import annotations
 NAMESPACE = "rlservo"
 ENTRY_POINTS = {
     "EndEffectorPositioningURSim-v0": "rlservo.envs.ur.end_effector_positioning:EndEffectorPositioningURSim",
+    "EmptyEnvironmentURSim-v0": "rlservo.envs.ur.empty_environment:EmptyEnvironmentURSim",
+    "BasicAvoidanceURSim-v0": "rlservo.envs.ur.basic_avoidance:BasicAvoidanceURSim",
     "NoObstacleNavigationMir100Sim-v0": "rlservo.envs.mir100.no_obstacle_navigation:NoObstacleNavigationMir100Sim",
     "ObstacleAvoidanceMir100Sim-v0": "rlservo.envs.mir100.obstacle_avoidance:ObstacleAvoidanceMir100Sim",
 }

@@ -3,38 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from rlservo.envs.checks import (
-    EnvDescription,
-    InvalidResetError,
-    as_vector,
-    check_action,
-    check_option_names,
-    element,
-)
-from rlservo.envs.rendering import RENDER_MODES, Camera
-from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
-from rlservo.envs.ur.simulation import URSimulation
+from rlservo.envs.checks import EnvDescription, InvalidResetError, as_vector
+from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, describe
+from rlservo.envs.ur.parameters import JOINTS
 
 START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
 START_RANGE = (1.5, 0.25, 0.5, 1.0, 0.4, 3.14)  # [rad], +-, with randomize_start
 WRIST_1_RANGE = (-3.48, 0.31)  # [rad], with restrict_wrist_1
 SUCCESS_DISTANCE = 0.1  # [m]
-MAX_STEPS = 300
-RESET_OPTIONS = ("joint_positions", "ee_target_pose", "randomize_start", "continue_on_success")
 REDRAWS = 1000  # of a random start that collides; about one in ten does
 
-_LIMITS = np.array(POSITION_LIMITS)
 
-Observation = NDArray[np.float32]
-
-
-class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
+class EndEffectorPositioningURSim(URArmEnv):
     """Bring the end effector of a UR arm to within 0.1 m of a target, without touching anything.
 
     The task, spaces, units and rewards are those of robo-gym 2.0's `EndEffectorPositioningURSim-v0`, so that a policy
@@ -101,8 +86,12 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
     Gazebo's controller jitter and sensor delay are not modelled: a command takes effect within the cycle, exactly.
     """
 
-    # Not a ClassVar: each instance states its own rate.
-    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
+    START_JOINTS = START_JOINTS
+    MAX_STEPS = 300
+    RESET_OPTIONS = ("joint_positions", "ee_target_pose", "randomize_start", "continue_on_success")
+    RS_MODE = "1object"
+    OBJECTS = ("sphere50_no_collision",)
+    TABLE = True
 
     def __init__(
         self,
@@ -127,47 +116,20 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
         render_mode: str | None = None,
     ) -> None:
         del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
-        if gui and render_mode is None:
-            render_mode = "human"  # what robo-gym's `gui` shows
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(f"render_mode {render_mode!r} does not exist: expected one of {', '.join(RENDER_MODES)}")
-        fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
-        if all(fixed):
-            raise ValueError("all six joints are fixed: there is nothing left to act on")
-        self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": action_cycle_rate}
-        self.simulation = URSimulation(
-            ur_model, max_velocity_scale=max_velocity_scale_factor, cycle_s=1.0 / action_cycle_rate
+        super().__init__(
+            fixed=(fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3),
+            ur_model=ur_model,
+            rs_state_to_info=rs_state_to_info,
+            gui=gui,
+            max_velocity_scale_factor=max_velocity_scale_factor,
+            action_cycle_rate=action_cycle_rate,
+            render_mode=render_mode,
         )
-        self._free = np.flatnonzero(~np.array(fixed))
-        self._fixed = np.flatnonzero(np.array(fixed))
         self._restrict_wrist_1 = restrict_wrist_1
-        self._rs_state_to_info = rs_state_to_info
         self._randomize_start = randomize_start
-        self._elements = self.describe(
-            fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3, action_cycle_rate
-        )["action"]
-
-        high = np.concatenate(
-            [np.full(3, np.inf), np.full(6, 1.1), np.full(6, np.inf), np.full(6, np.inf), np.full(6, 1.01)]
-        ).astype(np.float32)
-        self.observation_space = gym.spaces.Box(-high, high, dtype=np.float32)
-        self._actions = gym.spaces.Box(-1.0, 1.0, (len(self._free),), dtype=np.float32)
-        self.action_space = self._actions
-
-        self._camera = Camera(
-            self.simulation.model,
-            self.simulation.data,
-            lookat=(0.0, 0.05, 0.42),
-            distance=2.3,
-            azimuth=145.0,
-            elevation=-18.0,
-        )
-        self._start: NDArray[np.float64] = np.array(START_JOINTS)
-        self._target: NDArray[np.float64] = np.zeros(3)
-        self._previous_action: NDArray[np.float64] = np.zeros(6)
-        self._success_joints: NDArray[np.float64] | None = None
-        self._steps = 0
+        self._target: Vector = np.zeros(3)
+        self._previous_action: Vector = np.zeros(6)
+        self._success_joints: Vector | None = None
 
     @classmethod
     def describe(
@@ -183,87 +145,49 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
     ) -> EnvDescription:
         """Name the elements for the constructor arguments given, without building a simulator."""
         fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
-        observation = [element("target_r", "m"), element("target_theta", "rad"), element("target_phi", "rad")]
-        observation += [element(f"{joint}_position_normalized", "1") for joint in JOINTS]
-        observation += [element(f"{joint}_velocity", "rad/s") for joint in JOINTS]
-        observation += [element(f"target_{axis}", "m") for axis in "xyz"]
-        observation += [element(f"ee_{axis}", "m") for axis in "xyz"]
-        observation += [element(f"{joint}_previous_action", "1") for joint in JOINTS]
-        free = [joint for joint, is_fixed in zip(JOINTS, fixed, strict=True) if not is_fixed]
-        action = [element(f"{joint}_position_normalized", "1") for joint in free]
-        return {"observation": observation, "action": action, "control_rate_hz": action_cycle_rate}
+        observation = [("target_r", "m"), ("target_theta", "rad"), ("target_phi", "rad")]
+        observation += [(f"{joint}_position_normalized", "1") for joint in JOINTS]
+        observation += [(f"{joint}_velocity", "rad/s") for joint in JOINTS]
+        observation += [(f"target_{axis}", "m") for axis in "xyz"]
+        observation += [(f"ee_{axis}", "m") for axis in "xyz"]
+        observation += [(f"{joint}_previous_action", "1") for joint in JOINTS]
+        return describe(observation, fixed, cls._action_element(), action_cycle_rate)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the class's docstring lists the options."""
-        super().reset(seed=seed)
-        options = options or {}
-        check_option_names(options, RESET_OPTIONS)
-        self._steps = 0
-        self._previous_action = np.zeros(6)
-        self._start = self._place_arm(options)
-        pose = options.get("ee_target_pose")
-        self._target = self._random_target() if pose is None else as_vector("ee_target_pose", pose, 6)[:3]
-        self.simulation.place_target(self._target)
-        if self.render_mode == "human":
-            self._camera.show()
-        return self._observation(), {}
+    @classmethod
+    def _action_element(cls) -> tuple[str, str]:
+        return "position_normalized", "1"
 
-    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Command joint positions, let 0.1 s pass, and judge the outcome."""
-        given = check_action(action, self._actions, self._elements)
-        self._steps += 1
-        command = np.empty(6)  # normalised, all joints
-        command[self._free] = given
-        command[self._fixed] = (self._start / _LIMITS)[self._fixed]
-        self.simulation.command(self._to_joint_positions(command))
-        self.simulation.advance()
-
-        observation = self._observation()
-        self._previous_action = command  # after the observation: robo-gym's order, see the data sheet
-        reward, terminated, truncated, info = self._judge(float(observation[0]))
-        if self._rs_state_to_info:
-            info["rs_state"] = self.simulation.state()
-        if self.render_mode == "human":
-            self._camera.show()
-        return observation, reward, terminated, truncated, info
-
-    def render(self) -> Any:
-        """Return an (480, 640, 3) uint8 frame in mode rgb_array; the window of mode human refreshes by itself."""
-        return self._camera.frame() if self.render_mode == "rgb_array" else None
-
-    def close(self) -> None:
-        """Free the GL context and close the window."""
-        self._camera.close()
+    def _observation_bounds(self) -> tuple[Vector, Vector]:
+        unbounded = np.full(6, np.inf)
+        high = np.concatenate([unbounded[:3], np.full(6, POSITION_BOUND), unbounded, unbounded, np.full(6, 1.01)])
+        return -high, high
 
     # -- a new episode
 
-    def _place_arm(self, options: dict[str, Any]) -> NDArray[np.float64]:
+    def _place_arm(self, options: Mapping[str, Any]) -> Vector:
         given = options.get("joint_positions")
         centre = np.array(START_JOINTS) if given is None else as_vector("joint_positions", given, 6)
         if options.get("continue_on_success") and self._success_joints is not None:
             centre, randomize = self._success_joints, False
         else:
             randomize = bool(options.get("randomize_start", self._randomize_start))
-        for joint, position, limit in zip(JOINTS, centre, POSITION_LIMITS, strict=True):
-            if abs(position) > limit:
-                raise InvalidResetError(
-                    f"reset option 'joint_positions': {joint} is {position:g} rad, expected within +-{limit:g} rad"
-                )
+        centre = self._check_joints(centre)
         if not randomize:
-            if self.simulation.place(centre):
-                links = " and ".join(self.simulation.contacts()[0])
-                raise InvalidResetError(f"the start joint positions collide: {links} touch")
-            return centre
+            return self._place_arm_at(centre)
         for _ in range(REDRAWS):
             drawn = self.np_random.uniform(centre - START_RANGE, centre + START_RANGE)
-            joints = np.clip(drawn, -_LIMITS, _LIMITS)
+            joints: Vector = np.clip(drawn, -LIMITS, LIMITS)
             if not self.simulation.place(joints):
                 return joints
         raise InvalidResetError(f"{REDRAWS} random starts around the given joint positions all collide")
 
-    def _random_target(self) -> NDArray[np.float64]:
+    def _begin(self, options: Mapping[str, Any]) -> None:
+        self._previous_action = np.zeros(6)
+        pose = options.get("ee_target_pose")
+        self._target = self._random_target() if pose is None else as_vector("ee_target_pose", pose, 6)[:3]
+        self.simulation.place_object(0, self._target)
+
+    def _random_target(self) -> Vector:
         arm = self.simulation.parameters
         while True:
             phi = self.np_random.uniform(0.0, 2.0 * math.pi)
@@ -275,8 +199,11 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
 
     # -- a step
 
-    def _to_joint_positions(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
-        positions: NDArray[np.float64] = command * _LIMITS
+    def _fixed_values(self) -> Vector:
+        return self._start / LIMITS
+
+    def _to_joint_positions(self, command: Vector) -> Vector:
+        positions: Vector = command * LIMITS
         if self._restrict_wrist_1:
             low, high = WRIST_1_RANGE
             positions[3] = low + (command[3] + 1.0) * 0.5 * (high - low)
@@ -290,21 +217,23 @@ class EndEffectorPositioningURSim(gym.Env[Observation, NDArray[np.float32]]):
         theta = math.acos(max(-1.0, min(1.0, z / r))) if r > 0.0 else 0.0
         observation = np.empty(27, dtype=np.float32)
         observation[0:3] = r, theta, math.atan2(y, x)
-        observation[3:9] = sim.joint_positions / _LIMITS
+        observation[3:9] = sim.joint_positions / LIMITS
         observation[9:15] = sim.joint_velocities
         observation[15:18] = self._target
         observation[18:21] = tool
         observation[21:27] = self._previous_action
         return observation
 
-    def _judge(self, distance: float) -> tuple[float, bool, bool, dict[str, Any]]:
+    def _judge(self, observation: Observation, command: Vector) -> tuple[float, bool, bool, dict[str, Any]]:
+        self._previous_action = command  # after the observation: robo-gym's order, see the data sheet
+        distance = float(observation[0])
         if self.simulation.in_collision:
             return -1.0, True, False, self._ending("collision")
         if distance <= SUCCESS_DISTANCE:
             self._success_joints = self.simulation.joint_positions.copy()
             return 2.0, True, False, self._ending("success")
         reward = -0.005 * distance
-        if self._steps >= MAX_STEPS:
+        if self._steps >= self.MAX_STEPS:
             return reward, False, True, self._ending("max_steps_exceeded")
         return reward, False, False, {}
 

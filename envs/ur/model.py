@@ -7,13 +7,17 @@ the end effector. Each link is one or two capsules along the real housing's cent
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import mujoco
 
+from rlservo.envs.ur.objects import ObjectModel, object_model
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, TABLE_CENTRE, TABLE_SIZE, URParameters
 
 TIMESTEP = 0.005  # [s]
 BASE_HEIGHT = TABLE_CENTRE[2] + TABLE_SIZE[2] / 2  # [m], base_link above the world's ground
+
+PARKED_HEIGHT = 3.0  # [m], of an object that has no place yet, above base_link
 
 # The joint servo. Stiffness follows the effort limit (a quarter of the limit at 1 degree off), damping makes the
 # stiffest link-side inertia of the joint well damped. Armature is the harmonic drive's reflected rotor inertia, of the
@@ -26,17 +30,25 @@ ARMATURE = 0.1  # [kg m^2]
 SHOULDER_RADIUS, UPPER_ARM_RADIUS, ELBOW_RADIUS, FOREARM_RADIUS, WRIST_RADIUS = 0.060, 0.054, 0.060, 0.040, 0.045
 
 
-def build_model(arm: URParameters) -> mujoco.MjModel:
-    """Return the compiled model: the arm standing on the table, a target marker, a floor.
+# Touching an object is noticed and hardly felt: a contact this soft yields a ten-thousandth of the usual force.
+OBJECT_SOFTNESS = 'priority="1" condim="1" solimp="0.0001 0.0001 0.001 0.5 1"'
+
+
+def build_model(
+    arm: URParameters, *, objects: Sequence[str] = ("sphere50_no_collision",), table: bool = True
+) -> mujoco.MjModel:
+    """Return the compiled model: the arm standing on the table (or 0.1 m above bare ground) and the objects named.
+
+    Object i is the mocap body `object_<i>`; where there is no table a post that nothing collides with is drawn.
 
     Joints are named as in `JOINTS`; `tool0` is a site at wrist_3's origin. Each joint has two actuators that together
     are one servo: `<joint>` integrates its control, a velocity [rad/s], into a position setpoint, `<joint>_velocity`
     feeds the same velocity forward. Their sum, gravity compensation included, is limited to the joint's effort.
     """
-    return mujoco.MjModel.from_xml_string(_document(arm))
+    return mujoco.MjModel.from_xml_string(_document(arm, [object_model(name) for name in objects], table))
 
 
-def _document(arm: URParameters) -> str:
+def _document(arm: URParameters, objects: list[ObjectModel], table: bool) -> str:
     s = arm.size
     housing, cap = "0.78 0.79 0.81 1", "0.29 0.52 0.75 1"
 
@@ -78,12 +90,8 @@ def _document(arm: URParameters) -> str:
   <worldbody>
     <light pos="1.2 -0.8 2.6" dir="-0.4 0.3 -1" diffuse="0.5 0.5 0.5" specular="0.1 0.1 0.1"/>
     <geom class="scene" name="ground" type="plane" size="3 3 0.1" material="floor"/>
-    <geom class="scene" name="table" type="box" size="{TABLE_SIZE[0] / 2} {TABLE_SIZE[1] / 2} {TABLE_SIZE[2] / 2}"
-          pos="{TABLE_CENTRE[0]} {TABLE_CENTRE[1]} {TABLE_CENTRE[2]}" rgba="0.55 0.43 0.32 1"/>
-    <body name="target" mocap="true" pos="0 0 -1">
-      <geom class="seen" type="sphere" size="0.025" rgba="0.85 0.15 0.15 1"/>
-      <geom class="seen" type="sphere" size="0.1" rgba="0.85 0.15 0.15 0.15"/>
-    </body>
+    {_table() if table else _post()}
+    {_objects(objects)}
     <body name="base_link" pos="0 0 {BASE_HEIGHT}">
       <body name="base" euler="0 0 {math.pi}">
         {capsule((0, 0, SHOULDER_RADIUS * s), (0, 0, arm.d1), SHOULDER_RADIUS, m[0], cap)}
@@ -127,6 +135,31 @@ def _document(arm: URParameters) -> str:
   </actuator>
 </mujoco>
 """
+
+
+def _table() -> str:
+    half = " ".join(str(edge / 2) for edge in TABLE_SIZE)
+    centre = " ".join(str(value) for value in TABLE_CENTRE)
+    return f'<geom class="scene" name="table" type="box" size="{half}" pos="{centre}" rgba="0.55 0.43 0.32 1"/>'
+
+
+def _post() -> str:
+    return f'<geom class="seen" type="cylinder" fromto="0 0 0 0 0 {BASE_HEIGHT}" size="0.08" rgba="0.4 0.41 0.43 1"/>'
+
+
+def _objects(objects: list[ObjectModel]) -> str:
+    lines = []
+    for index, model in enumerate(objects):
+        size = " ".join([str(model.half_size)] * (1 if model.shape == "sphere" else 3))
+        # Seen by the links' contype, and by nothing else; the arm's base does not move and so never counts.
+        touch = f'contype="0" conaffinity="1" {OBJECT_SOFTNESS}' if model.collides else 'class="seen"'
+        # Out of the way until somebody places it, where the original parks its objects.
+        lines.append(f'<body name="object_{index}" mocap="true" pos="{index} 0 {PARKED_HEIGHT + BASE_HEIGHT}">')
+        lines.append(f'<geom name="object_{index}" {touch} type="{model.shape}" size="{size}" rgba="{model.rgb} 1"/>')
+        if model.halo:
+            lines.append(f'<geom class="seen" type="sphere" size="{model.halo}" rgba="{model.rgb} 0.15"/>')
+        lines.append("</body>")
+    return "\n    ".join(lines)
 
 
 def _servos(arm: URParameters) -> str:

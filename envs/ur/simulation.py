@@ -1,21 +1,29 @@
 """The simulated arm: put it somewhere, command joint positions, let a control cycle pass, read where everything is.
 
-It follows robo-gym's robot server: a command becomes a one-point joint trajectory, and the next command replaces it. It
-knows nothing of observations, rewards or Gymnasium. Poses are in `base_link`, which stands unrotated on the table.
+It follows robo-gym's robot server: a command becomes a one-point joint trajectory, and the next command replaces it;
+objects stand or move along paths. The Gymnasium environments and the robot server both run on it. It knows nothing of
+observations, rewards, Gymnasium or gRPC. Poses are in `base_link`, which stands unrotated on the table.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.envs.ur.model import BASE_HEIGHT, build_model
+from rlservo.envs.ur.model import BASE_HEIGHT, TIMESTEP, build_model
+from rlservo.envs.ur.object_paths import UPDATE_RATE_HZ, Path
 from rlservo.envs.ur.parameters import JOINTS, ur_parameters
+from rlservo.envs.ur.server_state import state_dict
 
 MIN_TRAJECTORY_S = 0.5  # [s], the robot server never plans a shorter one
+SETTLE_CYCLES = 20  # the robot server lets so many pass after it has set a state
+UPDATE_SUBSTEPS = round(1.0 / (UPDATE_RATE_HZ * TIMESTEP))  # of physics, between two positions of a moving object
+
+MAX_PAYLOAD = 20.0  # [kg], more than the largest arm carries (ur16e: 16 kg)
 
 Vector = NDArray[np.float64]
 
@@ -24,13 +32,22 @@ class URSimulation:
     """One arm on its table, at 200 Hz physics.
 
     `max_velocity_scale` multiplies the arm's joint velocity limits, as the robot server's parameter of that name.
+    `objects` are names of `OBJECT_MODELS`. Without `table` the arm stands 0.1 m above bare ground.
     """
 
-    def __init__(self, ur_model: str = "ur5", *, max_velocity_scale: float = 0.1, cycle_s: float = 0.1) -> None:
+    def __init__(
+        self,
+        ur_model: str = "ur5",
+        *,
+        max_velocity_scale: float = 0.1,
+        cycle_s: float = 0.1,
+        objects: Sequence[str] = ("sphere50_no_collision",),
+        table: bool = True,
+    ) -> None:
         self.parameters = ur_parameters(ur_model)
         if not 0.0 < max_velocity_scale <= 1.0:
             raise ValueError(f"max_velocity_scale_factor is {max_velocity_scale:g}: expected more than 0, at most 1")
-        self.model: mujoco.MjModel = build_model(self.parameters)
+        self.model: mujoco.MjModel = build_model(self.parameters, objects=objects, table=table)
         self.data = mujoco.MjData(self.model)
         self.max_velocity = max_velocity_scale * np.array(self.parameters.velocity_limits)  # [rad/s], (6,)
         self._substeps = round(cycle_s / self.model.opt.timestep)
@@ -45,7 +62,17 @@ class URSimulation:
         self._forearm = self.model.body("forearm").id
         self._tool_xpos = self.data.site_xpos[self._tool]  # views that stay valid: MjData never moves
         self._tool_xmat = self.data.site_xmat[self._tool]
-        self._target = self.model.body("target").mocapid[0]
+        self._forearm_xpos = self.data.xpos[self._forearm]
+        self._forearm_xmat = self.data.xmat[self._forearm]
+        self._objects = [int(self.model.body(f"object_{index}").mocapid[0]) for index in range(len(objects))]
+        self._moving: dict[int, Path] = {}  # by mocap index, in the world
+        self._tick = 0  # substeps since the objects' paths began
+        self._wrist_3 = self.model.body("wrist_3").id
+        self._bare_wrist_3 = (
+            float(self.model.body_mass[self._wrist_3]),
+            self.model.body_ipos[self._wrist_3].copy(),
+            self.model.body_inertia[self._wrist_3].copy(),
+        )
         self._velocity: Vector = np.zeros(6)  # [rad/s], of the trajectory that is being executed
         self._remaining = 0  # substeps until that trajectory arrives
         self.in_collision = False
@@ -53,8 +80,9 @@ class URSimulation:
     # -- placing
 
     def place(self, joint_positions: ArrayLike) -> bool:
-        """Put the arm at rest at `joint_positions` [rad] (6,). Return whether it collides there."""
+        """Put the arm at rest at `joint_positions` [rad] (6,), objects out of the way. Return whether it collides."""
         data = self.data
+        self._moving = {}
         mujoco.mj_resetData(self.model, data)
         data.qpos[:] = joint_positions
         data.act[:] = joint_positions
@@ -64,10 +92,45 @@ class URSimulation:
         self.in_collision = data.ncon > 0
         return self.in_collision
 
-    def place_target(self, position: ArrayLike) -> None:
-        """Move the target marker, which nothing collides with, to `position` [m] (3,) in base_link."""
-        self.data.mocap_pos[self._target] = np.asarray(position) + (0.0, 0.0, BASE_HEIGHT)
+    def place_object(self, index: int, position: ArrayLike) -> None:
+        """Put an object at `position` [m] (3,) in base_link, where it stays."""
+        self.move_objects({index: np.asarray(position, dtype=np.float64)[None, :]})
+
+    def move_objects(self, paths: dict[int, Path]) -> None:
+        """Let objects move along `paths` ((n, 3) [m] in base_link, 100 positions a second, round and round) from now.
+
+        Call it after `place`, which ends all paths.
+        """
+        self._tick = 0
+        for index, path in paths.items():
+            in_world = path + (0.0, 0.0, BASE_HEIGHT)
+            mocap = self._objects[index]
+            self.data.mocap_pos[mocap] = in_world[0]
+            self._moving.pop(mocap, None)
+            if len(path) > 1:
+                self._moving[mocap] = in_world
         mujoco.mj_kinematics(self.model, self.data)
+
+    def settle(self) -> None:
+        """Let 20 cycles pass with the arm at rest: the robot server does so at the end of a reset."""
+        self.hold()
+        for _ in range(SETTLE_CYCLES):
+            self.advance()
+
+    def set_payload(self, mass: float) -> None:
+        """Fasten a point mass [kg] to tool0 of which the arm's gravity compensation does not know; 0 takes it off."""
+        if not 0.0 <= mass <= MAX_PAYLOAD:
+            raise ValueError(f"the payload is {mass:g} kg: expected 0 to {MAX_PAYLOAD:g} kg")
+        model, body = self.model, self._wrist_3
+        own_mass, own_centre, own_inertia = self._bare_wrist_3
+        total = own_mass + mass
+        model.body_mass[body] = total
+        model.body_ipos[body] = own_centre * (own_mass / total)  # tool0 is the body's origin
+        # Both centres lie on the body's axis of symmetry, so its principal axes stay and only the two across it grow.
+        across = own_mass * mass / total * float(own_centre @ own_centre)
+        model.body_inertia[body] = own_inertia + across * np.array([1.0, 1.0, 0.0])
+        model.body_gravcomp[body] = own_mass / total
+        mujoco.mj_setConst(model, mujoco.MjData(model))
 
     # -- moving
 
@@ -91,24 +154,36 @@ class URSimulation:
 
     def advance(self) -> None:
         """Let one control cycle pass. A contact in any physics step sets `in_collision` until the next `place`."""
-        model, data = self.model, self.data
-        moving = min(self._substeps, self._remaining)
-        if moving:
+        data = self.data
+        travelling = min(self._substeps, self._remaining)
+        if travelling:
             data.ctrl[self._servo] = self._velocity
             data.ctrl[self._feed_forward] = self._velocity
-            for _ in range(moving):
-                mujoco.mj_step(model, data)
-                if data.ncon:
-                    self.in_collision = True
-            self._remaining -= moving
-        if moving < self._substeps:
+            self._step(travelling)
+            self._remaining -= travelling
+        if travelling < self._substeps:
             data.ctrl[:] = 0.0
-            for _ in range(self._substeps - moving):
-                mujoco.mj_step(model, data)
-                if data.ncon:
-                    self.in_collision = True
+            self._step(self._substeps - travelling)
         # mj_step leaves the link poses of the last step's start: bring them up to the joints' final positions.
-        mujoco.mj_kinematics(model, data)
+        if self._moving:
+            self._move_objects()
+        mujoco.mj_kinematics(self.model, data)
+
+    def _step(self, count: int) -> None:
+        model, data = self.model, self.data
+        for _ in range(count):
+            if self._moving:
+                self._move_objects()
+                self._tick += 1
+            mujoco.mj_step(model, data)
+            if data.ncon:
+                self.in_collision = True
+
+    def _move_objects(self) -> None:
+        update, rest = divmod(self._tick, UPDATE_SUBSTEPS)
+        if rest == 0:
+            for mocap, path in self._moving.items():
+                self.data.mocap_pos[mocap] = path[update % len(path)]
 
     # -- reading
 
@@ -135,28 +210,31 @@ class URSimulation:
         return self._tool_xmat.reshape(3, 3)  # type: ignore[no-any-return]
 
     @property
-    def target_position(self) -> Vector:
-        """The target's position in base_link [m] (3,)."""
-        position: Vector = self.data.mocap_pos[self._target].copy()
+    def forearm_position(self) -> Vector:
+        """The forearm link's origin, the elbow, in base_link [m] (3,)."""
+        position: Vector = self._forearm_xpos.copy()
         position[2] -= BASE_HEIGHT
         return position
 
-    def state(self) -> dict[str, float]:
-        """Return the robot server's `state_dict` of the mode `1object`."""
-        rotation = np.empty(4)
-        mujoco.mju_mat2Quat(rotation, self._tool_xmat)  # w, x, y, z
-        w, x, y, z = rotation.tolist()
-        values: dict[str, float] = {}
-        for axis, value in zip("xyz", self.target_position.tolist(), strict=True):
-            values[f"object_0_to_ref_translation_{axis}"] = value
-        values |= dict(zip(_OBJECT_ROTATION, (0.0, 0.0, 0.0, 1.0), strict=True))
-        values |= dict(zip(_POSITIONS, self.data.qpos.tolist(), strict=True))
-        values |= dict(zip(_VELOCITIES, self.data.qvel.tolist(), strict=True))
-        for axis, value in zip("xyz", self.tool_position.tolist(), strict=True):
-            values[f"ee_to_ref_translation_{axis}"] = value
-        values |= dict(zip(_TOOL_ROTATION, (x, y, z, w), strict=True))
-        values["in_collision"] = float(self.in_collision)
-        return values
+    @property
+    def forearm_rotation(self) -> Vector:
+        """The rotation matrix (3, 3) whose columns are the forearm link's axes in base_link."""
+        return self._forearm_xmat.reshape(3, 3)  # type: ignore[no-any-return]
+
+    def object_position(self, index: int) -> Vector:
+        """Where an object is, in base_link [m] (3,)."""
+        position: Vector = self.data.mocap_pos[self._objects[index]].copy()
+        position[2] -= BASE_HEIGHT
+        return position
+
+    @property
+    def object_count(self) -> int:
+        """How many objects the scene holds."""
+        return len(self._objects)
+
+    def state(self, rs_mode: str = "1object") -> dict[str, float]:
+        """Return the robot server's `state_dict` of a mode."""
+        return state_dict(self, rs_mode)
 
     def contacts(self) -> list[tuple[str, str]]:
         """Return the names of the bodies that touch now, for messages ('world' is the table and the ground)."""
@@ -166,9 +244,3 @@ class URSimulation:
             bodies = [model.body(model.geom_bodyid[geom]).name for geom in contact.geom]
             pairs.append((bodies[0], bodies[1]))
         return pairs
-
-
-_POSITIONS = [f"{joint}_joint_position" for joint in JOINTS]
-_VELOCITIES = [f"{joint}_joint_velocity" for joint in JOINTS]
-_OBJECT_ROTATION = [f"object_0_to_ref_rotation_{axis}" for axis in "xyzw"]
-_TOOL_ROTATION = [f"ee_to_ref_rotation_{axis}" for axis in "xyzw"]

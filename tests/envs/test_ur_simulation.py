@@ -220,7 +220,7 @@ def test_table_and_ground_stand_where_the_contract_says() -> None:
 def test_state_has_exactly_the_keys_of_the_mode_1object() -> None:
     sim = URSimulation("ur5")
     sim.place(START)
-    sim.place_target([0.3, 0.2, 0.5])
+    sim.place_object(0, [0.3, 0.2, 0.5])
     state = sim.state()
     joints = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
     expected = {f"{j}_joint_{kind}" for j in joints for kind in ("position", "velocity")}

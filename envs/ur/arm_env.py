@@ -1,0 +1,198 @@
+"""What the arm's tasks share: joints that may be fixed, a start pose, one command a cycle.
+
+A task adds what its action means, what it observes and how a step is judged. Source of every figure here:
+jr-robotics/robo-gym 2.0.1, envs/ur/ur_base_env.py.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlservo.envs.checks import EnvDescription, InvalidResetError, as_vector, check_action, check_option_names, element
+from rlservo.envs.rendering import RENDER_MODES, Camera
+from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
+from rlservo.envs.ur.simulation import URSimulation
+
+LIMITS = np.array(POSITION_LIMITS)
+POSITION_BOUND = 1.1  # of a normalised joint position: its limit and robo-gym's tolerance
+
+Observation = NDArray[np.float32]
+Vector = NDArray[np.float64]
+Fixed = tuple[bool, bool, bool, bool, bool, bool]  # JOINTS
+
+
+class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
+    """Move a UR arm by one command per joint and cycle; the tasks that derive from it hold the data sheets."""
+
+    # Not a ClassVar: each instance states its own rate.
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
+
+    START_JOINTS: ClassVar[tuple[float, ...]]  # [rad]
+    MAX_STEPS: ClassVar[int]
+    RESET_OPTIONS: ClassVar[tuple[str, ...]]
+    RS_MODE: ClassVar[str]  # what `info["rs_state"]` holds
+    OBJECTS: ClassVar[tuple[str, ...]]
+    TABLE: ClassVar[bool]
+
+    def __init__(
+        self,
+        *,
+        fixed: Fixed,
+        ur_model: str,
+        rs_state_to_info: bool,
+        gui: bool,
+        max_velocity_scale_factor: float,
+        action_cycle_rate: float,
+        render_mode: str | None,
+    ) -> None:
+        if gui and render_mode is None:
+            render_mode = "human"  # what robo-gym's `gui` shows
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(f"render_mode {render_mode!r} does not exist: expected one of {', '.join(RENDER_MODES)}")
+        if all(fixed):
+            raise ValueError("all six joints are fixed: there is nothing left to act on")
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": action_cycle_rate}
+        self.simulation = URSimulation(
+            ur_model,
+            max_velocity_scale=max_velocity_scale_factor,
+            cycle_s=1.0 / action_cycle_rate,
+            objects=self.OBJECTS,
+            table=self.TABLE,
+        )
+        self._free = np.flatnonzero(~np.array(fixed))
+        self._fixed = np.flatnonzero(np.array(fixed))
+        self._rs_state_to_info = rs_state_to_info
+        self._elements = action_elements(fixed, self._action_element())
+
+        low, high = self._observation_bounds()
+        self.observation_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        self._actions = gym.spaces.Box(-1.0, 1.0, (len(self._free),), dtype=np.float32)
+        self.action_space = self._actions
+
+        self._camera = Camera(
+            self.simulation.model,
+            self.simulation.data,
+            lookat=(0.0, 0.05, 0.42),
+            distance=2.3,
+            azimuth=145.0,
+            elevation=-18.0,
+        )
+        self._start: Vector = np.array(self.START_JOINTS)
+        self._steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; the class's docstring lists the options."""
+        super().reset(seed=seed)
+        options = options or {}
+        check_option_names(options, self.RESET_OPTIONS)
+        self._steps = 0
+        self._start = self._place_arm(options)
+        self._begin(options)
+        if self.render_mode == "human":
+            self._camera.show()
+        return self._observation(), {}
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Command the joints, let one cycle pass, and judge the outcome."""
+        given = check_action(action, self._actions, self._elements)
+        self._steps += 1
+        command = np.empty(6)  # all joints
+        command[self._free] = given
+        command[self._fixed] = self._fixed_values()[self._fixed]
+        self.simulation.command(self._to_joint_positions(command))
+        self.simulation.advance()
+
+        observation = self._observation()
+        reward, terminated, truncated, info = self._judge(observation, command)
+        if self._rs_state_to_info:
+            info["rs_state"] = self.simulation.state(self.RS_MODE)
+        if self.render_mode == "human":
+            self._camera.show()
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> Any:
+        """Return an (480, 640, 3) uint8 frame in mode rgb_array; the window of mode human refreshes by itself."""
+        return self._camera.frame() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Free the GL context and close the window."""
+        self._camera.close()
+
+    # -- what a task adds
+
+    @classmethod
+    @abstractmethod
+    def _action_element(cls) -> tuple[str, str]:
+        """Return what an action element is called after its joint's name, and its unit."""
+
+    @abstractmethod
+    def _observation_bounds(self) -> tuple[Vector, Vector]:
+        """Return the observation space's low and high."""
+
+    @abstractmethod
+    def _begin(self, options: Mapping[str, Any]) -> None:
+        """Prepare the episode: the arm stands at its start."""
+
+    @abstractmethod
+    def _fixed_values(self) -> Vector:
+        """Return what the fixed joints' action elements are, (6,)."""
+
+    @abstractmethod
+    def _to_joint_positions(self, command: Vector) -> Vector:
+        """Turn an action of all six joints into the joint positions [rad] it asks for."""
+
+    @abstractmethod
+    def _observation(self) -> Observation:
+        """Return the observation of this moment."""
+
+    @abstractmethod
+    def _judge(self, observation: Observation, command: Vector) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Return reward, terminated, truncated and info of the step that ended with `observation`."""
+
+    # -- parts
+
+    def _place_arm(self, options: Mapping[str, Any]) -> Vector:
+        """Put the arm where the options say and return that."""
+        given = options.get("joint_positions")
+        return self._place_arm_at(np.array(self.START_JOINTS) if given is None else self._check_joints(given))
+
+    def _check_joints(self, given: Any) -> Vector:
+        joints = as_vector("joint_positions", given, 6)
+        for joint, position, limit in zip(JOINTS, joints, POSITION_LIMITS, strict=True):
+            if abs(position) > limit:
+                raise InvalidResetError(
+                    f"reset option 'joint_positions': {joint} is {position:g} rad, expected within +-{limit:g} rad"
+                )
+        return joints
+
+    def _place_arm_at(self, joints: Vector) -> Vector:
+        if self.simulation.place(joints):
+            links = " and ".join(self.simulation.contacts()[0])
+            raise InvalidResetError(f"the start joint positions collide: {links} touch")
+        return joints
+
+
+def action_elements(fixed: Fixed, what: tuple[str, str]) -> list[Any]:
+    """Name the elements of an action: one for each joint that is not fixed."""
+    name, unit = what
+    return [element(f"{joint}_{name}", unit) for joint, is_fixed in zip(JOINTS, fixed, strict=True) if not is_fixed]
+
+
+def describe(
+    observation: Sequence[tuple[str, str]], fixed: Fixed, action: tuple[str, str], rate: float
+) -> EnvDescription:
+    """Return the description of a task whose observation elements (name, unit) are given."""
+    return {
+        "observation": [element(name, unit) for name, unit in observation],
+        "action": action_elements(fixed, action),
+        "control_rate_hz": rate,
+    }

@@ -1,0 +1,150 @@
+"""robo-gym's empty environment: the arm alone, nothing to reach, to try a controller or a policy's plumbing on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rlservo.envs.checks import EnvDescription
+from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, describe
+from rlservo.envs.ur.parameters import JOINTS
+
+
+class EmptyEnvironmentURSim(URArmEnv):
+    """Move a UR arm about in an empty world.
+
+    Spaces, units and endings are those of robo-gym 2.0's `EmptyEnvironmentURSim-v0`. One step is one control cycle of
+    0.05 s. There is no table: the arm stands 0.1 m above the ground.
+
+    ## Observation: Box(12,), float32
+
+    | index | name | unit | range |
+    |---|---|---|---|
+    | 0-5 | position of base, shoulder, elbow, wrist_1, wrist_2, wrist_3 over 2 pi (elbow: pi) | 1 | -1.1 .. 1.1 |
+    | 6-11 | velocity of the same joints | rad/s | unbounded |
+
+    ## Action: Box(5,), float32, -1 .. 1
+
+    Absolute joint positions over 2 pi (elbow: pi), one element per joint that is not fixed, in the order above. The arm
+    moves towards them in max(0.5 s, slowest joint's way / (scale * velocity limit)), and the next action replaces the
+    motion 0.05 s later. A fixed joint is commanded to its position at reset. An action outside the space raises
+    `InvalidActionError` naming the element and the excess.
+
+    ## Reward
+
+    0, always.
+
+    ## Endings
+
+    | `info["final_status"]` | when | flag |
+    |---|---|---|
+    | collision | a link touches the ground or the arm itself | terminated |
+    | success | 300 steps without a collision | truncated |
+
+    The last step's info also holds `is_success`.
+
+    ## Reset options
+
+    `joint_positions` (6 numbers, rad); [0, -2.5, 1.5, 0, -1.4, 0] without it.
+
+    ## Constructor
+
+    `ur_model` (ur3, ur3e, ur5, ur5e, ur10, ur10e, ur16e), `fix_base` ... `fix_wrist_3`, `rs_state_to_info` (the robot
+    server's `state_dict` of the mode `only_robot` in `info["rs_state"]`; False keeps info picklable for RLlib),
+    `render_mode`. Of our own: `max_velocity_scale_factor` (0.2) and `action_cycle_rate` (20 Hz), which robo-gym has in
+    its launch file. robo-gym's `ip`, `lower_bound_port`, `upper_bound_port`, `gui` (`render_mode="human"`) and
+    `rs_address` are accepted; there is no server to find.
+
+    ## Differences from robo-gym on Gazebo
+
+    The time limit truncates (robo-gym says done). Resets are immediate, and a colliding start is refused. Gazebo's
+    controller jitter and sensor delay are not modelled: a command takes effect within the cycle, exactly.
+    """
+
+    START_JOINTS = (0.0, -2.5, 1.5, 0.0, -1.4, 0.0)  # [rad]
+    MAX_STEPS = 300
+    RESET_OPTIONS = ("joint_positions",)
+    RS_MODE = "only_robot"
+    OBJECTS = ()
+    TABLE = False
+
+    def __init__(
+        self,
+        rs_address: str | None = None,
+        fix_base: bool = False,
+        fix_shoulder: bool = False,
+        fix_elbow: bool = False,
+        fix_wrist_1: bool = False,
+        fix_wrist_2: bool = False,
+        fix_wrist_3: bool = True,
+        ur_model: str = "ur5",
+        rs_state_to_info: bool = True,
+        *,
+        ip: str | None = None,
+        lower_bound_port: int | None = None,
+        upper_bound_port: int | None = None,
+        gui: bool = False,
+        max_velocity_scale_factor: float = 0.2,
+        action_cycle_rate: float = 20.0,
+        render_mode: str | None = None,
+    ) -> None:
+        del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
+        super().__init__(
+            fixed=(fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3),
+            ur_model=ur_model,
+            rs_state_to_info=rs_state_to_info,
+            gui=gui,
+            max_velocity_scale_factor=max_velocity_scale_factor,
+            action_cycle_rate=action_cycle_rate,
+            render_mode=render_mode,
+        )
+
+    @classmethod
+    def describe(
+        cls,
+        fix_base: bool = False,
+        fix_shoulder: bool = False,
+        fix_elbow: bool = False,
+        fix_wrist_1: bool = False,
+        fix_wrist_2: bool = False,
+        fix_wrist_3: bool = True,
+        action_cycle_rate: float = 20.0,
+        **_unrelated: Any,
+    ) -> EnvDescription:
+        """Name the elements for the constructor arguments given, without building a simulator."""
+        fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
+        observation = [(f"{joint}_position_normalized", "1") for joint in JOINTS]
+        observation += [(f"{joint}_velocity", "rad/s") for joint in JOINTS]
+        return describe(observation, fixed, cls._action_element(), action_cycle_rate)
+
+    @classmethod
+    def _action_element(cls) -> tuple[str, str]:
+        return "position_normalized", "1"
+
+    def _observation_bounds(self) -> tuple[Vector, Vector]:
+        high = np.concatenate([np.full(6, POSITION_BOUND), np.full(6, np.inf)])
+        return -high, high
+
+    def _begin(self, options: Mapping[str, Any]) -> None:
+        self.simulation.settle()
+
+    def _fixed_values(self) -> Vector:
+        return self._start / LIMITS
+
+    def _to_joint_positions(self, command: Vector) -> Vector:
+        return command * LIMITS
+
+    def _observation(self) -> Observation:
+        observation = np.empty(12, dtype=np.float32)
+        observation[:6] = self.simulation.joint_positions / LIMITS
+        observation[6:] = self.simulation.joint_velocities
+        return observation
+
+    def _judge(self, observation: Observation, command: Vector) -> tuple[float, bool, bool, dict[str, Any]]:
+        if self.simulation.in_collision:
+            return 0.0, True, False, {"final_status": "collision", "is_success": False}
+        if self._steps >= self.MAX_STEPS:
+            return 0.0, False, True, {"final_status": "success", "is_success": True}
+        return 0.0, False, False, {}
