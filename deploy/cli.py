@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from rlservo.deploy import robot_commands
 from rlservo.export.errors import RlservoError, UsageError
 
 app = typer.Typer(
@@ -286,6 +287,9 @@ def demo(
         from rlservo.deploy.demo import run_demo
 
     run_demo(out, checkpoints=checkpoints, episodes=episodes, console=_out)
+
+
+robot_commands.add_to(app)
 
 
 def parse_env_arguments(pairs: list[str]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from rlservo.envs.rendering import RENDER_MODES, Camera
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
 from rlservo.envs.ur.simulation import URSimulation
 
-LIMITS = np.array(POSITION_LIMITS)
+LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
 POSITION_BOUND = 1.1  # of a normalised joint position: its limit and robo-gym's tolerance
 
 Observation = NDArray[np.float32]

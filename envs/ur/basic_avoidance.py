@@ -52,8 +52,8 @@ class BasicAvoidanceURSim(URArmEnv):
 
     In thousandths, each step, over all six joints (a fixed joint's action counts as 0): 1 - s / 0.6 for being near the
     start, where s is the sum of |elements 9-14|, while the sum of |elements 12-17| is below 0.6 (robo-gym sums those);
-    1 - mean(action^2) for small actions; -0.2 for each joint whose action changed by more than 0.5; -2 while the ball is
-    nearer than 0.3 m to tool0 or to the forearm's origin, the elbow.
+    1 - mean(action^2) for small actions; -0.2 for each joint whose action changed by more than 0.5; -2 while the ball
+    is nearer than 0.3 m to tool0 or to the forearm's origin, the elbow.
 
     ## Endings
 
@@ -68,9 +68,9 @@ class BasicAvoidanceURSim(URArmEnv):
 
     `joint_positions` (6 numbers, rad; [-1.57, -1.31, -1.31, -2.18, 1.57, 0] without it), `fixed_object_position`
     (3 numbers, m, in base_link: the ball stays there). Of our own: `z_amplitude` and `z_offset` [m] of the ball's
-    motion, which are drawn from 0.09 .. 0.35 and 0.2 .. 0.6 without them. The ball goes up and down at x 0.12, y 0.34 m,
-    once in 8 s, and has done so for 20 cycles when the first observation is made. A motion that hits the arm before
-    that is drawn again; one given by the caller that does so is refused with `InvalidResetError`.
+    motion, which are drawn from 0.09 .. 0.35 and 0.2 .. 0.6 without them. The ball goes up and down at x 0.12,
+    y 0.34 m, once in 8 s, and has done so for 20 cycles when the first observation is made. A motion that hits the arm
+    before that is drawn again; one given by the caller that does so is refused with `InvalidResetError`.
 
     ## Constructor
 
@@ -82,9 +82,9 @@ class BasicAvoidanceURSim(URArmEnv):
 
     ## Differences from robo-gym on Gazebo
 
-    robo-gym 2.0.1's own class cannot be reset or stepped with any server (its `reset` and `step` call their parents with
-    the signatures of version 1); what it means to do is done here. The time limit truncates (robo-gym says done). All
-    randomness comes from the environment's own seed. Resets are immediate, and a colliding start is refused.
+    robo-gym 2.0.1's own class cannot be reset or stepped with any server (its `reset` and `step` call their parents
+    with the signatures of version 1); what it means to do is done here. The time limit truncates (robo-gym says done).
+    All randomness comes from the environment's own seed. Resets are immediate, and a colliding start is refused.
     """
 
     START_JOINTS = (-1.57, -1.31, -1.31, -2.18, 1.57, 0.0)  # [rad]

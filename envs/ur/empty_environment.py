@@ -128,6 +128,7 @@ class EmptyEnvironmentURSim(URArmEnv):
         return -high, high
 
     def _begin(self, options: Mapping[str, Any]) -> None:
+        del options  # the start pose is the only one
         self.simulation.settle()
 
     def _fixed_values(self) -> Vector:
@@ -143,6 +144,7 @@ class EmptyEnvironmentURSim(URArmEnv):
         return observation
 
     def _judge(self, observation: Observation, command: Vector) -> tuple[float, bool, bool, dict[str, Any]]:
+        del observation, command  # nothing to reach
         if self.simulation.in_collision:
             return 0.0, True, False, {"final_status": "collision", "is_success": False}
         if self._steps >= self.MAX_STEPS:

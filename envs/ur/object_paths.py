@@ -181,7 +181,8 @@ def _second_derivatives(knots: NDArray[np.float64], points: NDArray[np.float64])
     # Not-a-knot: the third derivative is continuous at the second knot and at the last but one.
     matrix[0, :3] = h[1], -(h[0] + h[1]), h[0]
     matrix[-1, -3:] = h[-1], -(h[-2] + h[-1]), h[-2]
-    return np.linalg.solve(matrix, right)
+    second: NDArray[np.float64] = np.linalg.solve(matrix, right).astype(np.float64, copy=False)
+    return second
 
 
 def _random_points(given: Parameters, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -6,7 +6,6 @@ names make the dictionary's order irrelevant.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import mujoco
@@ -14,41 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.envs.ur.parameters import JOINTS
-
-ROS_ORDER = (
-    2,
-    1,
-    0,
-    3,
-    4,
-    5,
-)  # elbow, shoulder, base, wrists; the same list turns ROS order back into the standard one
+from rlservo.envs.ur.rs_modes import ROS_ORDER, rs_mode_of
 
 Vector = NDArray[np.float64]
 Transform = tuple[float, float, float, float, float, float, float]  # x, y, z [m], quaternion x, y, z, w
-
-
-@dataclass(frozen=True)
-class RsMode:
-    """What a mode tells besides joints, end effector and collision."""
-
-    objects: int
-    forearm: bool
-
-
-RS_MODES: dict[str, RsMode] = {
-    "only_robot": RsMode(objects=0, forearm=False),
-    "1object": RsMode(objects=1, forearm=False),
-    "1moving2points": RsMode(objects=1, forearm=True),
-    "2objects2points": RsMode(objects=2, forearm=True),
-}
-
-
-def rs_mode_of(name: str) -> RsMode:
-    """Return the mode of that name, or raise ValueError naming those there are."""
-    if name not in RS_MODES:
-        raise ValueError(f"rs_mode {name!r} does not exist: expected one of {', '.join(RS_MODES)}")
-    return RS_MODES[name]
 
 
 class Arm(Protocol):
@@ -113,18 +81,6 @@ def state_list(arm: Arm, rs_mode: str, *, turned: bool = False) -> list[float]:
     if mode.forearm:
         values += _transform(arm.forearm_position, arm.forearm_rotation, turned)
     return values
-
-
-def state_length(rs_mode: str) -> int:
-    """Return how long the list of a mode is."""
-    mode = rs_mode_of(rs_mode)
-    return 7 * mode.objects + 20 + 7 * mode.forearm
-
-
-def positions_in_list(rs_mode: str) -> slice:
-    """Return where a mode's list holds the joint positions."""
-    start = 7 * rs_mode_of(rs_mode).objects
-    return slice(start, start + 6)
 
 
 def _object(arm: Arm, index: int, turned: bool) -> Transform:

@@ -1,0 +1,176 @@
+"""The commands `rlservo robot-server` and `rlservo server-manager`: options here, work in rlservo.envs.robot_server."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import Enum
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from rlservo.export.errors import RlservoError, UsageError
+
+robot_server = typer.Typer(
+    help="Serve a simulated robot to robo-gym's environments, as a drop-in for the ROS robot server.",
+    no_args_is_help=True,
+)
+_out = Console()
+
+
+class ClockKind(str, Enum):
+    """When a control cycle ends."""
+
+    fast = "fast"
+    real = "real"
+
+
+Host = Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for clients on other machines.")]
+Clock = Annotated[
+    ClockKind,
+    typer.Option(help="fast: a cycle takes what its simulation takes; real: its time on the wall, as on the robot."),
+]
+RobotPort = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free one.")]
+Gui = Annotated[bool, typer.Option("--gui", help="Show the robot in a window; needs a display.")]
+Seed = Annotated[int | None, typer.Option(help="Of random object paths and laser noise; none: differs every run.")]
+
+
+@robot_server.command("ur")
+def robot_server_ur(
+    ur_model: Annotated[str, typer.Option(help="ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5",
+    rs_mode: Annotated[
+        str, typer.Option(help="What a state holds: only_robot, 1object, 1moving2points or 2objects2points.")
+    ] = "only_robot",
+    action_mode: Annotated[
+        str, typer.Option(help="abs_pos: actions are joint positions; delta_pos: offsets from where the arm is.")
+    ] = "abs_pos",
+    action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz]; 200/n.")] = 25.0,
+    max_velocity_scale_factor: Annotated[float, typer.Option(help="Of the joints' velocity limits.")] = 1.0,
+    world: Annotated[str, typer.Option(help="empty, or a tabletop world of robo-gym.")] = "tabletop",
+    model: Annotated[
+        list[str] | None,
+        typer.Option("--object", help="Object model in the scene, e.g. sphere50; repeat it. By default the mode's."),
+    ] = None,
+    reference_frame: Annotated[str, typer.Option(help="base_link (simulation) or base (the real controller's).")] = (
+        "base_link"
+    ),
+    host: Host = "127.0.0.1",
+    port: RobotPort = 50051,
+    clock: Clock = ClockKind.fast,
+    gui: Gui = False,
+    seed: Seed = None,
+) -> None:
+    """Serve a UR arm until Ctrl-C.
+
+    Example: `rlservo robot-server ur --ur-model ur5 --rs-mode 1object --action-cycle-rate 10 --port 50051`, then
+    `gym.make("EndEffectorPositioningURRob-v0", rs_address="127.0.0.1:50051", ur_model="ur5")` in robo-gym
+    """
+    with _one_sentence_errors():
+        from rlservo.envs.robot_server.settings import URSettings
+
+        settings = URSettings(
+            host=host,
+            port=port,
+            clock=clock.value,
+            gui=gui,
+            seed=seed,
+            ur_model=ur_model,
+            rs_mode=rs_mode,
+            action_mode=action_mode,
+            reference_frame=reference_frame,
+            action_cycle_rate=action_cycle_rate,
+            max_velocity_scale_factor=max_velocity_scale_factor,
+            world=world,
+            objects=None if model is None else tuple(model),
+        )
+        _serve(settings, f"{ur_model}, {rs_mode}, {action_mode}, {action_cycle_rate:g} Hz")
+
+
+@robot_server.command("mir100")
+def robot_server_mir100(
+    world: Annotated[str, typer.Option(help="empty or lab_6x8.")] = "empty",
+    host: Host = "127.0.0.1",
+    port: RobotPort = 50051,
+    clock: Clock = ClockKind.fast,
+    gui: Gui = False,
+    seed: Seed = None,
+) -> None:
+    """Serve a MiR100 until Ctrl-C.
+
+    Example: `rlservo robot-server mir100 --world lab_6x8 --port 50051`
+    """
+    with _one_sentence_errors():
+        from rlservo.envs.robot_server.settings import Mir100Settings
+
+        settings = Mir100Settings(host=host, port=port, clock=clock.value, gui=gui, seed=seed, world=world)
+        _serve(settings, f"MiR100, world {world}, 10 Hz")
+
+
+def server_manager(
+    host: Host = "127.0.0.1",
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Port; without it the first free one of 50100 to 50199.")
+    ] = None,
+    clock: Clock = ClockKind.fast,
+    max_servers: Annotated[int, typer.Option(min=1, help="How many robot servers may run at once.")] = 100,
+    orphan_timeout: Annotated[
+        float, typer.Option(min=0.0, help="Seconds without a client after which a robot server ends; 0: never.")
+    ] = 120.0,
+) -> None:
+    """Start robot servers for robo-gym's Sim environments, in place of its ROS server manager, until Ctrl-C.
+
+    Example: `rlservo server-manager`, then
+    `gym.make("EndEffectorPositioningURSim-v0", ip="127.0.0.1", ur_model="ur5")` in robo-gym
+    """
+    with _one_sentence_errors():
+        from rlservo.envs.robot_server.manager import serve_manager
+
+        def ready(bound: int) -> None:
+            _out.print(f"server manager on {host}:{bound}, clock {clock.value}; Ctrl-C stops it", highlight=False)
+
+        serve_manager(
+            host=host,
+            port=port,
+            clock=clock.value,
+            max_servers=max_servers,
+            orphan_s=orphan_timeout or None,
+            on_ready=ready,
+        )
+
+
+def _serve(settings: object, title: str) -> None:
+    from rlservo.envs.robot_server.server import serve_robot
+    from rlservo.envs.robot_server.settings import Mir100Settings, URSettings
+
+    assert isinstance(settings, URSettings | Mir100Settings)
+    host = settings.host
+
+    def ready(port: int) -> None:
+        _out.print(f"robot server on {host}:{port}: {title}; Ctrl-C stops it", highlight=False)
+
+    serve_robot(settings, on_ready=ready)
+
+
+@contextmanager
+def _one_sentence_errors() -> Iterator[None]:
+    """Turn what the simulators refuse into the command line's errors, and say which extra is missing."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("rlservo"):
+            raise
+        raise UsageError(f"this command needs the Python package {error.name!r}: pip install 'rlservo[sim]'") from error
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    except OSError as error:
+        raise RlservoError(str(error)) from error
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add both commands to the command line."""
+    app.add_typer(robot_server, name="robot-server")
+    command: Callable[..., None] = server_manager
+    app.command("server-manager")(command)

@@ -1,0 +1,49 @@
+"""When a cycle may end: at once (`fast`), or when its time on the wall is over (`real`).
+
+Either way the same calls give the same trajectory. In real time a client that does not keep pace is waited for, up to
+half a second; beyond that time goes on without it, as it does on the robot.
+"""
+
+from __future__ import annotations
+
+import time
+
+GRACE_S = 0.5  # [s]; the MiR100's own command time-out
+MAX_CATCH_UP_S = 60.0  # [s] of simulation; after a longer silence the rest is not simulated
+
+
+class Clock:
+    """Pace for one robot. Not thread-safe: the service calls it under its lock, except `wait`."""
+
+    def __init__(self, kind: str, cycle_s: float) -> None:
+        self._real = kind == "real"
+        self._cycle_s = cycle_s
+        self._due: float | None = None  # when the last cycle ends
+
+    def missed(self) -> int:
+        """Return how many cycles have passed without a command, and count them as passed."""
+        if not self._real or self._due is None:
+            return 0
+        late = time.monotonic() - self._due
+        if late <= GRACE_S:
+            return 0
+        cycles = int(late / self._cycle_s)
+        self._due += cycles * self._cycle_s
+        return min(cycles, round(MAX_CATCH_UP_S / self._cycle_s))
+
+    def passed(self, cycles: int) -> float | None:
+        """Count cycles that were simulated just now. Return what to `wait` for before answering."""
+        if not self._real:
+            return None
+        now = time.monotonic()
+        # A client that needs less than a cycle between calls keeps the rate exactly.
+        on_time = self._due is not None and now - self._due <= self._cycle_s
+        began = self._due if on_time and self._due is not None else now
+        self._due = began + cycles * self._cycle_s
+        return self._due
+
+    @staticmethod
+    def wait(due: float | None) -> None:
+        """Sleep until a moment that `passed` returned."""
+        if due is not None:
+            time.sleep(max(0.0, due - time.monotonic()))

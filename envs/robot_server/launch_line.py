@@ -1,0 +1,137 @@
+"""Reads the roslaunch lines that robo-gym's environments send to a server manager.
+
+Arguments and their defaults: jr-robotics/robo-gym-robot-servers, ur_robot_server/launch/ur_robot_server.launch and
+mir100_robot_server/launch/sim_robot_server.launch. Whatever is not known is refused by name; what only concerns the
+windows of Gazebo and RViz is accepted and has no effect; what asks for something that is not simulated is refused.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable, Mapping
+
+from rlservo.envs.robot_server.settings import MAX_OBJECTS, Mir100Settings, Settings, URSettings
+
+# Accepted, without effect.
+WINDOWS = {"gui", "rviz_gui", "gazebo_gui", "rviz_config_path", "rviz_config_file"}
+# Accepted with the values that mean what is simulated anyway.
+UR_ONLY = {
+    "real_robot": ("false",),
+    "use_voxel_occupancy": ("false",),
+    "object_trajectory_file_name": ("no_file", ""),
+    "camera1_gazebo": ("false",),
+    **dict.fromkeys(("x", "y", "roll", "pitch", "yaw"), ("0.0", "0")),
+    "z": ("0.1",),
+}
+MIR100_ONLY: dict[str, tuple[str, ...]] = dict.fromkeys(("robot_x", "robot_y", "robot_yaw"), ("0.0", "0"))
+UR_KNOWN = {
+    "ur_model", "world_name", "max_velocity_scale_factor", "server_port", "action_cycle_rate", "reference_frame",
+    "target_mode", "rs_mode", "action_mode", "objects_controller", "n_objects",
+}  # fmt: skip
+MIR100_KNOWN = {"world_name", "server_port"}
+_OBJECT = re.compile(r"object_(\d+)_(model_name|frame)")
+
+
+def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host: str = "127.0.0.1") -> Settings:
+    """Return the settings that a roslaunch line asks for.
+
+    Raises ValueError naming the package, launch file, argument or value that is not known or not simulated.
+    """
+    try:
+        words = shlex.split(line)
+    except ValueError as error:
+        raise ValueError(f"the line cannot be split into words: {error}") from error
+    if len(words) < 3 or words[0] != "roslaunch":
+        raise ValueError(f"the line is {line[:200]!r}: expected 'roslaunch <package> <launch file> name:=value ...'")
+    package, file = words[1:3]
+    if package not in LAUNCH_FILES:
+        raise ValueError(f"package {package!r} is not known: expected one of {', '.join(LAUNCH_FILES)}")
+    known_file, read = LAUNCH_FILES[package]
+    if file != known_file:
+        raise ValueError(f"launch file {file!r} of {package} is not known: expected {known_file}")
+    arguments: dict[str, str] = {}
+    for word in words[3:]:
+        name, assigned, value = word.partition(":=")
+        if not assigned or not name:
+            raise ValueError(f"{word!r} is no launch argument: expected name:=value")
+        arguments[name] = value
+    return read(arguments, gui, clock, host)
+
+
+def _read_ur(arguments: Mapping[str, str], gui: bool, clock: str, host: str) -> URSettings:
+    objects = {name for name in arguments if _OBJECT.fullmatch(name)}
+    _check_names(arguments, UR_KNOWN | objects, UR_ONLY)
+    if "ur_model" not in arguments:
+        raise ValueError("the argument ur_model is missing, and the launch file has no default for it")
+    mode = arguments.get("rs_mode", "false")
+    if mode == "false":
+        mode = arguments.get("target_mode", "only_robot")
+    return URSettings(
+        host=host,
+        port=int(_number(arguments, "server_port", 0)),
+        clock=clock,
+        gui=gui,
+        ur_model=arguments["ur_model"],
+        rs_mode=mode,
+        action_mode=arguments.get("action_mode", "abs_pos"),
+        reference_frame=arguments.get("reference_frame", "base"),
+        action_cycle_rate=_number(arguments, "action_cycle_rate", 25.0),
+        max_velocity_scale_factor=_number(arguments, "max_velocity_scale_factor", 1.0),
+        world=arguments.get("world_name", "empty.world"),
+        objects=_objects(arguments),
+    )
+
+
+def _objects(arguments: Mapping[str, str]) -> tuple[str, ...]:
+    if arguments.get("objects_controller", "false").lower() != "true":
+        return ()
+    count = _number(arguments, "n_objects", 0.0)
+    if not (0 <= count <= MAX_OBJECTS and count == int(count)):
+        raise ValueError(f"n_objects is {count:g}: expected a whole number from 0 to {MAX_OBJECTS}")
+    names = []
+    for index in range(int(count)):
+        name = arguments.get(f"object_{index}_model_name", "")
+        if not name:
+            raise ValueError(f"n_objects is {count:g}, and the argument object_{index}_model_name is missing")
+        names.append(name)
+    return tuple(names)
+
+
+def _read_mir100(arguments: Mapping[str, str], gui: bool, clock: str, host: str) -> Mir100Settings:
+    _check_names(arguments, MIR100_KNOWN, MIR100_ONLY)
+    return Mir100Settings(
+        host=host,
+        port=int(_number(arguments, "server_port", 0)),
+        clock=clock,
+        gui=gui,
+        world=arguments.get("world_name", "empty_world_target.world"),
+    )
+
+
+LAUNCH_FILES: dict[str, tuple[str, Callable[[Mapping[str, str], bool, str, str], Settings]]] = {
+    "ur_robot_server": ("ur_robot_server.launch", _read_ur),
+    "mir100_robot_server": ("sim_robot_server.launch", _read_mir100),
+}
+
+
+def _check_names(arguments: Mapping[str, str], known: set[str], only: Mapping[str, tuple[str, ...]]) -> None:
+    unknown = [name for name in arguments if name not in known | WINDOWS | set(only)]
+    if unknown:
+        raise ValueError(
+            f"launch arguments that are not known: {', '.join(unknown)}; "
+            f"expected some of {', '.join(sorted(known | WINDOWS | set(only)))}"
+        )
+    for name, allowed in only.items():
+        if name in arguments and arguments[name].lower() not in allowed:
+            raise ValueError(f"{name}:={arguments[name]} is not simulated: expected {name}:={allowed[0]}, the default")
+
+
+def _number(arguments: Mapping[str, str], name: str, default: float) -> float:
+    text = arguments.get(name)
+    if text is None:
+        return default
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{name}:={text} is no number") from None

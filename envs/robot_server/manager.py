@@ -1,0 +1,259 @@
+"""robo-gym's server manager without ROS: starts robot servers, each a process of its own, and ends every one of them.
+
+The first half knows nothing of gRPC; the second is the service on the wire.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from collections.abc import Callable
+from concurrent import futures
+from typing import Any
+
+import grpc
+from google.protobuf.message import DecodeError
+
+from rlservo.envs.robot_server.launch_line import parse_launch_line
+from rlservo.envs.robot_server.messages import SERVER_MANAGER, ManagerStatus, ServerRequest
+from rlservo.envs.robot_server.robot import CLOCKS
+from rlservo.envs.robot_server.server import OPTIONS, PortInUseError, bind
+from rlservo.envs.robot_server.server_process import ServerProcess
+from rlservo.envs.robot_server.settings import Settings, URSettings
+
+MANAGER_PORTS = range(50100, 50200)  # where robo-gym's clients look for a manager, in this order
+MAX_SERVERS = 100
+ORPHAN_S = 120.0  # [s] without any connection, after which a robot server ends itself
+WATCH_INTERVAL_S = 0.2
+THREADS = 32
+
+log = logging.getLogger("rlservo.server_manager")
+
+
+class RobotServers:
+    """The robot servers of one manager, by port. A thread watches them; `close` ends them all."""
+
+    def __init__(
+        self,
+        *,
+        host: str = "127.0.0.1",
+        clock: str = "fast",
+        max_servers: int = MAX_SERVERS,
+        orphan_s: float | None = ORPHAN_S,
+    ) -> None:
+        if clock not in CLOCKS:
+            raise ValueError(f"clock {clock!r} does not exist: expected one of {', '.join(CLOCKS)}")
+        self._host, self._clock, self._max_servers, self._orphan_s = host, clock, max_servers, orphan_s
+        self._lock = threading.Lock()
+        self._running: dict[int, ServerProcess] = {}
+        self._starting = 0
+        self._crashed: set[int] = set()  # ports of servers that ended by themselves and that nobody has killed since
+        self._closed = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, name="watch-robot-servers", daemon=True)
+        self._watcher.start()
+
+    @property
+    def running(self) -> dict[int, int]:
+        """Port and process id of every robot server."""
+        with self._lock:
+            return {port: server.pid for port, server in self._running.items()}
+
+    def start(self, line: str, *, gui: bool = False) -> int:
+        """Start what a roslaunch line asks for and return its port, once it answers.
+
+        Raises ValueError for a line that cannot be honoured, for too many servers, and when it does not come up.
+        """
+        settings = parse_launch_line(line, gui=gui, clock=self._clock, host=self._host)
+        with self._lock:
+            if self._closed.is_set():
+                raise ValueError("this server manager is ending")
+            if len(self._running) + self._starting >= self._max_servers:
+                raise ValueError(f"{self._max_servers} robot servers are running, which is this manager's limit")
+            self._starting += 1
+        try:
+            server = self._start_off_the_managers_ports(settings)
+        except OSError as error:
+            raise ValueError(f"the robot server's process could not be started: {error}") from error
+        finally:
+            with self._lock:
+                self._starting -= 1
+        with self._lock:
+            if not self._closed.is_set():
+                self._crashed.discard(server.port)
+                self._running[server.port] = server
+                log.info("%s on port %d (process %d)", _title(settings), server.port, server.pid)
+                return server.port
+        server.end()
+        raise ValueError("this server manager is ending")
+
+    def kill(self, port: int) -> None:
+        """End the robot server on `port`; one that has crashed counts as ended. Raises ValueError for other ports."""
+        with self._lock:
+            server = self._running.pop(port, None)
+            crashed = port in self._crashed
+            self._crashed.discard(port)
+            ports = ", ".join(str(known) for known in sorted(self._running)) or "none"
+        if server is not None:
+            server.end()
+            log.info("%s on port %d ended", _title(server.settings), port)
+        elif not crashed:
+            raise ValueError(f"there is no robot server on port {port}; running: {ports}")
+
+    def kill_all(self) -> None:
+        """End every robot server, side by side."""
+        with self._lock:
+            servers = list(self._running.values())
+            self._running.clear()
+            self._crashed.clear()
+        if servers:
+            with futures.ThreadPoolExecutor(len(servers)) as pool:
+                list(pool.map(ServerProcess.end, servers))
+            log.info("%d robot servers ended", len(servers))
+
+    def close(self) -> None:
+        """End everything and start nothing more."""
+        with self._lock:
+            self._closed.set()
+        self._watcher.join()
+        self.kill_all()
+
+    def _start_off_the_managers_ports(self, settings: Settings) -> ServerProcess:
+        """Start a server, again where the system gave it a port on which clients look for a manager."""
+        unwanted: list[ServerProcess] = []
+        try:
+            while True:
+                server = ServerProcess(settings, orphan_s=self._orphan_s)
+                if settings.port or server.port not in MANAGER_PORTS:
+                    return server
+                unwanted.append(server)  # ended only after the next has a port, or that would be the same one
+        finally:
+            for server in unwanted:
+                server.end()
+
+    def _watch(self) -> None:
+        while not self._closed.wait(WATCH_INTERVAL_S):
+            with self._lock:
+                ended = [(port, server) for port, server in self._running.items() if server.exit_code is not None]
+                for port, _ in ended:
+                    del self._running[port]
+                    self._crashed.add(port)
+            for port, server in ended:
+                server.kill()  # collects the process and its pipes
+                log.warning("%s on port %d ended by itself: %s", _title(server.settings), port, _why(server.exit_code))
+
+
+class ManagerService:
+    """The four calls of robo-gym's ServerManager."""
+
+    def __init__(self, servers: RobotServers) -> None:
+        self._servers = servers
+
+    def handler(self) -> grpc.GenericRpcHandler:
+        """Return what a gRPC server is given."""
+        calls: dict[str, Callable[[bytes], Any]] = {
+            "StartNewServer": self._start,
+            "KillServer": self._kill,
+            "KillAllServers": self._kill_all,
+            "VerifyConnection": lambda _: ManagerStatus(alive=True),
+        }
+        return grpc.method_handlers_generic_handler(
+            SERVER_MANAGER, {name: self._guarded(name, call) for name, call in calls.items()}
+        )
+
+    def _start(self, request: bytes) -> Any:
+        wanted = ServerRequest.FromString(request)
+        return ServerRequest(success=True, port=self._servers.start(wanted.cmd, gui=wanted.gui))
+
+    def _kill(self, request: bytes) -> Any:
+        self._servers.kill(ServerRequest.FromString(request).port)
+        return ServerRequest(success=True)
+
+    def _kill_all(self, request: bytes) -> Any:
+        ServerRequest.FromString(request)
+        self._servers.kill_all()
+        return ServerRequest(success=True)
+
+    @staticmethod
+    def _guarded(name: str, call: Callable[[bytes], Any]) -> grpc.RpcMethodHandler:
+        def answer(request: bytes, _context: grpc.ServicerContext) -> bytes:
+            try:
+                message = call(request)
+            except (DecodeError, ValueError) as error:
+                reason = f"{len(request)} bytes that are no such message" if isinstance(error, DecodeError) else error
+                log.error("%s: %s", name, reason)
+                message = ServerRequest(success=False, info=str(reason))
+            except Exception as error:
+                log.exception("%s failed", name)
+                message = ServerRequest(
+                    success=False, info=f"{type(error).__name__} in the server manager, see its log"
+                )
+            serialized: bytes = message.SerializeToString()
+            return serialized
+
+        return grpc.unary_unary_rpc_method_handler(answer)
+
+
+class ServerManager:
+    """A bound and started manager; `close` ends it and every robot server."""
+
+    def __init__(self, *, host: str = "127.0.0.1", port: int | None = None, servers: RobotServers) -> None:
+        self.servers = servers
+        self._server = grpc.server(futures.ThreadPoolExecutor(THREADS, "server-manager"), options=OPTIONS)
+        self._server.add_generic_rpc_handlers((ManagerService(servers).handler(),))
+        self.port = _bind_first(self._server, host, MANAGER_PORTS if port is None else (port,))
+        self._server.start()
+
+    def close(self) -> None:
+        """End everything."""
+        self._server.stop(grace=None)
+        self.servers.close()
+
+
+def serve_manager(
+    *,
+    host: str,
+    port: int | None,
+    clock: str,
+    max_servers: int,
+    orphan_s: float | None,
+    on_ready: Callable[[int], None],
+) -> None:
+    """Run a manager until SIGTERM or SIGINT; nothing is left running. Main thread only."""
+    stopped = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopped.set())
+    servers = RobotServers(host=host, clock=clock, max_servers=max_servers, orphan_s=orphan_s)
+    try:
+        manager = ServerManager(host=host, port=port, servers=servers)
+    except BaseException:
+        servers.close()
+        raise
+    try:
+        on_ready(manager.port)
+        stopped.wait()
+    finally:
+        manager.close()
+
+
+def _bind_first(server: grpc.Server, host: str, ports: range | tuple[int, ...]) -> int:
+    for port in ports:
+        try:
+            return bind(server, host, port)
+        except PortInUseError:
+            if len(ports) == 1:
+                raise
+    raise PortInUseError(
+        f"every port from {ports[0]} to {ports[-1]} on {host} is taken, where robo-gym's clients look for a manager: "
+        f"end another manager, or give a port"
+    )
+
+
+def _title(settings: Settings) -> str:
+    return f"robot server {settings.ur_model if isinstance(settings, URSettings) else 'mir100'}"
+
+
+def _why(exit_code: int | None) -> str:
+    if exit_code is None or exit_code >= 0:
+        return f"exit code {exit_code}"
+    return f"killed by {signal.Signals(-exit_code).name}"

@@ -1,0 +1,48 @@
+"""What a robot server serves: a robot that can be put somewhere, commanded for one cycle, and looked at.
+
+It knows nothing of gRPC, protobuf or time on the wall.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+CLOCKS = ("fast", "real")
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """robo-gym's State message, both ways."""
+
+    values: Sequence[float] = ()
+    names: Mapping[str, float] = field(default_factory=dict)  # state_dict
+    float_params: Mapping[str, float] = field(default_factory=dict)
+    string_params: Mapping[str, str] = field(default_factory=dict)
+
+
+class Robot(Protocol):
+    """A simulated robot with the server's vocabulary. Every method raises ValueError for what it cannot honour."""
+
+    @property
+    def cycle_s(self) -> float:
+        """How long a control cycle lasts [s]."""
+
+    def state(self) -> RobotState:
+        """Return the state of this moment."""
+
+    def set_state(self, wanted: RobotState) -> int:
+        """Reset the robot and what is around it. Return how many cycles that took."""
+
+    def act(self, action: Sequence[float]) -> None:
+        """Command the robot and let one cycle pass."""
+
+    def idle(self, cycles: int) -> None:
+        """Let cycles pass in which no command arrived."""
+
+    def show(self) -> None:
+        """Show the robot in a window, or refresh it."""
+
+    def close(self) -> None:
+        """Close the window."""

@@ -1,0 +1,136 @@
+"""Runs one robot server: makes the robot, binds a port, serves until told to stop.
+
+`rlservo robot-server` runs it in the foreground. The server manager runs it as a process of its own
+(`python -m rlservo.envs.robot_server.server '<settings>'`), which says on standard output what port it has, and ends
+when its standard input does: nothing outlives the manager, whatever becomes of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent import futures
+
+import grpc
+
+from rlservo.envs.robot_server.clock import Clock
+from rlservo.envs.robot_server.connections import count_connections
+from rlservo.envs.robot_server.robot import Robot
+from rlservo.envs.robot_server.service import RobotService
+from rlservo.envs.robot_server.settings import Settings, URSettings, settings_from_json
+
+THREADS = 8  # calls at a time; one of them moves the robot
+OPTIONS = [("grpc.so_reuseport", 0)]  # gRPC's default lets two servers share a port, and clients meet either
+WATCH_INTERVAL_S = 2.0
+BEFORE_FIRST_CALL = 10  # times as much patience
+READY = "ready on port "  # what a manager waits for on standard output
+FAILED = "failed: "  # or this, and the reason
+
+log = logging.getLogger("rlservo.robot_server")
+
+
+class PortInUseError(OSError):
+    """The port asked for is taken."""
+
+
+class RobotServer:
+    """A bound and started server; `stop` ends it."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.robot = make_robot(settings)
+        self.service = RobotService(self.robot, Clock(settings.clock, self.robot.cycle_s), gui=settings.gui)
+        self._server = grpc.server(futures.ThreadPoolExecutor(THREADS, "robot-server"), options=OPTIONS)
+        self._server.add_generic_rpc_handlers((self.service.handler(),))
+        self.port = bind(self._server, settings.host, settings.port)
+        self._server.start()
+
+    def stop(self) -> None:
+        """Refuse new calls, abort the running ones, and free the port."""
+        self._server.stop(grace=None).wait(timeout=1.0)
+        self.robot.close()
+
+
+def make_robot(settings: Settings) -> Robot:
+    """Return the robot that the settings describe. MuJoCo is imported here: a manager does without it."""
+    if isinstance(settings, URSettings):
+        from rlservo.envs.robot_server.ur_robot import URRobot
+
+        return URRobot(settings)
+    from rlservo.envs.robot_server.mir100_robot import Mir100Robot
+
+    return Mir100Robot(settings)
+
+
+def bind(server: grpc.Server, host: str, port: int) -> int:
+    """Bind a gRPC server and return the port it has. Raises PortInUseError naming the address."""
+    address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    try:
+        bound = int(server.add_insecure_port(address))
+    except RuntimeError as error:
+        raise PortInUseError(
+            f"cannot listen on {address}: the port is taken, or the address is not this machine's"
+        ) from error
+    return bound
+
+
+def serve_robot(settings: Settings, *, on_ready: Callable[[int], None], orphan_s: float | None = None) -> None:
+    """Serve until SIGTERM or SIGINT, or until nobody has been connected for `orphan_s` seconds. Main thread only."""
+    stopped = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopped.set())
+    server = RobotServer(settings)
+    try:
+        on_ready(server.port)
+        alone_since = time.monotonic()
+        while not stopped.wait(WATCH_INTERVAL_S if orphan_s is not None else None):
+            if count_connections(server.port) != 0:
+                alone_since = time.monotonic()
+                continue
+            # A client connects with its first call, which may take its time.
+            patience = (orphan_s or 0.0) * (1 if server.service.calls else BEFORE_FIRST_CALL)
+            if time.monotonic() - alone_since > patience:
+                log.warning("nobody has been connected for %g s: this server ends itself", patience)
+                return
+    finally:
+        server.stop()
+
+
+def main(argv: list[str]) -> None:
+    """Be the robot server of a manager; see this file's docstring."""
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
+    threading.Thread(target=_end_with_standard_input, name="lifeline", daemon=True).start()
+    settings = settings_from_json(argv[0])
+    orphan_s = float(argv[1]) if len(argv) > 1 else None
+
+    def ready(port: int) -> None:
+        _say(f"{READY}{port}")
+        # Nobody reads on: what a library prints from now on goes nowhere instead of into a full pipe.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+    try:
+        serve_robot(settings, on_ready=ready, orphan_s=orphan_s)
+    except (PortInUseError, ValueError) as error:
+        _say(f"{FAILED}{error}")
+        raise SystemExit(1) from None
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def _end_with_standard_input() -> None:
+    with contextlib.suppress(OSError):
+        while os.read(0, 4096):
+            pass
+    os._exit(0)  # the manager is gone; a simulator has nothing to save
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,125 @@
+"""robo-gym's RobotServer service over a robot: the one file here that knows both.
+
+Requests are parsed here rather than by gRPC, so that garbage is answered like every other error: `success = false`, and
+a line in the log that says why. The message has no field for a reason.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import grpc
+from google.protobuf.message import DecodeError
+
+from rlservo.envs.robot_server.clock import Clock
+from rlservo.envs.robot_server.messages import ROBOT_SERVER, Action, Empty, State, Success
+from rlservo.envs.robot_server.robot import Robot, RobotState
+
+log = logging.getLogger("rlservo.robot_server")
+
+
+class RobotService:
+    """The four calls. One command at a time; looking at the state never waits for a cycle to end."""
+
+    def __init__(self, robot: Robot, clock: Clock, *, gui: bool = False) -> None:
+        self._robot, self._clock, self._gui = robot, clock, gui
+        self._state_lock = threading.Lock()  # held while the simulation runs
+        self._turn = threading.Lock()  # held by a command until its cycle is over
+        self.calls = 0
+
+    def handler(self) -> grpc.GenericRpcHandler:
+        """Return what a gRPC server is given."""
+        calls: dict[str, Callable[[bytes], Any]] = {
+            "GetState": self.get_state,
+            "SetState": self.set_state,
+            "SendAction": self.send_action,
+            "SendActionGetState": self.send_action_get_state,
+        }
+        failed = {"GetState": State, "SendActionGetState": State, "SetState": Success, "SendAction": Success}
+        return grpc.method_handlers_generic_handler(
+            ROBOT_SERVER, {name: self._guarded(name, call, failed[name]) for name, call in calls.items()}
+        )
+
+    def get_state(self, request: bytes) -> Any:
+        """Answer GetState."""
+        Empty.FromString(request)
+        with self._state_lock:
+            self._catch_up()
+            return _message(self._robot.state())
+
+    def set_state(self, request: bytes) -> Any:
+        """Answer SetState."""
+        given = State.FromString(request)
+        wanted = RobotState(
+            values=list(given.state),
+            names=dict(given.state_dict),
+            float_params=dict(given.float_params),
+            string_params=dict(given.string_params),
+        )
+        with self._turn:
+            with self._state_lock:
+                due = self._clock.passed(self._robot.set_state(wanted))
+                self._show()
+            self._clock.wait(due)
+        return Success(success=True)
+
+    def send_action(self, request: bytes) -> Any:
+        """Answer SendAction."""
+        self._act(request)
+        return Success(success=True)
+
+    def send_action_get_state(self, request: bytes) -> Any:
+        """Answer SendActionGetState."""
+        return _message(self._act(request, with_state=True))
+
+    def _act(self, request: bytes, *, with_state: bool = False) -> RobotState:
+        action = list(Action.FromString(request).action)
+        with self._turn:
+            with self._state_lock:
+                self._catch_up()
+                self._robot.act(action)
+                due = self._clock.passed(1)
+                state = self._robot.state() if with_state else RobotState()
+                self._show()
+            self._clock.wait(due)
+        return state
+
+    def _catch_up(self) -> None:
+        missed = self._clock.missed()
+        if missed:
+            self._robot.idle(missed)
+
+    def _show(self) -> None:
+        if not self._gui:
+            return
+        try:
+            self._robot.show()
+        except Exception as error:  # whatever a display can do; the robot goes on without a window
+            log.warning("no window: %s", error)
+            self._gui = False
+
+    def _guarded(self, name: str, call: Callable[[bytes], Any], failed: Any) -> grpc.RpcMethodHandler:
+        def answer(request: bytes, _context: grpc.ServicerContext) -> bytes:
+            self.calls += 1
+            try:
+                message = call(request)
+            except DecodeError:
+                log.error("%s: %d bytes that are no such message", name, len(request))
+                message = failed(success=False)
+            except ValueError as error:
+                log.error("%s: %s", name, error)
+                message = failed(success=False)
+            except Exception:
+                log.exception("%s failed", name)
+                message = failed(success=False)
+            serialized: bytes = message.SerializeToString()
+            return serialized
+
+        return grpc.unary_unary_rpc_method_handler(answer)
+
+
+def _message(state: RobotState) -> Any:
+    return State(state=state.values, state_dict=state.names, success=True)

@@ -1,0 +1,142 @@
+"""What a robot server can be started with, checked before anything is started.
+
+The names are those of robo-gym's launch files; see launch_line.py for the lines that carry them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from rlservo.envs.mir100.worlds import WORLDS as MIR100_WORLDS
+from rlservo.envs.robot_server.robot import CLOCKS
+from rlservo.envs.ur.objects import object_model
+from rlservo.envs.ur.parameters import ur_parameters
+from rlservo.envs.ur.rs_modes import rs_mode_of
+
+ACTION_MODES = ("abs_pos", "delta_pos")
+REFERENCE_FRAMES = ("base_link", "base")
+MAX_OBJECTS = 10
+
+# Whether the arm stands on robo-gym's table, by the name of the Gazebo world.
+UR_WORLDS = {
+    "empty": False,
+    "2_box100": False,
+    "tabletop": True,
+    "tabletop_box50": True,
+    "tabletop_sphere50": True,
+    "tabletop_sphere50_no_collision": True,
+    "tabletop_sphere50_green_sphere50_no_collision": True,
+}
+# The robot's world in Gazebo -> ours.
+MIR100_WORLD_NAMES = {"empty_world_target": "empty", **{name: name for name in MIR100_WORLDS}}
+OBJECTS_BY_MODE = {
+    "only_robot": (),
+    "1object": ("sphere50_no_collision",),
+    "1moving2points": ("sphere50",),
+    "2objects2points": ("green_sphere50_no_collision", "sphere50"),
+}
+
+
+@dataclass(frozen=True)
+class Common:
+    """What every robot server has."""
+
+    host: str = "127.0.0.1"
+    port: int = 0  # 0: any free one
+    clock: str = "fast"
+    gui: bool = False
+    seed: int | None = None  # of the objects' random paths and the lasers' noise; None: differs from run to run
+
+    def __post_init__(self) -> None:
+        _one_of("clock", self.clock, CLOCKS)
+        if not 0 <= self.port <= 65535:
+            raise ValueError(f"port {self.port} does not exist: expected 0 (any free one) to 65535")
+
+
+@dataclass(frozen=True)
+class URSettings(Common):
+    """A robot server for one of the seven arms."""
+
+    ur_model: str = "ur5"
+    rs_mode: str = "only_robot"
+    action_mode: str = "abs_pos"
+    reference_frame: str = "base_link"
+    action_cycle_rate: float = 25.0  # [Hz]
+    max_velocity_scale_factor: float = 1.0
+    world: str = "tabletop"
+    objects: tuple[str, ...] | None = None  # None: what the mode needs
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        ur_parameters(self.ur_model)
+        mode = rs_mode_of(self.rs_mode)
+        _one_of("action_mode", self.action_mode, ACTION_MODES)
+        _one_of("reference_frame", self.reference_frame, REFERENCE_FRAMES)
+        _one_of("world", self.world.removesuffix(".world"), UR_WORLDS)
+        if not (math.isfinite(self.action_cycle_rate) and self.action_cycle_rate > 0.0):
+            raise ValueError(f"action_cycle_rate is {self.action_cycle_rate:g} Hz: expected more than 0")
+        if not 0.0 < self.max_velocity_scale_factor <= 1.0:
+            raise ValueError(
+                f"max_velocity_scale_factor is {self.max_velocity_scale_factor:g}: expected more than 0, at most 1"
+            )
+        objects = self.object_names
+        for name in objects:
+            object_model(name)
+        if not mode.objects <= len(objects) <= MAX_OBJECTS:
+            raise ValueError(
+                f"rs_mode {self.rs_mode!r} tells of {mode.objects} objects, and there are {len(objects)}: "
+                f"expected {mode.objects} to {MAX_OBJECTS}"
+            )
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """The objects in the scene."""
+        return OBJECTS_BY_MODE[self.rs_mode] if self.objects is None else tuple(self.objects)
+
+    @property
+    def table(self) -> bool:
+        """Whether the arm stands on the table."""
+        return UR_WORLDS[self.world.removesuffix(".world")]
+
+
+@dataclass(frozen=True)
+class Mir100Settings(Common):
+    """A robot server for the mobile robot."""
+
+    world: str = "empty"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _one_of("world", self.world.removesuffix(".world"), MIR100_WORLD_NAMES)
+
+    @property
+    def world_name(self) -> str:
+        """The world's name in our simulator."""
+        return MIR100_WORLD_NAMES[self.world.removesuffix(".world")]
+
+
+Settings = URSettings | Mir100Settings
+_KINDS: dict[str, type[Settings]] = {"ur": URSettings, "mir100": Mir100Settings}
+
+
+def settings_to_json(settings: Settings) -> str:
+    """Return the settings as one line that `settings_from_json` understands."""
+    kind = "ur" if isinstance(settings, URSettings) else "mir100"
+    return json.dumps({"robot": kind, **asdict(settings)})
+
+
+def settings_from_json(line: str) -> Settings:
+    """Return the settings of a line written by `settings_to_json`."""
+    values: dict[str, Any] = json.loads(line)
+    kind = _KINDS[values.pop("robot")]
+    if values.get("objects") is not None:
+        values["objects"] = tuple(values["objects"])
+    return kind(**values)
+
+
+def _one_of(name: str, value: str, known: Any) -> None:
+    if value not in known:
+        raise ValueError(f"{name} {value!r} does not exist: expected one of {', '.join(known)}")
