@@ -116,6 +116,8 @@ def _document(arm: URParameters, objects: list[ObjectModel], table: bool) -> str
                     {joint(5)}
                     {capsule((0, 0, -arm.d6), (0, 0, -flange), WRIST_RADIUS, m[6], cap)}
                     <site name="tool0" size="0.01" rgba="0.1 0.6 0.2 1"/>
+                    <!-- Without gravcomp: the arm does not know what it carries. -->
+                    <body name="payload"><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/></body>
                   </body>
                 </body>
               </body>

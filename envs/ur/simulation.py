@@ -67,12 +67,7 @@ class URSimulation:
         self._objects = [int(self.model.body(f"object_{index}").mocapid[0]) for index in range(len(objects))]
         self._moving: dict[int, Path] = {}  # by mocap index, in the world
         self._tick = 0  # substeps since the objects' paths began
-        self._wrist_3 = self.model.body("wrist_3").id
-        self._bare_wrist_3 = (
-            float(self.model.body_mass[self._wrist_3]),
-            self.model.body_ipos[self._wrist_3].copy(),
-            self.model.body_inertia[self._wrist_3].copy(),
-        )
+        self._payload = self.model.body("payload").id
         self._velocity: Vector = np.zeros(6)  # [rad/s], of the trajectory that is being executed
         self._remaining = 0  # substeps until that trajectory arrives
         self.in_collision = False
@@ -121,16 +116,8 @@ class URSimulation:
         """Fasten a point mass [kg] to tool0 of which the arm's gravity compensation does not know; 0 takes it off."""
         if not 0.0 <= mass <= MAX_PAYLOAD:
             raise ValueError(f"the payload is {mass:g} kg: expected 0 to {MAX_PAYLOAD:g} kg")
-        model, body = self.model, self._wrist_3
-        own_mass, own_centre, own_inertia = self._bare_wrist_3
-        total = own_mass + mass
-        model.body_mass[body] = total
-        model.body_ipos[body] = own_centre * (own_mass / total)  # tool0 is the body's origin
-        # Both centres lie on the body's axis of symmetry, so its principal axes stay and only the two across it grow.
-        across = own_mass * mass / total * float(own_centre @ own_centre)
-        model.body_inertia[body] = own_inertia + across * np.array([1.0, 1.0, 0.0])
-        model.body_gravcomp[body] = own_mass / total
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        self.model.body_mass[self._payload] = mass
+        mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
 
     # -- moving
 
