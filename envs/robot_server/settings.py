@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -75,7 +76,7 @@ class URSettings(Common):
         mode = rs_mode_of(self.rs_mode)
         _one_of("action_mode", self.action_mode, ACTION_MODES)
         _one_of("reference_frame", self.reference_frame, REFERENCE_FRAMES)
-        _one_of("world", self.world.removesuffix(".world"), UR_WORLDS)
+        _one_of("world", self.world, UR_WORLDS, suffix=".world")
         if not (math.isfinite(self.action_cycle_rate) and self.action_cycle_rate > 0.0):
             raise ValueError(f"action_cycle_rate is {self.action_cycle_rate:g} Hz: expected more than 0")
         if not 0.0 < self.max_velocity_scale_factor <= 1.0:
@@ -110,7 +111,7 @@ class Mir100Settings(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _one_of("world", self.world.removesuffix(".world"), MIR100_WORLD_NAMES)
+        _one_of("world", self.world, MIR100_WORLD_NAMES, suffix=".world")
 
     @property
     def world_name(self) -> str:
@@ -137,6 +138,6 @@ def settings_from_json(line: str) -> Settings:
     return kind(**values)
 
 
-def _one_of(name: str, value: str, known: Any) -> None:
-    if value not in known:
+def _one_of(name: str, value: str, known: Collection[str], *, suffix: str = "") -> None:
+    if value.removesuffix(suffix) not in known:
         raise ValueError(f"{name} {value!r} does not exist: expected one of {', '.join(known)}")

@@ -1,0 +1,118 @@
+"""The roslaunch lines of robo-gym's own environments, and what is refused in them."""
+
+from __future__ import annotations
+
+import pytest
+
+from rlservo.envs.robot_server.launch_line import parse_launch_line
+from rlservo.envs.robot_server.settings import (
+    Mir100Settings,
+    Settings,
+    URSettings,
+    settings_from_json,
+    settings_to_json,
+)
+
+UR = "roslaunch ur_robot_server ur_robot_server.launch"
+MIR = "roslaunch mir100_robot_server sim_robot_server.launch"
+POSITIONING = f"""{UR} \
+        world_name:=tabletop_sphere50_no_collision.world \
+        reference_frame:=base_link \
+        max_velocity_scale_factor:=0.1 \
+        action_cycle_rate:=10 \
+        rviz_gui:=true \
+        gazebo_gui:=true \
+        objects_controller:=true \
+        rs_mode:=1object \
+        n_objects:=1.0 \
+        object_0_model_name:=sphere50_no_collision \
+        object_0_frame:=target ur_model:=ur10e gui:=false server_port:=50321"""
+
+
+def test_positioning_line_of_robo_gym_is_understood() -> None:
+    assert parse_launch_line(POSITIONING, gui=True, clock="real", host="0.0.0.0") == URSettings(
+        host="0.0.0.0",
+        port=50321,
+        clock="real",
+        gui=True,
+        ur_model="ur10e",
+        rs_mode="1object",
+        reference_frame="base_link",
+        action_cycle_rate=10.0,
+        max_velocity_scale_factor=0.1,
+        world="tabletop_sphere50_no_collision.world",
+        objects=("sphere50_no_collision",),
+    )
+
+
+def test_what_is_left_out_has_the_launch_files_defaults() -> None:
+    settings = parse_launch_line(f"{UR} ur_model:=ur3")
+    assert isinstance(settings, URSettings)
+    assert (settings.rs_mode, settings.reference_frame, settings.object_names) == ("only_robot", "base", ())
+    assert (settings.action_cycle_rate, settings.max_velocity_scale_factor) == (25.0, 1.0)
+    assert not settings.table
+    mir = parse_launch_line(MIR)
+    assert isinstance(mir, Mir100Settings)
+    assert mir.world_name == "empty"
+
+
+def test_mir100_and_two_object_lines_are_understood() -> None:
+    mir = parse_launch_line(f"{MIR} world_name:=lab_6x8.world gazebo_gui:=true")
+    assert isinstance(mir, Mir100Settings)
+    assert mir.world_name == "lab_6x8"
+    two = parse_launch_line(
+        f"{UR} ur_model:=ur5 rs_mode:=2objects2points objects_controller:=true n_objects:=2.0 action_mode:=delta_pos "
+        "object_0_model_name:=green_sphere50_no_collision object_0_frame:=target object_1_model_name:=sphere50 "
+        "object_1_frame:=obstacle1 world_name:=tabletop_sphere50_green_sphere50_no_collision.world"
+    )
+    assert isinstance(two, URSettings)
+    assert two.object_names == ("green_sphere50_no_collision", "sphere50")
+    assert two.action_mode == "delta_pos"
+    assert two.table
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("", "expected 'roslaunch <package> <launch file> name:=value"),
+        ("rm -rf /", "the line is 'rm -rf /': expected 'roslaunch"),
+        ("roslaunch 'ur_robot_server", "cannot be split into words: No closing quotation"),
+        ("roslaunch panda_robot_server x.launch", "package 'panda_robot_server' is not known: expected one of ur_rob"),
+        ("roslaunch ur_robot_server ur99.launch", "launch file 'ur99.launch' of ur_robot_server is not known"),
+        (UR, "the argument ur_model is missing"),
+        (f"{UR} ur_model:=ur7", "ur_model 'ur7' does not exist: expected one of ur3, ur3e"),
+        (f"{UR} ur_model:=ur5 speed:=9 colour:=red", "that are not known: speed, colour; expected some of action_cyc"),
+        (f"{UR} ur_model:=ur5 ; rm -rf /", "';' is no launch argument: expected name:=value"),
+        (f"{UR} ur_model:=ur5 --screen", "'--screen' is no launch argument"),
+        (f"{UR} ur_model:=ur5 rs_mode:=voxels", "rs_mode 'voxels' does not exist: expected one of only_robot"),
+        (f"{UR} ur_model:=ur5 action_cycle_rate:=fast", "action_cycle_rate:=fast is no number"),
+        (f"{UR} ur_model:=ur5 action_cycle_rate:=-1", "action_cycle_rate is -1 Hz: expected more than 0"),
+        (f"{UR} ur_model:=ur5 max_velocity_scale_factor:=2", "expected more than 0, at most 1"),
+        (f"{UR} ur_model:=ur5 world_name:=moon.world", "world 'moon.world' does not exist: expected one of empty"),
+        (f"{UR} ur_model:=ur5 reference_frame:=world", "reference_frame 'world' does not exist"),
+        (f"{UR} ur_model:=ur5 real_robot:=true", "real_robot:=true is not simulated: expected real_robot:=false"),
+        (f"{UR} ur_model:=ur5 object_trajectory_file_name:=splines_ur5", "splines_ur5 is not simulated"),
+        (f"{UR} ur_model:=ur5 z:=1.0", "z:=1.0 is not simulated: expected z:=0.1"),
+        (f"{UR} ur_model:=ur5 rs_mode:=1object", "rs_mode '1object' tells of 1 objects, and there are 0"),
+        (f"{UR} ur_model:=ur5 objects_controller:=true n_objects:=1", "object_0_model_name is missing"),
+        (f"{UR} ur_model:=ur5 objects_controller:=true n_objects:=1e9", "n_objects is 1e.09: expected a whole number"),
+        (
+            f"{UR} ur_model:=ur5 objects_controller:=true n_objects:=1 object_0_model_name:=duck",
+            "object model 'duck' does not exist",
+        ),
+        (f"{UR} ur_model:=ur5 server_port:=99999", "port 99999 does not exist"),
+        (f"{MIR} world_name:=moon.world", "world 'moon.world' does not exist: expected one of empty_world_target"),
+        (f"{MIR} ur_model:=ur5", "launch arguments that are not known: ur_model"),
+        (f"{MIR} robot_x:=1.0", "robot_x:=1.0 is not simulated"),
+    ],
+)
+def test_line_that_cannot_be_honoured_is_refused_by_name(line: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse_launch_line(line)
+
+
+@pytest.mark.parametrize(
+    "settings", [parse_launch_line(POSITIONING), URSettings(), Mir100Settings(world="lab_6x8", seed=3, clock="real")]
+)
+def test_settings_survive_the_way_to_another_process(settings: Settings) -> None:
+    assert settings_from_json(settings_to_json(settings)) == settings
