@@ -11,6 +11,7 @@ import contextlib
 import logging
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -71,12 +72,19 @@ def bind(server: grpc.Server, host: str, port: int) -> int:
     """Bind a gRPC server and return the port it has. Raises PortInUseError naming the address."""
     address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
     try:
-        bound = int(server.add_insecure_port(address))
-    except RuntimeError as error:
+        _probe(host, port)  # gRPC writes several lines to standard error where it fails
+        return int(server.add_insecure_port(address))
+    except (OSError, RuntimeError) as error:
         raise PortInUseError(
             f"cannot listen on {address}: the port is taken, or the address is not this machine's"
         ) from error
-    return bound
+
+
+def _probe(host: str, port: int) -> None:
+    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    with socket.socket(family, kind, protocol) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(address)
 
 
 def serve_robot(settings: Settings, *, on_ready: Callable[[int], None], orphan_s: float | None = None) -> None:

@@ -1,0 +1,325 @@
+"""The server manager: real processes, started, crashed, killed and orphaned."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import grpc
+import pytest
+
+from rlservo.envs.robot_server.connections import count_connections
+from rlservo.envs.robot_server.manager import MANAGER_PORTS, RobotServers, ServerManager
+from rlservo.envs.robot_server.messages import ROBOT_SERVER, SERVER_MANAGER, Empty, ManagerStatus, State
+from rlservo.envs.robot_server.server import PortInUseError
+
+UR = "roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur5"
+MIR = "roslaunch mir100_robot_server sim_robot_server.launch"
+
+
+def get_state(port: int, timeout: float = 5.0) -> Any:
+    with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+        call = channel.unary_unary(f"/{ROBOT_SERVER}/GetState", response_deserializer=State.FromString)
+        return call(Empty().SerializeToString(), timeout=timeout)
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as stat:  # noqa: PTH123 (a process may end between two looks)
+            return stat.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_for(condition: Callable[[], bool], seconds: float) -> bool:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def test_server_starts_answers_and_is_gone_after_the_kill(manager: ServerManager, client: Any) -> None:
+    assert client.call("VerifyConnection").alive
+    started = client.start(UR)
+    assert started.success
+    assert started.port not in MANAGER_PORTS
+    pid = manager.servers.running[started.port]
+    assert pid != os.getpid()
+    assert get_state(started.port).success
+    assert client.kill(started.port).success
+    assert not is_alive(pid)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", started.port))  # the port is free again
+    with pytest.raises(grpc.RpcError):
+        get_state(started.port)
+
+
+def test_line_that_cannot_be_honoured_is_answered_with_the_reason(
+    manager: ServerManager, client: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    for line, reason in (
+        (f"{UR} colour:=red", "launch arguments that are not known: colour"),
+        ("roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur99", "ur_model 'ur99' does not exist"),
+        (f"{UR} action_cycle_rate:=30", "a rate of 200/n Hz"),
+        ("", "expected 'roslaunch"),
+    ):
+        answer = client.start(line)
+        assert not answer.success
+        assert answer.port == 0
+        assert reason in answer.info
+        assert reason in caplog.text
+    assert manager.servers.running == {}
+
+
+def test_fixed_server_port_that_is_taken_is_answered_with_the_reason(client: Any) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        answer = client.start(f"{UR} server_port:={port}")
+    assert not answer.success
+    assert f"cannot listen on 127.0.0.1:{port}: the port is taken" in answer.info
+    again = client.start(f"{UR} server_port:={port}")
+    assert again.success
+    assert again.port == port
+
+
+def test_killing_an_unknown_port_names_those_that_run(client: Any) -> None:
+    port = client.start(UR).port
+    answer = client.kill(1)
+    assert not answer.success
+    assert answer.info == f"there is no robot server on port 1; running: {port}"
+    assert client.kill(port).success
+    assert client.kill(port).info == f"there is no robot server on port {port}; running: none"
+
+
+def test_garbage_is_answered_and_the_manager_goes_on(client: Any) -> None:
+    for name in ("StartNewServer", "KillServer", "KillAllServers"):
+        answer = client.call(name, b"\xff\xff\xff")
+        assert not answer.success
+        assert answer.info == "3 bytes that are no such message"
+    assert client.call("VerifyConnection", b"\xff\xff\xff").alive
+
+
+def test_killed_robot_server_is_noticed_and_its_client_gets_an_error(
+    manager: ServerManager, client: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    port, other = client.start(UR).port, client.start(MIR).port
+    pid = manager.servers.running[port]
+    os.kill(pid, signal.SIGKILL)
+    with pytest.raises(grpc.RpcError) as caught:
+        for _ in range(100):  # the call that finds out may be the next one
+            get_state(port)
+    assert caught.value.code() == grpc.StatusCode.UNAVAILABLE
+    assert wait_for(lambda: port not in manager.servers.running, 2.0)
+    assert wait_for(lambda: "ended by itself: killed by SIGKILL" in caplog.text, 2.0)
+    assert not is_alive(pid)  # and no zombie is left
+    assert get_state(other).success
+    # robo-gym's ExceptionHandling wrapper kills the server it lost before it starts another.
+    assert client.kill(port).success
+    assert client.start(UR).success
+
+
+def test_stopped_process_that_does_not_listen_to_sigterm_is_killed_within_a_second(
+    manager: ServerManager, client: Any
+) -> None:
+    port = client.start(UR).port
+    pid = manager.servers.running[port]
+    os.kill(pid, signal.SIGSTOP)
+    began = time.monotonic()
+    assert client.kill(port).success
+    assert time.monotonic() - began < 1.0
+    assert not is_alive(pid)
+
+
+def test_limit_of_servers_is_kept_and_freed_by_a_kill() -> None:
+    servers = RobotServers(max_servers=2)
+    try:
+        ports = [servers.start(UR), servers.start(MIR)]
+        with pytest.raises(ValueError, match="2 robot servers are running, which is this manager's limit"):
+            servers.start(UR)
+        servers.kill(ports[0])
+        servers.start(UR)
+    finally:
+        servers.close()
+    assert servers.running == {}
+    with pytest.raises(ValueError, match="this server manager is ending"):
+        servers.start(UR)
+
+
+@pytest.mark.slow
+def test_twenty_servers_at_once_all_answer_and_all_end(manager: ServerManager, client: Any) -> None:
+    answers: list[Any] = []
+    threads = [
+        threading.Thread(target=lambda line=line: answers.append(client.start(line))) for line in [UR, MIR] * 10
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(answer.success for answer in answers)
+    running = manager.servers.running
+    assert len({answer.port for answer in answers}) == len(running) == 20
+    assert all(get_state(port).success for port in running)
+    assert client.kill_all().success
+    assert manager.servers.running == {}
+    assert not any(is_alive(pid) for pid in running.values())
+    assert client.start(UR).success  # it goes on
+
+
+# -- the command
+
+
+@pytest.fixture
+def command() -> Iterator[Callable[..., tuple[subprocess.Popen[str], int]]]:
+    """Run `rlservo server-manager` or `robot-server` and return the process and its port."""
+    processes: list[subprocess.Popen[str]] = []
+
+    def run(*arguments: str) -> tuple[subprocess.Popen[str], int]:
+        line = [sys.executable, "-m", "rlservo.deploy.cli", *arguments]
+        process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        processes.append(process)
+        assert process.stdout is not None
+        said = process.stdout.readline()
+        found = re.search(r":(\d+)[,:]", said)
+        assert found, said
+        return process, int(found[1])
+
+    yield run
+    for process in processes:
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def children(pid: int) -> list[int]:
+    found = []
+    with contextlib.suppress(OSError), open(f"/proc/{pid}/task/{pid}/children") as listed:  # noqa: PTH123
+        found = [int(child) for child in listed.read().split()]
+    return found
+
+
+def robot_servers_of(pid: int) -> list[int]:
+    """All processes whose parent is the manager, whichever of its threads started them."""
+    found = []
+    for entry in os.listdir("/proc"):  # noqa: PTH208
+        with contextlib.suppress(OSError, ValueError), open(f"/proc/{int(entry)}/stat") as stat:  # noqa: PTH123
+            if int(stat.read().rsplit(")", 1)[1].split()[1]) == pid:
+                found.append(int(entry))
+    return found
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_nothing_outlives_the_manager_however_it_ends(command: Any, end: signal.Signals) -> None:
+    process, port = command("server-manager", "--port", str(free_port()))
+    with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+        from rlservo.envs.robot_server.messages import ServerRequest
+
+        start = channel.unary_unary(f"/{SERVER_MANAGER}/StartNewServer", response_deserializer=ServerRequest.FromString)
+        ports = [start(ServerRequest(cmd=line).SerializeToString(), timeout=60).port for line in (UR, MIR)]
+    servers = robot_servers_of(process.pid)
+    assert len(servers) == 2
+    assert all(get_state(port).success for port in ports)
+    process.send_signal(end)
+    process.wait(5)
+    assert process.returncode == (-end if end == signal.SIGKILL else 0)
+    assert wait_for(lambda: not any(is_alive(pid) for pid in servers), 2.0)
+
+
+def test_manager_takes_the_first_free_port_of_robo_gyms_range(command: Any) -> None:
+    first, first_port = command("server-manager")
+    _, second_port = command("server-manager")
+    assert first_port in MANAGER_PORTS
+    assert second_port in MANAGER_PORTS
+    assert second_port > first_port  # they do not share one
+    for port in (first_port, second_port):
+        with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+            verify = channel.unary_unary(
+                f"/{SERVER_MANAGER}/VerifyConnection", response_deserializer=ManagerStatus.FromString
+            )
+            assert verify(Empty().SerializeToString(), timeout=5).alive
+    first.terminate()
+    first.wait(5)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", first_port))
+
+
+def test_manager_says_so_when_every_port_is_taken() -> None:
+    with contextlib.ExitStack() as stack:
+        for port in MANAGER_PORTS:
+            taken = stack.enter_context(socket.socket())
+            with contextlib.suppress(OSError):  # somebody else's, which is as good
+                taken.bind(("127.0.0.1", port))
+                taken.listen()
+        servers = RobotServers()
+        stack.callback(servers.close)
+        with pytest.raises(PortInUseError, match="every port from 50100 to 50199 on 127.0.0.1 is taken"):
+            ServerManager(servers=servers)
+
+
+def test_robot_server_command_serves_and_ends_on_ctrl_c(command: Any) -> None:
+    process, port = command("robot-server", "ur", "--ur-model", "ur10e", "--rs-mode", "1moving2points", "--port", "0")
+    state = get_state(port)
+    assert len(state.state_dict) == 34
+    process.send_signal(signal.SIGINT)
+    assert process.wait(3) == 0
+    process, port = command("robot-server", "mir100", "--world", "lab_6x8", "--port", "0")
+    assert len(get_state(port).state) == 1030
+    process.terminate()
+    assert process.wait(3) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("robot-server", "ur", "--ur-model", "ur7"), "ur_model 'ur7' does not exist: expected one of ur3"),
+        (("robot-server", "ur", "--rs-mode", "x"), "rs_mode 'x' does not exist"),
+        (("robot-server", "ur", "--object", "duck"), "object model 'duck' does not exist"),
+        (("robot-server", "ur", "--action-cycle-rate", "30"), "expected a rate of 200/n Hz"),
+        (("robot-server", "mir100", "--world", "moon"), "world 'moon' does not exist: expected one of"),
+        (("server-manager", "--host", "203.0.113.7", "--port", "50101"), "cannot listen on 203.0.113.7:50101"),
+    ],
+)
+def test_impossible_options_are_one_sentence(arguments: tuple[str, ...], message: str) -> None:
+    line = [sys.executable, "-m", "rlservo.deploy.cli", *arguments]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=60)
+    assert done.returncode in (1, 2)
+    assert message in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+
+
+# -- orphans
+
+
+def test_robot_server_without_a_client_ends_itself_and_one_with_a_client_stays() -> None:
+    servers = RobotServers(orphan_s=0.5)
+    try:
+        left, kept = servers.start(UR), servers.start(UR)
+        get_state(left)  # comes and goes
+        with grpc.insecure_channel(f"127.0.0.1:{kept}") as channel:
+            call = channel.unary_unary(f"/{ROBOT_SERVER}/GetState", response_deserializer=State.FromString)
+            call(Empty().SerializeToString(), timeout=5)
+            assert count_connections(kept) == 1
+            assert wait_for(lambda: left not in servers.running, 8.0)
+            assert kept in servers.running
+        assert wait_for(lambda: kept not in servers.running, 8.0)
+    finally:
+        servers.close()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
