@@ -1,8 +1,8 @@
 """robo-gym's own environment, for the tests that drive our servers with the original client.
 
-robo-gym pins a protobuf that Ray cannot use, so it lives in a virtual environment of its own, built once into the user's
-cache folder. Where that fails (no network, say) these tests skip with the reason, unless RLSERVO_REQUIRE_ROBO_GYM is
-set, as it is in CI.
+robo-gym pins a protobuf that Ray cannot use, so it lives in a virtual environment of its own, built once into the
+user's cache folder. Where that fails (no network, say) these tests skip with the reason, unless
+RLSERVO_REQUIRE_ROBO_GYM is set, as it is in CI.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 ROBO_GYM = ["robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1"]
-# What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and pip
-# would settle that with an old robo-gym-server-modules that has no pin and does not work.
+# What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and
+# pip would settle that with an old robo-gym-server-modules that has no pin and does not work.
 CLIENT = ["httpx>=0.27", "pydantic>=2.6"]
 
 

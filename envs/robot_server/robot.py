@@ -28,21 +28,28 @@ class Robot(Protocol):
     @property
     def cycle_s(self) -> float:
         """How long a control cycle lasts [s]."""
+        ...
 
     def state(self) -> RobotState:
         """Return the state of this moment."""
+        ...
 
     def set_state(self, wanted: RobotState) -> int:
         """Reset the robot and what is around it. Return how many cycles that took."""
+        ...
 
     def act(self, action: Sequence[float]) -> None:
         """Command the robot and let one cycle pass."""
+        ...
 
     def idle(self, cycles: int) -> None:
         """Let cycles pass in which no command arrived."""
+        ...
 
     def show(self) -> None:
         """Show the robot in a window, or refresh it."""
+        ...
 
     def close(self) -> None:
         """Close the window."""
+        ...

@@ -27,29 +27,36 @@ class Arm(Protocol):
     @property
     def joint_positions(self) -> Vector:
         """[rad] (6,)."""
+        ...
 
     @property
     def joint_velocities(self) -> Vector:
         """[rad/s] (6,)."""
+        ...
 
     @property
     def tool_position(self) -> Vector:
         """[m] (3,)."""
+        ...
 
     @property
     def tool_rotation(self) -> Vector:
         """(3, 3)."""
+        ...
 
     @property
     def forearm_position(self) -> Vector:
         """[m] (3,)."""
+        ...
 
     @property
     def forearm_rotation(self) -> Vector:
         """(3, 3)."""
+        ...
 
     def object_position(self, index: int) -> Vector:
         """[m] (3,)."""
+        ...
 
 
 def state_dict(arm: Arm, rs_mode: str, *, turned: bool = False) -> dict[str, float]:

@@ -4,13 +4,17 @@
 
 Where a job says "pause", the driver prints a line and waits for one on standard input after that many steps.
 
-Two of robo-gym 2.0.1's base methods cannot work with any server: `URBaseAvoidanceEnv.reset` calls `super(gym.Env)`, which
-has no reset, and refuses the arguments its subclass passes; its `step` returns five values where the subclasses unpack
-four. `mend_avoidance` puts `URBaseEnv.reset` and the four values there. Everything else is as it came from PyPI.
+Two of robo-gym 2.0.1's base methods cannot work with any server: `URBaseAvoidanceEnv.reset` calls `super(gym.Env)`,
+which has no reset, and refuses the arguments its subclass passes; its `step` returns five values where the subclasses
+unpack four. `mend_avoidance` puts `URBaseEnv.reset` and the four values there. Everything else is as it came from PyPI.
 """
+
+from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -20,33 +24,40 @@ from robo_gym.envs.ur.ur_base_env import URBaseEnv
 from robo_gym.wrappers.exception_handling import ExceptionHandling
 
 
-def mend_avoidance():
-    def reset(self, *, seed=None, options=None, joint_positions=None, fixed_object_position=None):
+def mend_avoidance() -> None:
+    def reset(
+        self: Any,
+        *,
+        options: Any = None,
+        joint_positions: Any = None,
+        fixed_object_position: Any = None,
+        seed: Any = None,
+    ) -> Any:
         options = options or {"joint_positions": joint_positions, "fixed_object_position": fixed_object_position}
         fixed = options.get("fixed_object_position")
         compose = type(self)._set_initial_robot_server_state
         self._set_initial_robot_server_state = lambda rs_state: compose(self, rs_state, fixed)
         return URBaseEnv.reset(self, options={"joint_positions": options["joint_positions"]})
 
-    def step(self, action):
+    def step(self: Any, action: Any) -> Any:
         state, reward, done, _, info = URBaseEnv.step(self, action)
         return state, reward, done, info
 
     URBaseAvoidanceEnv.reset, URBaseAvoidanceEnv.step = reset, step
 
 
-def run(job):
+def run(job: dict[str, Any]) -> dict[str, Any]:
     env = gym.make(job["env"], disable_env_checker=True, **job["arguments"]).unwrapped
-    sent = []  # joint positions or velocities on the wire, and what SetState held
+    sent: list[Any] = []  # joint positions or velocities on the wire, and what SetState held
     client = env.client
     set_state, send_action, send_and_get = client.set_state_msg, client.send_action, client.send_action_get_state
-    params = []
+    params: list[Any] = []
     client.set_state_msg = lambda message: params.append(dict(message.float_params)) or set_state(message)
     client.send_action = lambda action: sent.append(list(action)) or send_action(action)
     client.send_action_get_state = lambda action: sent.append(list(action)) or send_and_get(action)
     if "seed" in job:
         env.seed(job["seed"])
-    result = {"sent": sent, "params": params, "observations": [], "rewards": [], "status": None}
+    result: dict[str, Any] = {"sent": sent, "params": params, "observations": [], "rewards": [], "status": None}
     first = env.reset(**job["reset"])
     first = first[0] if isinstance(first, tuple) else first
     result["observations"].append(first.tolist())
@@ -65,7 +76,7 @@ def run(job):
     return result
 
 
-def run_through_a_crash(job):
+def run_through_a_crash(job: dict[str, Any]) -> dict[str, Any]:
     """Episode, crash, and on with robo-gym's own wrapper for it."""
     env = ExceptionHandling(gym.make(job["env"], disable_env_checker=True, **job["arguments"]).unwrapped)
     env.reset()
@@ -82,18 +93,16 @@ def run_through_a_crash(job):
     return result
 
 
-def main():
+def main() -> None:
     mend_avoidance()
-    with open(sys.argv[1]) as file:
-        jobs = json.load(file)
+    jobs = json.loads(Path(sys.argv[1]).read_text())
     results = []
     for job in jobs:
         try:
             results.append((run_through_a_crash if job.get("crash") else run)(job))
         except Exception as error:
             results.append({"error": f"{type(error).__name__}: {error}"})
-    with open(sys.argv[2], "w") as file:
-        json.dump(results, file)
+    Path(sys.argv[2]).write_text(json.dumps(results))
 
 
 if __name__ == "__main__":

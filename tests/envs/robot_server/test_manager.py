@@ -161,9 +161,7 @@ def test_limit_of_servers_is_kept_and_freed_by_a_kill() -> None:
 @pytest.mark.slow
 def test_twenty_servers_at_once_all_answer_and_all_end(manager: ServerManager, client: Any) -> None:
     answers: list[Any] = []
-    threads = [
-        threading.Thread(target=lambda line=line: answers.append(client.start(line))) for line in [UR, MIR] * 10
-    ]
+    threads = [threading.Thread(target=lambda line=line: answers.append(client.start(line))) for line in [UR, MIR] * 10]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -265,7 +263,7 @@ def test_manager_says_so_when_every_port_is_taken() -> None:
                 taken.listen()
         servers = RobotServers()
         stack.callback(servers.close)
-        with pytest.raises(PortInUseError, match="every port from 50100 to 50199 on 127.0.0.1 is taken"):
+        with pytest.raises(PortInUseError, match=r"every port from 50100 to 50199 on 127.0.0.1 is taken"):
             ServerManager(servers=servers)
 
 
