@@ -22,6 +22,7 @@ check: setup  ## Lint, format and types, as CI runs them
 
 bench: setup  ## Simulator and serving speed, printed and written to bench/
 	$(BIN)/python benchmarks/simulators.py
+	$(BIN)/python benchmarks/robot_server.py
 	$(BIN)/python benchmarks/serving.py
 
 wheel: setup  ## Build the wheel into dist/

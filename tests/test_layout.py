@@ -16,6 +16,8 @@ ONLY_IN = {
     "ray.serve": ("serve_app/app.py", "serve_app/launcher.py"),
     "fastapi": ("serve_app/http.py", "serve_app/docs.py", "serve_app/app.py"),
     "mujoco": ("envs/",),
+    "grpc": ("envs/robot_server/",),
+    "google.protobuf": ("envs/robot_server/",),
     "torch": ("export/",),
     "pickle": ("export/unpickle.py",),
 }

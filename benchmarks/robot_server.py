@@ -1,0 +1,187 @@
+"""Robot server speed: starts, steps per second through gRPC, and many simulators at once in real time.
+
+    python benchmarks/robot_server.py [--seconds 3] [--servers 20]
+
+A server manager and its robot servers run as processes of their own, as users run them. Steps are one UR5 command with
+its state (SendActionGetState, 1object) and one MiR100 command and its state (SendAction, GetState, lab_6x8), on one
+client. Medians of five rounds. Written to bench/robot_server.json too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from rlservo.envs.robot_server.manager import RobotServers
+from rlservo.envs.robot_server.messages import ROBOT_SERVER, Action, Empty, State, Success
+
+JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
+START = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)
+ROUNDS = 5
+REAL_RATE_HZ = 20
+OBJECT = "objects_controller:=true n_objects:=1 object_0_model_name:=sphere50_no_collision object_0_frame:=target"
+UR5 = f"roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur5 rs_mode:=1object {OBJECT} action_cycle_rate:="
+MIR100 = "roslaunch mir100_robot_server sim_robot_server.launch world_name:=lab_6x8.world"
+
+
+class Robot:
+    """A connected robot server."""
+
+    def __init__(self, port: int, *, is_ur: bool) -> None:
+        channel = grpc.insecure_channel(f"127.0.0.1:{port}")
+
+        def call(name: str, answer: Any) -> Callable[..., Any]:
+            method: Callable[..., Any] = channel.unary_unary(
+                f"/{ROBOT_SERVER}/{name}", lambda message: message.SerializeToString(), answer.FromString
+            )
+            return method
+
+        self.set_state, self.get_state = call("SetState", Success), call("GetState", State)
+        self.send, self.send_and_get = call("SendAction", Success), call("SendActionGetState", State)
+        self._is_ur = is_ur
+        rng = np.random.default_rng(0)
+        offsets = rng.uniform(-0.3, 0.3, (200, 6)).astype(np.float32)
+        ros = np.array([START[2], START[1], START[0], *START[3:]])
+        self._actions = (ros + offsets if is_ur else offsets[:, :2]).tolist()
+        self._next = 0
+
+    def reset(self) -> None:
+        """Put the robot at its start."""
+        if self._is_ur:
+            named = {f"{joint}_joint_position": value for joint, value in zip(JOINTS, START, strict=True)}
+            assert self.set_state(State(state_dict=named)).success
+        else:
+            assert self.set_state(State(state=[0.0] * 3 + [0.0, 2.5, 0.0])).success
+
+    def step(self) -> None:
+        """Command and look, as robo-gym's environments do."""
+        self._next = (self._next + 1) % len(self._actions)
+        action = Action(action=self._actions[self._next])
+        if self._is_ur:
+            assert self.send_and_get(action).success
+        else:
+            assert self.send(action).success
+            assert self.get_state(Empty()).success
+
+
+def starts(count: int = 10) -> tuple[list[float], list[float]]:
+    """Return seconds to start and to kill a UR5 server, one after the other."""
+    servers = RobotServers()
+    started, killed = [], []
+    try:
+        for _ in range(count):
+            began = time.perf_counter()
+            port = servers.start(UR5 + "10")
+            started.append(time.perf_counter() - began)
+            began = time.perf_counter()
+            servers.kill(port)
+            killed.append(time.perf_counter() - began)
+    finally:
+        servers.close()
+    return started, killed
+
+
+def speed(line: str, seconds: float, *, is_ur: bool) -> list[float]:
+    """Return steps per second on the fast clock, a round each."""
+    servers = RobotServers()
+    rounds = []
+    try:
+        robot = Robot(servers.start(line), is_ur=is_ur)
+        for _ in range(ROUNDS):
+            robot.reset()
+            steps, began = 0, time.perf_counter()
+            while (elapsed := time.perf_counter() - began) < seconds:
+                for _ in range(20):
+                    robot.step()
+                steps += 20
+            rounds.append(steps / elapsed)
+    finally:
+        servers.close()
+    return rounds
+
+
+def real_time(count: int, seconds: float) -> tuple[float, list[float]]:
+    """Return how long starting `count` servers at once took, and each one's rate on the real clock [Hz]."""
+    servers = RobotServers(clock="real")
+    ports: list[int] = []
+    rates: list[float] = []
+    try:
+        began = time.perf_counter()
+        starting = [
+            threading.Thread(target=lambda: ports.append(servers.start(f"{UR5}{REAL_RATE_HZ}"))) for _ in range(count)
+        ]
+        for thread in starting:
+            thread.start()
+        for thread in starting:
+            thread.join()
+        together = time.perf_counter() - began
+
+        def drive(port: int) -> None:
+            robot = Robot(port, is_ur=True)
+            robot.reset()
+            robot.step()
+            steps = round(seconds * REAL_RATE_HZ)
+            from_here = time.perf_counter()
+            for _ in range(steps):
+                robot.step()
+            rates.append(steps / (time.perf_counter() - from_here))
+
+        driving = [threading.Thread(target=drive, args=(port,)) for port in ports]
+        for thread in driving:
+            thread.start()
+        for thread in driving:
+            thread.join()
+    finally:
+        servers.close()
+    return together, rates
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Measure the robot servers.")
+    parser.add_argument("--seconds", type=float, default=3.0, help="per round")
+    parser.add_argument("--servers", type=int, default=20, help="how many at once in real time")
+    parser.add_argument("--out", type=Path, default=Path("bench"))
+    args = parser.parse_args()
+
+    started, killed = starts()
+    ur, mir = speed(UR5 + "10", args.seconds, is_ur=True), speed(MIR100, args.seconds, is_ur=False)
+    together, rates = real_time(args.servers, max(args.seconds, 5.0))
+    results = {
+        "start_s": started,
+        "kill_s": killed,
+        "ur5_steps_per_s": ur,
+        "mir100_steps_per_s": mir,
+        "servers": args.servers,
+        "start_together_s": together,
+        "real_time_hz": rates,
+    }
+    table = Table(title="Robot servers")
+    for column in ("what", "median", "worst", "goal"):
+        table.add_column(column, justify="left" if column == "what" else "right")
+    table.add_row("start a UR5 server [s]", f"{statistics.median(started):.2f}", f"{max(started):.2f}", "2")
+    table.add_row("kill it [s]", f"{statistics.median(killed):.2f}", f"{max(killed):.2f}", "1")
+    table.add_row("UR5 steps/s, fast clock", f"{statistics.median(ur):,.0f}", f"{min(ur):,.0f}", "1,000")
+    table.add_row("MiR100 steps/s, fast clock", f"{statistics.median(mir):,.0f}", f"{min(mir):,.0f}", "500")
+    table.add_row(f"start {args.servers} at once [s]", f"{together:.1f}", "", "")
+    table.add_row(
+        f"{args.servers} UR5s at {REAL_RATE_HZ} Hz, real clock [Hz]", f"{statistics.median(rates):.2f}",
+        f"{min(rates):.2f}", str(REAL_RATE_HZ),
+    )  # fmt: skip
+    Console().print(table)
+    args.out.mkdir(exist_ok=True)
+    (args.out / "robot_server.json").write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
