@@ -35,6 +35,10 @@ UR5 = f"roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur5 rs_mode:=
 MIR100 = "roslaunch mir100_robot_server sim_robot_server.launch world_name:=lab_6x8.world"
 
 
+def serialize(message: Any) -> bytes:
+    return bytes(message.SerializeToString())
+
+
 class Robot:
     """A connected robot server."""
 
@@ -42,9 +46,7 @@ class Robot:
         channel = grpc.insecure_channel(f"127.0.0.1:{port}")
 
         def call(name: str, answer: Any) -> Callable[..., Any]:
-            method: Callable[..., Any] = channel.unary_unary(
-                f"/{ROBOT_SERVER}/{name}", lambda message: message.SerializeToString(), answer.FromString
-            )
+            method: Callable[..., Any] = channel.unary_unary(f"/{ROBOT_SERVER}/{name}", serialize, answer.FromString)
             return method
 
         self.set_state, self.get_state = call("SetState", Success), call("GetState", State)

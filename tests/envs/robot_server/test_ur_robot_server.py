@@ -335,6 +335,17 @@ def test_many_clients_at_once_get_whole_states_and_every_action_counts(serve: Se
     assert height == pytest.approx(heights[5 * 180 % 1600], abs=1e-5)
 
 
+def test_window_that_cannot_be_opened_is_no_reason_not_to_serve(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    client = serve(URSettings(gui=True))
+    assert "there is no display to open a window on" in caplog.text
+    assert client.set_state(state_dict=named())
+    assert client.send(ros(START))
+
+
 def test_slow_client_does_not_hold_up_another(serve: Serve) -> None:
     """A connection that opened and says nothing, and one whose command waits for its cycle in real time."""
     client = serve(URSettings(clock="real", action_cycle_rate=1))
