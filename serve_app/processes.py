@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shutil
 import signal
 import socket
 import time
@@ -105,6 +106,15 @@ def end_marked(mark: str, *, timeout_s: float = 10.0) -> list[int]:
                 os.kill(pid, signal.SIGKILL)
         time.sleep(0.05)
     return left
+
+
+def remove_folder(folder: Path, *, timeout_s: float = 5.0) -> None:
+    """Remove a folder that processes just ended, or another cleaner, may be touching a last time."""
+    deadline = time.monotonic() + timeout_s
+    while folder.exists() and time.monotonic() < deadline:
+        shutil.rmtree(folder, ignore_errors=True)
+        if folder.exists():
+            time.sleep(0.05)
 
 
 def _pids() -> list[int]:
