@@ -353,7 +353,8 @@ def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapp
     """Write golden.npz; every array's first axis is the sample."""
     arrays = {f"input/{name}": value for name, value in inputs.items()}
     arrays.update({f"output/{name}": value for name, value in outputs.items()})
-    np.savez_compressed(folder / GOLDEN_FILE, allow_pickle=False, **arrays)
+    # `allow_pickle` would be one more array to numpy before 2.1; load_bundle refuses pickled ones.
+    np.savez_compressed(folder / GOLDEN_FILE, **arrays)
 
 
 def write_contract(folder: Path, contract: Contract) -> None:
