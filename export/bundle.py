@@ -287,7 +287,7 @@ def _looks_like_bundle(folder: Path) -> bool:
 
 def _versions(policy: Path) -> list[Path]:
     folders = [
-        f for f in policy.iterdir() if f.is_dir() and re.match(VERSION_PATTERN, f.name) and _looks_like_bundle(f)
+        f for f in policy.iterdir() if f.is_dir() and re.fullmatch(VERSION_PATTERN, f.name) and _looks_like_bundle(f)
     ]
     return sorted(folders, key=lambda f: version_key(f.name))
 

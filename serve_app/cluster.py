@@ -45,8 +45,8 @@ def main() -> int:
             include_dashboard=False,
             log_to_driver=False,
             configure_logging=False,
-            _temp_dir=plan["folder"],
-            _node_ip_address="127.0.0.1",  # Ray's own ports stay on this machine
+            _temp_dir=plan["ray_folder"],
+            _node_ip_address="127.0.0.1",  # some of Ray's ports listen everywhere all the same, with the token
             _system_config={"enable_worker_prestart": False},
         )
         app.start(

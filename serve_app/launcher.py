@@ -14,6 +14,7 @@ import logging
 import os
 import queue
 import secrets
+import shlex
 import shutil
 import signal
 import subprocess
@@ -34,7 +35,9 @@ logger = logging.getLogger(__name__)
 
 START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 30.0
-MAX_FOLDER = 30  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
+MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
+# Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
+RAY_FOLDER = "r"
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 STOP, STOP_NOW = "stop", "stop now"
 
@@ -47,7 +50,7 @@ for argument; do
     -e 's/bind \\*:{stats}$/bind 127.0.0.1:{stats}/' "$argument"
   previous=$argument
 done
-exec '{binary}' "$@"
+exec {binary} "$@"
 """
 
 
@@ -192,7 +195,14 @@ def _child(
     mark = secrets.token_hex(16)
     environment = ray_environment(folder, haproxy=haproxy, mark=mark)
     read_fd, write_fd = os.pipe()
-    full_plan = {**plan, "folder": str(folder), "mark": mark, "report_fd": write_fd}
+    (folder / RAY_FOLDER).mkdir()
+    full_plan = {
+        **plan,
+        "folder": str(folder),
+        "ray_folder": str(folder / RAY_FOLDER),
+        "mark": mark,
+        "report_fd": write_fd,
+    }
     with (folder / "server.log").open("wb") as log:
         child = subprocess.Popen(
             [sys.executable, "-m", "rlservo.serve_app.cluster", json.dumps(full_plan)],
@@ -255,7 +265,7 @@ def ray_environment(folder: Path, *, haproxy: str | None, mark: str) -> dict[str
     if haproxy is None:
         return environment
     script = folder / "haproxy"
-    script.write_text(HAPROXY_SCRIPT.format(binary=haproxy, stats=stats, metrics=metrics))
+    script.write_text(HAPROXY_SCRIPT.format(binary=shlex.quote(haproxy), stats=stats, metrics=metrics))
     script.chmod(0o700)
     environment.update(
         {
@@ -265,6 +275,7 @@ def ray_environment(folder: Path, *, haproxy: str | None, mark: str) -> dict[str
             # the value is put into haproxy.cfg as it is, and '#' comments out the level that follows there.
             "RAY_SERVE_HAPROXY_NBTHREAD": "1",
             "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
+            "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # Ray's hour would keep a half-sent request for as long
             "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
             "RAY_SERVE_HAPROXY_BINARY_PATH": str(script),
             "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),

@@ -48,6 +48,8 @@ def _why_not(host: str, port: int, error: OSError) -> str:
             return f"port {port} on {host} is in use: stop what listens there, or choose another with --port"
         pid, name = holder
         message = f"port {port} on {host} is in use by '{name}' (process {pid})"
+        if name == "haproxy" and not _is_orphan(pid):
+            return f"{message}, the proxy of a running server: stop that server (Ctrl-C), or choose another with --port"
         if name == "haproxy":
             return (
                 f"{message}: a proxy that an earlier Ray Serve left behind, it would answer in our place; "
@@ -59,6 +61,16 @@ def _why_not(host: str, port: int, error: OSError) -> str:
     if error.errno == errno.EADDRNOTAVAIL:
         return f"host '{host}' is not an address of this machine: use 127.0.0.1, or 0.0.0.0 for all of its addresses"
     return f"cannot listen on {host}:{port}: {error.strerror}"
+
+
+def _is_orphan(pid: int) -> bool:
+    """Return whether no Ray is left among the process's ancestors, so that it serves nobody."""
+    with contextlib.suppress(OSError):
+        while pid > 1:
+            if (PROC / str(pid) / "comm").read_text().startswith(("raylet", "ray::")):
+                return False
+            pid = int((PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()[1])
+    return True
 
 
 def port_holder(port: int) -> tuple[int, str] | None:

@@ -93,7 +93,14 @@ def running(arguments: list[str], port: int, **environment: str) -> Iterator[Run
     variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
     variables.update({SPOOR: spoor, "TMPDIR": str(temporary), **environment})
     process = subprocess.Popen(
-        arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=variables, cwd=ROOT
+        arguments,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=variables,
+        cwd=ROOT,
+        # A shell's background job starts with Ctrl-C ignored, and so would all it starts, `serve run` among them.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
         yield Run(process, port, spoor)
