@@ -369,11 +369,6 @@ def contract_json(contract: Contract) -> str:
     return json.dumps(contract.model_dump(mode="json"), indent=2)
 
 
-def contract_schema() -> dict[str, Any]:
-    """Return the JSON schema of contract.json."""
-    return Contract.model_json_schema()
-
-
 def sha256(file: Path) -> str:
     """Return the file's hash as 64 hexadecimal digits."""
     digest = hashlib.sha256()
