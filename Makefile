@@ -2,7 +2,6 @@
 VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
-FOLDERS := envs export serve_app deploy examples benchmarks
 STAMP := $(VENV)/.installed
 
 .PHONY: demo test check bench wheel setup clean
@@ -28,7 +27,7 @@ bench: setup  ## Simulator and serving speed, printed and written to bench/
 wheel: setup  ## Build the wheel into dist/
 	$(BIN)/python -m build --wheel --outdir dist .
 
-setup: $(STAMP)
+setup: $(STAMP)  ## Only the set-up
 
 $(STAMP): pyproject.toml constraints.txt setup.py envs/rlservo-gymnasium.pth
 	$(PYTHON) -m venv $(VENV)

@@ -21,6 +21,7 @@ from rich.console import Console
 
 from rlservo.deploy import robot_commands
 from rlservo.export.errors import RlservoError, UsageError
+from rlservo.serve_app.acting import ActingPolicy
 
 app = typer.Typer(
     name="rlservo",
@@ -53,6 +54,10 @@ def main() -> None:
         raise SystemExit(2 if isinstance(error, UsageError) else 1) from None
     except BrokenPipeError:  # the reader of our output went away, as in `rlservo inspect ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+    except OSError as error:
+        what = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
+        _err.print(f"rlservo: {what}", style="red", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(1) from None
 
 
@@ -245,13 +250,11 @@ def rollout(
         raise UsageError("give either --url (a server) or --bundle (in process)")
     if video is not None:
         choose_gl_backend()
-    with _extra("client,sim"):
-        from rlservo.serve_app.client import PolicyClient
-        from rlservo.serve_app.policy import Policy
+    with _extra("sim"):
         from rlservo.serve_app.rollout import rollout as run_rollout
         from rlservo.serve_app.rollout_report import render_report
 
-    with Policy.load(bundle) if bundle is not None else PolicyClient(str(url), policy) as acting:
+    with _acting_policy(url, policy, bundle) as acting:
         report = run_rollout(
             acting,
             env,
@@ -290,6 +293,18 @@ def demo(
 
 
 robot_commands.add_to(app)
+
+
+def _acting_policy(url: str | None, name: str | None, bundle: Path | None) -> ActingPolicy:
+    """Return the policy to drive with; in process it needs no HTTP client."""
+    if bundle is not None:
+        from rlservo.serve_app.policy import Policy
+
+        return Policy.load(bundle)
+    with _extra("client"):
+        from rlservo.serve_app.client import PolicyClient
+
+    return PolicyClient(str(url), name)
 
 
 def parse_env_arguments(pairs: list[str]) -> dict[str, Any]:

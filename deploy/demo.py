@@ -5,6 +5,7 @@ Exporting and serving run as the very commands a user would type, in processes o
 
 from __future__ import annotations
 
+import ctypes
 import shlex
 import shutil
 import signal
@@ -13,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -78,17 +79,18 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
 
     console.rule("2  serve: both policies on one Ray Serve endpoint")
     runs: list[RobotRun] = []
-    with _server(console, repository, out / "server.log") as url:
+    counts = ("--episodes", str(episodes), "--seed", str(FIRST_SEED))
+    with _ends_like_ctrl_c(), _server(console, repository, out / "server.log") as url:
         console.rule(f"3  drive: {episodes} episodes each, every action over HTTP")
         for robot in ROBOTS:
-            _show(console, "rollout", robot.env_id, "--url", url, "--policy", robot.policy, "--episodes", str(episodes))
+            _show(console, "rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts)
             with PolicyClient(url, robot.policy) as policy, console.status("driving ..."):
                 traces: list[Trace] = []
                 report = rollout(_Recorder(policy, traces), robot.env_id, episodes=episodes, seed=FIRST_SEED)
                 if report.interrupted:
                     raise KeyboardInterrupt
                 longest = max(report.episodes, key=lambda row: (bool(row.success), row.steps))
-                frames = film(policy, robot.env_id, seed=FIRST_SEED + longest.index)
+                frames = film(policy, robot.env_id, seed=FIRST_SEED + longest.index, note=console.print)
                 runs.append(RobotRun(robot, report, traces, frames))
     picture = draw_picture(out / "demo.png", runs)
     console.rule("4  result")
@@ -155,6 +157,7 @@ def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
             stdout=stream,
             stderr=subprocess.STDOUT,
             start_new_session=True,
+            preexec_fn=_end_with_parent,
         )
         try:
             with console.status("starting Ray Serve (about 10 s) ..."):
@@ -164,6 +167,27 @@ def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
         finally:
             with console.status("stopping the server ..."):
                 _stop(server)
+
+
+@contextmanager
+def _ends_like_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM and a closed terminal stop the server too, as Ctrl-C does."""
+
+    def interrupt(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end_with_parent() -> None:
+    """Have the kernel send the server SIGTERM when this process is killed (Linux: PR_SET_PDEATHSIG)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)
 
 
 def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -40,11 +41,12 @@ class RobotRun:
     frames: list[Frame]
 
 
-def film(policy: ActingPolicy, env_id: str, *, seed: int) -> list[Frame]:
-    """Return the first, middle and last picture of one episode; none where no GL library is installed."""
+def film(policy: ActingPolicy, env_id: str, *, seed: int, note: Callable[[str], object]) -> list[Frame]:
+    """Return the first, middle and last picture of one episode; none, with a note, where the machine cannot draw."""
     try:
         env = make_env(env_id, {}, render=True)
-    except UsageError:
+    except UsageError as error:
+        note(f"no pictures of the robots: {error.message}")
         return []
     frames: list[Frame] = []
     try:
@@ -56,7 +58,8 @@ def film(policy: ActingPolicy, env_id: str, *, seed: int) -> list[Frame]:
             obs, _, terminated, truncated, _ = env.step(policy.act(obs))
             frames.append(rgb_frame(env))
             ended = terminated or truncated
-    except UsageError:
+    except UsageError as error:
+        note(f"no pictures of the robots: {error.message}")
         return []
     finally:
         env.close()
@@ -101,7 +104,7 @@ def _draw_curves(axes: Any, run: RobotRun) -> None:
         transform=axes.get_yaxis_transform(),
     )
     axes.set_xlabel("time [s]")
-    axes.set_ylabel("distance to target [m]")
+    axes.set_ylabel("distance to target before each action [m]")
     axes.set_ylim(bottom=0)
     axes.set_xlim(left=0)
     axes.grid(alpha=0.25)

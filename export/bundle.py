@@ -287,7 +287,7 @@ def _looks_like_bundle(folder: Path) -> bool:
 
 def _versions(policy: Path) -> list[Path]:
     folders = [
-        f for f in policy.iterdir() if f.is_dir() and re.match(VERSION_PATTERN, f.name) and _looks_like_bundle(f)
+        f for f in policy.iterdir() if f.is_dir() and re.fullmatch(VERSION_PATTERN, f.name) and _looks_like_bundle(f)
     ]
     return sorted(folders, key=lambda f: version_key(f.name))
 
@@ -353,7 +353,8 @@ def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapp
     """Write golden.npz; every array's first axis is the sample."""
     arrays = {f"input/{name}": value for name, value in inputs.items()}
     arrays.update({f"output/{name}": value for name, value in outputs.items()})
-    np.savez_compressed(folder / GOLDEN_FILE, allow_pickle=False, **arrays)
+    # `allow_pickle` would be one more array to numpy before 2.1; load_bundle refuses pickled ones.
+    np.savez_compressed(folder / GOLDEN_FILE, **arrays)  # type: ignore[arg-type]  # for numpy 2's keyword above
 
 
 def write_contract(folder: Path, contract: Contract) -> None:
@@ -366,11 +367,6 @@ def write_contract(folder: Path, contract: Contract) -> None:
 def contract_json(contract: Contract) -> str:
     """Return the contract as the indented JSON that goes into the bundle and the ONNX metadata."""
     return json.dumps(contract.model_dump(mode="json"), indent=2)
-
-
-def contract_schema() -> dict[str, Any]:
-    """Return the JSON schema of contract.json."""
-    return Contract.model_json_schema()
 
 
 def sha256(file: Path) -> str:

@@ -23,9 +23,9 @@ def default_name(env_id: str | None, root: Path) -> str:
 
 def check_names(name: str | None, version: str | None) -> None:
     """Raise UsageError when a name or a version that was asked for cannot be one."""
-    if name is not None and not re.match(NAME_PATTERN, name):
+    if name is not None and not re.fullmatch(NAME_PATTERN, name):
         raise UsageError(f"'{name}' cannot be a policy's name: expected up to 64 letters, digits, '.', '_' and '-'")
-    if version is not None and not re.match(VERSION_PATTERN, version):
+    if version is not None and not re.fullmatch(VERSION_PATTERN, version):
         raise UsageError(f"'{version}' cannot be a version: expected a positive integer or a form like 1.2.0")
 
 
@@ -38,7 +38,7 @@ def choose_target(out: Path, name: str, version: str | None) -> Path:
     if (out.exists() and not out.is_dir()) or (policy.exists() and not policy.is_dir()):
         raise UsageError(f"{policy if out.is_dir() else out} is a file: expected a folder to write bundles into")
     present = [child.name for child in policy.iterdir()] if policy.is_dir() else []
-    taken = [entry for entry in present if re.match(VERSION_PATTERN, entry)]
+    taken = [entry for entry in present if re.fullmatch(VERSION_PATTERN, entry)]
     if version is None:
         version = str(max((version_key(entry)[0] for entry in taken), default=0) + 1)
     if version in present:

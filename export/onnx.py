@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from numpy.typing import NDArray
 
@@ -112,6 +111,11 @@ def add_metadata(file: Path, properties: Mapping[str, str]) -> None:
 
 def run_onnx(file: Path) -> Runner:
     """Return a function that runs the file in onnxruntime on one thread, as a server does."""
+    # onnxruntime's Linux wheels report use from the moment they are imported unless this is set. An exporter calls
+    # nobody; whoever wants it may set the variable to 0.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # errors arrive as exceptions; it would print them as well

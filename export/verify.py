@@ -123,7 +123,7 @@ def _evaluate(contract: Contract, env_id: str, drivers: tuple[Act, Act], episode
             )
         runs = [[_episode(env, act, contract, first_seed + number) for number in range(episodes)] for act in drivers]
     finally:
-        env.close()  # type: ignore[no-untyped-call]  # gymnasium 1.2 leaves it unannotated
+        env.close()
     returns = [float(np.mean([one.reward for one in run])) for run in runs]
     success = [_success_rate(run) for run in runs]
     return Evaluation(

@@ -153,10 +153,12 @@ class Actor:
                     {"deadline_ms": request.deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": request.seq},
                 )
         obs = request.obs
-        if type(obs) is list and len(obs) > self._max_batch:
+        rows = _rows(obs)
+        if rows > self._max_batch:
             policy = store.get(params["name"], params.get("version"))
-            if len(obs) != (policy.contract.observation_space.shape or (0,))[0]:  # not one long observation
-                raise TooLargeError(f"a batch of {len(obs)} observations is too large: at most {self._max_batch}")
+            shape = policy.contract.observation_space.shape or (0,)
+            if type(obs) is dict or rows != shape[0]:  # not one long observation
+                raise TooLargeError(f"a batch of {rows} observations is too large: at most {self._max_batch}")
         try:
             decision = store.act(params["name"], params.get("version"), obs, explore=request.explore, seed=request.seed)
         except ObservationError as error:
@@ -370,3 +372,10 @@ def _errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 def _json(status: int, document: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> Response:
     return Response(wire.encode_json(document), status, headers, "application/json")
+
+
+def _rows(obs: Any) -> int:
+    """Return how many observations a batch would hold, lists or names to lists."""
+    if type(obs) is dict:
+        return max((len(value) for value in obs.values() if type(value) is list), default=0)
+    return len(obs) if type(obs) is list else 0

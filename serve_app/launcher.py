@@ -14,6 +14,7 @@ import logging
 import os
 import queue
 import secrets
+import shlex
 import shutil
 import signal
 import subprocess
@@ -26,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.errors import UnavailableError, UsageError
-from rlservo.serve_app.processes import MARK, check_port, end_marked, free_ports
+from rlservo.serve_app.processes import MARK, check_port, end_marked, free_ports, remove_folder
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
 
@@ -34,7 +35,9 @@ logger = logging.getLogger(__name__)
 
 START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 30.0
-MAX_FOLDER = 30  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
+MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
+# Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
+RAY_FOLDER = "r"
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 STOP, STOP_NOW = "stop", "stop now"
 
@@ -47,7 +50,7 @@ for argument; do
     -e 's/bind \\*:{stats}$/bind 127.0.0.1:{stats}/' "$argument"
   previous=$argument
 done
-exec '{binary}' "$@"
+exec {binary} "$@"
 """
 
 
@@ -181,7 +184,7 @@ def _folder() -> Iterator[Path]:
     try:
         yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_folder(folder)
 
 
 @contextlib.contextmanager
@@ -192,7 +195,14 @@ def _child(
     mark = secrets.token_hex(16)
     environment = ray_environment(folder, haproxy=haproxy, mark=mark)
     read_fd, write_fd = os.pipe()
-    full_plan = {**plan, "folder": str(folder), "mark": mark, "report_fd": write_fd}
+    (folder / RAY_FOLDER).mkdir()
+    full_plan = {
+        **plan,
+        "folder": str(folder),
+        "ray_folder": str(folder / RAY_FOLDER),
+        "mark": mark,
+        "report_fd": write_fd,
+    }
     with (folder / "server.log").open("wb") as log:
         child = subprocess.Popen(
             [sys.executable, "-m", "rlservo.serve_app.cluster", json.dumps(full_plan)],
@@ -212,7 +222,7 @@ def _child(
     finally:
         if child.stdin is not None:
             child.stdin.close()
-        if left := end_marked(mark):
+        if left := end_marked(mark, child.pid):
             logger.error("processes %s of the server would not end", left)
         child.wait()
         reader.join()
@@ -228,7 +238,7 @@ def _pass_on(read_fd: int, events: queue.SimpleQueue[Any]) -> None:
 def ray_environment(folder: Path, *, haproxy: str | None, mark: str) -> dict[str, str]:
     """Return the environment of the cluster: this process's, without its Ray settings, with ours.
 
-    The figures behind each choice are in DESIGN.md and were measured on ray 2.60.
+    The variables are ray 2.60's (ray/serve/_private/constants.py).
     """
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
     fallback_http, fallback_grpc, stats, metrics = free_ports(4)
@@ -239,7 +249,9 @@ def ray_environment(folder: Path, *, haproxy: str | None, mark: str) -> dict[str
             # ~/.ray/auth_token nor its absence matters.
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": secrets.token_hex(32),
+            # Neither Ray nor onnxruntime reports use to its makers from a robot's computer.
             "RAY_USAGE_STATS_ENABLED": "0",
+            "ORT_DISABLE_TELEMETRY": "1",
             "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",
             "RAY_SERVE_RUN_ROUTER_IN_SEPARATE_LOOP": "0",
             "RAY_SERVE_LOG_TO_STDERR": "0",
@@ -253,7 +265,7 @@ def ray_environment(folder: Path, *, haproxy: str | None, mark: str) -> dict[str
     if haproxy is None:
         return environment
     script = folder / "haproxy"
-    script.write_text(HAPROXY_SCRIPT.format(binary=haproxy, stats=stats, metrics=metrics))
+    script.write_text(HAPROXY_SCRIPT.format(binary=shlex.quote(haproxy), stats=stats, metrics=metrics))
     script.chmod(0o700)
     environment.update(
         {
@@ -263,6 +275,7 @@ def ray_environment(folder: Path, *, haproxy: str | None, mark: str) -> dict[str
             # the value is put into haproxy.cfg as it is, and '#' comments out the level that follows there.
             "RAY_SERVE_HAPROXY_NBTHREAD": "1",
             "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
+            "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # Ray's hour would keep a half-sent request for as long
             "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
             "RAY_SERVE_HAPROXY_BINARY_PATH": str(script),
             "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),

@@ -25,17 +25,17 @@ class ServerSettings(BaseModel):
     threads: int = Field(1, ge=1, le=256)
     """onnxruntime threads per session; one is fastest for networks of kilobytes and keeps concurrent requests apart."""
 
-    max_body_bytes: int = Field(16 << 20, ge=1024)
+    max_body_bytes: int = Field(4 << 20, ge=1024)
     """A larger request body is refused with 413 before it is read to the end."""
 
     max_batch: int = Field(4096, ge=1)
     """More observations in one request are refused with 413: the event loop computes a batch in one go."""
 
-    body_timeout_s: float = Field(10.0, gt=0, allow_inf_nan=False)
+    body_timeout_s: float = Field(2.0, gt=0, allow_inf_nan=False)
     """[s] A client that takes longer to send its body is answered 408."""
 
     max_ongoing_requests: int = Field(256, ge=1)
-    """Requests one replica works on at once; beyond it Ray Serve answers 503."""
+    """Requests one replica holds at once; further ones wait for a place (hence the short `body_timeout_s`)."""
 
     docs: bool = True
     """Serve the interactive API documentation at /docs, from files that come with the server."""

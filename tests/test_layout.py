@@ -13,7 +13,7 @@ FOLDERS = ("envs", "export", "serve_app", "deploy")
 # The one file (or folder) that may import a heavy library, by top-level module.
 ONLY_IN = {
     "ray.rllib": ("export/checkpoint.py", "examples/"),
-    "ray.serve": ("serve_app/app.py", "serve_app/launcher.py"),
+    "ray.serve": ("serve_app/app.py",),
     "fastapi": ("serve_app/http.py", "serve_app/docs.py", "serve_app/app.py"),
     "mujoco": ("envs/",),
     "grpc": ("envs/robot_server/",),

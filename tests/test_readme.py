@@ -71,7 +71,7 @@ def test_commands_run_as_written(checkout: Path) -> None:
             time.sleep(0.5)
         answer = run(curl)
         assert re.search(r'"action":\[(-?[\d.e-]+,){4}-?[\d.e-]+\].*"policy":"ur5"', answer)
-        assert "20 of 20" in run(rollout)
+        assert "success: 20" in run(rollout)
         for block in blocks("python"):
             code = as_written(block).replace("action = policy.act(obs)", "print(policy.act([0.5] * 27).shape)")
             script = checkout / "block.py"
