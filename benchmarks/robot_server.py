@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import threading
 import time
@@ -94,23 +95,31 @@ def starts(count: int = 10) -> tuple[list[float], list[float]]:
     return started, killed
 
 
-def speed(line: str, seconds: float, *, is_ur: bool) -> list[float]:
-    """Return steps per second on the fast clock, a round each."""
+def speed(line: str, seconds: float, *, is_ur: bool) -> tuple[list[float], list[float]]:
+    """Return steps per second on the fast clock, and steps per second of the server's CPU time, a round each."""
     servers = RobotServers()
-    rounds = []
+    rounds, of_cpu = [], []
     try:
-        robot = Robot(servers.start(line), is_ur=is_ur)
+        port = servers.start(line)
+        robot, pid = Robot(port, is_ur=is_ur), servers.running[port]
         for _ in range(ROUNDS):
             robot.reset()
-            steps, began = 0, time.perf_counter()
+            steps, began, cpu_began = 0, time.perf_counter(), cpu_seconds(pid)
             while (elapsed := time.perf_counter() - began) < seconds:
                 for _ in range(20):
                     robot.step()
                 steps += 20
             rounds.append(steps / elapsed)
+            of_cpu.append(steps / (cpu_seconds(pid) - cpu_began))
     finally:
         servers.close()
-    return rounds
+    return rounds, of_cpu
+
+
+def cpu_seconds(pid: int) -> float:
+    """Return the CPU time that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def real_time(count: int, seconds: float) -> tuple[float, list[float]]:
@@ -157,13 +166,16 @@ def main() -> None:
     args = parser.parse_args()
 
     started, killed = starts()
-    ur, mir = speed(UR5 + "10", args.seconds, is_ur=True), speed(MIR100, args.seconds, is_ur=False)
+    ur, ur_cpu = speed(UR5 + "10", args.seconds, is_ur=True)
+    mir, mir_cpu = speed(MIR100, args.seconds, is_ur=False)
     together, rates = real_time(args.servers, max(args.seconds, 5.0))
     results = {
         "start_s": started,
         "kill_s": killed,
         "ur5_steps_per_s": ur,
+        "ur5_steps_per_server_cpu_s": ur_cpu,
         "mir100_steps_per_s": mir,
+        "mir100_steps_per_server_cpu_s": mir_cpu,
         "servers": args.servers,
         "start_together_s": together,
         "real_time_hz": rates,
@@ -174,7 +186,9 @@ def main() -> None:
     table.add_row("start a UR5 server [s]", f"{statistics.median(started):.2f}", f"{max(started):.2f}", "2")
     table.add_row("kill it [s]", f"{statistics.median(killed):.2f}", f"{max(killed):.2f}", "1")
     table.add_row("UR5 steps/s, fast clock", f"{statistics.median(ur):,.0f}", f"{min(ur):,.0f}", "1,000")
+    table.add_row("  per second of the server's CPU", f"{statistics.median(ur_cpu):,.0f}", f"{min(ur_cpu):,.0f}", "")
     table.add_row("MiR100 steps/s, fast clock", f"{statistics.median(mir):,.0f}", f"{min(mir):,.0f}", "500")
+    table.add_row("  per second of the server's CPU", f"{statistics.median(mir_cpu):,.0f}", f"{min(mir_cpu):,.0f}", "")
     table.add_row(f"start {args.servers} at once [s]", f"{together:.1f}", "", "")
     table.add_row(
         f"{args.servers} UR5s at {REAL_RATE_HZ} Hz, real clock [Hz]", f"{statistics.median(rates):.2f}",
