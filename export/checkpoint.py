@@ -34,7 +34,7 @@ from rlservo.export.heads import replace_heads
 from rlservo.export.location import CTOR_FILE, STATE_STEMS, CheckpointFiles
 from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf, parameter_count
 from rlservo.export.samples import Inputs, draw_batches
-from rlservo.export.trees import Tree, build, build_like, map_tree, named_leaves, space_leaves, tree_leaves
+from rlservo.export.trees import Tree, build, build_like, is_nested, map_tree, named_leaves, space_leaves, tree_leaves
 from rlservo.export.unpickle import explain, first_line, unpickle
 
 DISTRIBUTIONS: dict[str, DistributionKind] = {
@@ -156,14 +156,26 @@ class RllibLoop:
                 self._episodes[row].add_env_step(
                     observation=obs, action=action, reward=float(rewards[row]), extra_model_outputs=extra
                 )
-        batch, shared = self._pipelines.to_module(self._episodes)
+        # RLlib's log-probability of a nested deterministic action does not fit more than one environment (ray 2.60):
+        # there, it acts for one at a time.
+        alone = is_nested(self._recipe.action_space)
+        groups = [[row] for row in range(len(rows))] if alone else [list(range(len(rows)))]
+        self._last = []
+        found = [self._decide([self._episodes[row] for row in group]) for group in groups]
+        return {name: np.concatenate([one[name] for one in found]) for name in found[0]}
+
+    def _decide(self, episodes: list[Any]) -> dict[str, NDArray[Any]]:
+        """Return what RLlib computes for these episodes, and remember what they have to be told with the next step."""
+        batch, shared = self._pipelines.to_module(episodes)
         given = self._pipelines.forward(batch)
         outputs = self._outputs(batch, given)
-        sent = self._pipelines.to_env(given, self._episodes, shared)
+        sent = self._pipelines.to_env(given, episodes, shared)
         # The episodes remember the module's own actions; the environment gets those that have been scaled.
         own = sent.pop(Columns.ACTIONS)
         action = sent.pop(Columns.ACTIONS_FOR_ENV, own)
-        self._last = [(_pick(own, row), {key: values[row] for key, values in sent.items()}) for row in range(len(rows))]
+        self._last += [
+            (_pick(own, row), {key: values[row] for key, values in sent.items()}) for row in range(len(episodes))
+        ]
         named = {name: np.asarray(leaf) for name, leaf in named_leaves(action, "action").items()}
         return {**named, **outputs}
 

@@ -28,6 +28,11 @@ def children(space: Any) -> dict[Any, Any] | None:
     return None
 
 
+def is_nested(space: Any) -> bool:
+    """Return whether the space has parts that are arrays of their own."""
+    return isinstance(space, spaces.Dict | spaces.Tuple)
+
+
 def space_leaves(space: Any, name: str) -> dict[str, Any]:
     """Return every leaf space by its name, `name` itself or `name.<path>`, in RLlib's order.
 

@@ -20,6 +20,7 @@ from ray.rllib.algorithms.sac import SACConfig
 from ray.rllib.algorithms.tqc import TQCConfig
 from ray.rllib.connectors.env_to_module import FlattenObservations, MeanStdFilter, PrevActionsPrevRewards
 from ray.rllib.connectors.env_to_module.frame_stacking import FrameStackingEnvToModule
+from ray.rllib.connectors.learner.frame_stacking import FrameStackingLearner
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
@@ -54,6 +55,10 @@ def stacked() -> Any:
 
 
 
+
+
+def stacked_for_learning(input_observation_space: Any, input_action_space: Any, device: Any = None) -> Any:
+    return FrameStackingLearner(num_frames=3)
 
 
 def spaces_env(config: Any, obs: str, action: str, *before: Any, after: Any = None, **runners: Any) -> Any:
@@ -105,7 +110,7 @@ def configurations() -> dict[str, Any]:
         "greedy_module": ppo("dict", "discrete", spec=RLModuleSpec(module_class=zoo_spaces.GreedyModule)),
         "image": ppo("image", "discrete", model=CNN),
         "byte_image": ppo("byte_image", "discrete", spec=RLModuleSpec(module_class=zoo_spaces.ByteImageModule)),
-        "stacked": ppo("gray", "discrete", stacked, model=CNN),
+        "stacked": ppo("gray", "discrete", stacked, model=CNN).learners(learner_connector=stacked_for_learning),
         "act_multi_discrete": ppo("vector", "multi_discrete"),
         "act_dict": ppo("vector", "dict"),
         "act_tuple": ppo("vector", "tuple"),
