@@ -468,7 +468,7 @@ def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapp
     arrays = {f"input/{name}": value for name, value in inputs.items()}
     arrays.update({f"output/{name}": value for name, value in outputs.items()})
     # `allow_pickle` would be one more array to numpy before 2.1; load_bundle refuses pickled ones.
-    np.savez_compressed(folder / GOLDEN_FILE, **arrays)
+    np.savez_compressed(folder / GOLDEN_FILE, **arrays)  # type: ignore[arg-type]  # for numpy 2's keyword above
 
 
 def write_contract(folder: Path, contract: Contract) -> None:

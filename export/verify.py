@@ -143,7 +143,7 @@ def _evaluate(
             [_episode(env, start(), recipe, first_seed + number) for number in range(episodes)] for start in drivers
         ]
     finally:
-        env.close()  # type: ignore[no-untyped-call]  # gymnasium 1.2 leaves it unannotated
+        env.close()
     returns = [float(np.mean([one.reward for one in run])) for run in runs]
     success = [_success_rate(run) for run in runs]
     return Evaluation(

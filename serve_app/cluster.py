@@ -96,7 +96,7 @@ def _watch_input(stop: threading.Event, started: threading.Event, plan: dict[str
 
 def _leave_nothing(plan: dict[str, Any]) -> None:
     """End what is left and remove the folder. The launcher does the same, unless it was killed."""
-    end_marked(plan["mark"])
+    end_marked(plan["mark"], os.getsid(0))
     remove_folder(Path(plan["folder"]))
 
 

@@ -212,7 +212,7 @@ def _child(
     finally:
         if child.stdin is not None:
             child.stdin.close()
-        if left := end_marked(mark):
+        if left := end_marked(mark, child.pid):
             logger.error("processes %s of the server would not end", left)
         child.wait()
         reader.join()
