@@ -111,7 +111,7 @@ class ActionNode(nn.Module):
     def forward(self, parameters: Tensor) -> tuple[Tensor, ...]:
         """Return one tensor per action leaf, given the distribution's parameters (or Q-values) `[batch, n]`."""
         parts = [parameters] if len(self.widths) == 1 else torch.split(parameters, self.widths, dim=-1)
-        return self.finish([leaf.choose(part) for leaf, part in zip(self.leaves, parts, strict=True)])
+        return self.finish([leaf.choose(part) for leaf, part in zip(self._leaves(), parts, strict=True)])
 
     def finish(self, chosen: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Return what goes to the environment, given the leaves the policy chose."""
@@ -120,7 +120,10 @@ class ActionNode(nn.Module):
             for function in self.user_steps:
                 tree = function(tree)
             chosen = list(named_leaves(tree, "action").values())
-        return tuple(leaf.finish(one) for leaf, one in zip(self.leaves, chosen, strict=True))
+        return tuple(leaf.finish(one) for leaf, one in zip(self._leaves(), chosen, strict=True))
+
+    def _leaves(self) -> list[ActionLeaf]:
+        return [leaf for leaf in self.leaves if isinstance(leaf, ActionLeaf)]
 
 
 class ActionLeaf(nn.Module):

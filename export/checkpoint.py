@@ -344,8 +344,9 @@ def _action_rule(
 ) -> tuple[DistributionKind | None, Mode, tuple[str, ...]]:
     """Return the distribution's kind, how its mode is computed and the outputs' names, by asking the class."""
     name = type(module).__name__
-    if isinstance(module, QNetAPI) and Columns.ACTION_DIST_INPUTS not in given:
-        return None, "argmax", ("q_values",)  # DQN; SAC's module has Q-values, too, but gives a distribution
+    has_q_values = isinstance(module, QNetAPI)  # SAC's module has them, too, but gives a distribution
+    if has_q_values and Columns.ACTION_DIST_INPUTS not in given:
+        return None, "argmax", ("q_values",)
     if Columns.ACTIONS in given:
         notify(f"module {name} computes its actions itself: the export does the same, and cannot explore")
         return None, "given", ()

@@ -184,7 +184,7 @@ def _user_step(piece: Any, pipeline: str, consequence: str) -> UserStep:
 
 
 def _filter(piece: Any, space: Any) -> ObservationFilter:
-    if isinstance(space, Box) and space.dtype.kind == "u":
+    if isinstance(space, Box) and np.dtype(space.dtype).kind == "u":
         raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib's result has no sign there and wraps")
     if not isinstance(space, Box | MultiBinary):
         raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib filters single arrays")

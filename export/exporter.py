@@ -42,6 +42,7 @@ from rlservo.export.recipe import Recipe
 from rlservo.export.samples import BATCH_SIZES, Inputs, draw_batches
 from rlservo.export.spaces import space_spec, state_spec
 from rlservo.export.steps import baked_steps
+from rlservo.export.threads import one_thread
 from rlservo.export.unpickle import user_code
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ def export_checkpoint(
         target = choose_target(Path(out), name, version)
         restored = _load(files, notify, value)
         elements = read_elements(facts.env_id, facts.env_config, restored.recipe, notify)
-        with _temporary_folder(target) as folder, _one_thread():
+        with _temporary_folder(target) as folder, one_thread():
             parity, golden = _write_graphs(folder, restored, [element.name for element in elements.action])
             recipe = restored.recipe
             contract = Contract(
@@ -141,19 +142,6 @@ def _temporary_folder(target: Path) -> Iterator[Path]:
         for parent in made:
             with contextlib.suppress(OSError):  # not empty: the export succeeded
                 parent.rmdir()
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch compute on one thread: for networks of this size a second one costs more than it brings."""
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ class FlattenNode(ObservationNode):
         ]
         self.codes: list[Callable[[Tensor], Tensor]] = [_code(leaf) for leaf in kept]
 
-    def forward(self, obs: Tree, _memory: dict[str, Tensor]) -> Tree:
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
         if self.without:
             obs = {key: value for key, value in obs.items() if key not in self.without}
         parts = [code(leaf) for code, leaf in zip(self.codes, tree_leaves(obs), strict=True)]
@@ -117,7 +117,7 @@ class FilterNode(ObservationNode):
         self.register_buffer("scale", torch.tensor(scale, dtype=dtype))
         self.register_buffer("divisor", torch.tensor(frozen.divisor(), dtype=dtype))
 
-    def forward(self, obs: Tree, _memory: dict[str, Tensor]) -> Tree:
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
         if self.integer is not None:
             obs = (obs.double() - self.offset) / self.divisor
         else:
@@ -171,7 +171,7 @@ class UserNode(ObservationNode):
         super().__init__()
         self.function = step.function
 
-    def forward(self, obs: Tree, _memory: dict[str, Tensor]) -> Tree:
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
         return self.function(obs)
 
 

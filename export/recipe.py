@@ -92,7 +92,7 @@ class UserStep:
 ObservationStep: TypeAlias = ObservationFilter | Flatten | FrameStack | Previous | UserStep
 
 Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax", "given"]
-"""How the deterministic action comes out of the distribution's parameters (argmax: or of Q-values; given: not at all)."""
+"""How the deterministic action comes out of the distribution's parameters (or Q-values), or that it is given."""
 
 Transform: TypeAlias = Literal["none", "unsquash", "clip"]
 """What RLlib does to that action before `env.step`; Box leaves that are not bounded all round are not unsquashed."""

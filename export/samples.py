@@ -97,9 +97,9 @@ def _draw(kind: str, leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArra
     if isinstance(space, MultiBinary):
         return rng.integers(0, 2, (size, *space.shape)).astype(space.dtype)
     assert isinstance(space, Box)
-    if space.dtype.kind in "iu":
+    if np.dtype(space.dtype).kind in "iu":
         return _integers(kind, space, rng, size)
-    if space.dtype.kind == "b":
+    if np.dtype(space.dtype).kind == "b":
         return np.asarray(rng.random((size, *space.shape)) < 0.5)
     return KINDS[kind](leaf, rng, size).astype(space.dtype)
 

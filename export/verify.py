@@ -23,6 +23,7 @@ from rlservo.export.location import locate_checkpoint
 from rlservo.export.parity import GraphLoop, Loop, prove, record
 from rlservo.export.recipe import Recipe
 from rlservo.export.samples import draw_batches
+from rlservo.export.threads import one_thread
 from rlservo.export.trees import build, named_leaves, space_leaves
 from rlservo.export.unpickle import first_line, user_code
 
@@ -64,7 +65,7 @@ def verify_bundle(
     same = files.sha256() == loaded.contract.provenance.checkpoint_sha256
     if not same:
         notify("the bundle was exported from another checkpoint: expect a difference")
-    with user_code(app_dir):
+    with user_code(app_dir), one_thread():
         from rlservo.export.checkpoint import load_checkpoint
 
         has_value = any(output.name == "value" for output in loaded.contract.outputs)
@@ -174,8 +175,8 @@ def _episode(env: gymnasium.Env[Any, Any], loop: Loop, recipe: Recipe, seed: int
             inputs["reward"] = np.array([reward], np.float32)
         outputs = loop.step(inputs, np.array([first]))
         action = build(recipe.action_space, [_sent(outputs[name][0]) for name in recipe.action_leaves])
-        obs, reward, terminated, truncated, info = env.step(action)
-        reward, first = float(reward), False
+        obs, earned, terminated, truncated, info = env.step(action)
+        reward, first = float(earned), False
         total += reward
         done = terminated or truncated
     return _Episode(total, _succeeded(info))

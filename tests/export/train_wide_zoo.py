@@ -1,6 +1,6 @@
 """The wider zoo: spaces, recurrent policies, connectors and algorithms. See train_zoo.py, whose tools it uses.
 
-    python train_wide_zoo.py OUT [NAME...]
+python train_wide_zoo.py OUT [NAME...]
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import ray
 from ray import tune
 from ray.rllib.algorithms.appo import APPOConfig
@@ -28,8 +27,8 @@ from ray.rllib.examples.rl_modules.classes.autoregressive_actions_rlm import Aut
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "app"), str(HERE)]
-import zoo_spaces  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
-from train_zoo import record  # pyright: ignore[reportMissingImports]
+import zoo_spaces  # noqa: E402  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
+from train_zoo import record  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 SMALL = DefaultModelConfig(fcnet_hiddens=[16])
 LSTM = DefaultModelConfig(fcnet_hiddens=[8], use_lstm=True, lstm_cell_size=8, max_seq_len=10)
@@ -53,10 +52,6 @@ def stacked() -> Any:
     return FrameStackingEnvToModule(num_frames=3)
 
 
-
-
-
-
 def stacked_for_learning(input_observation_space: Any, input_action_space: Any, device: Any = None) -> Any:
     return FrameStackingLearner(num_frames=3)
 
@@ -73,7 +68,7 @@ def spaces_env(config: Any, obs: str, action: str, *before: Any, after: Any = No
 
 def ppo(obs: str, action: str, *before: Any, model: Any = SMALL, spec: Any = None, after: Any = None) -> Any:
     config = spaces_env(PPOConfig(), obs, action, *before, after=after)
-    config.training(train_batch_size=128, minibatch_size=64, num_epochs=1)
+    config.training(train_batch_size=64, minibatch_size=32, num_epochs=1)
     return config.rl_module(rl_module_spec=spec) if spec else config.rl_module(model_config=model)
 
 
@@ -88,13 +83,15 @@ def configurations() -> dict[str, Any]:
     flat = FlattenObservations
     impala = spaces_env(IMPALAConfig(), "vector", "box").learners(num_learners=0).rl_module(model_config=SMALL)
     appo = spaces_env(APPOConfig(), "vector", "multi_discrete").learners(num_learners=0).rl_module(model_config=LSTM)
+    gru = RLModuleSpec(module_class=zoo_spaces.GruModule, model_config={"max_seq_len": 10})
+    episodes = {"type": "EpisodeReplayBuffer", "capacity": 1000}
     masking = RLModuleSpec(module_class=ActionMaskingTorchRLModule, model_config={"head_fcnet_hiddens": [8]})
     return {
         "lstm_box": ppo("vector", "box", MeanStdFilter, model=LSTM),
         "lstm_discrete": ppo("vector", "discrete", model=LSTM),
         "lstm_previous": ppo("vector", "discrete", previous, flat, model=LSTM),
         "previous": ppo("discrete", "discrete", previous, flat),
-        "user_gru": ppo("vector", "discrete", spec=RLModuleSpec(module_class=zoo_spaces.GruModule, model_config={"max_seq_len": 10})),
+        "user_gru": ppo("vector", "discrete", spec=gru),
         "appo_lstm": appo.training(train_batch_size_per_learner=64),
         "obs_discrete": ppo("discrete", "box", flat),
         "obs_below_zero": ppo("below_zero", "discrete", flat),
@@ -126,35 +123,27 @@ def configurations() -> dict[str, Any]:
         "dqn_plain": off_policy(DQNConfig(), "vector", "discrete", dueling=False, double_q=False),
         "dqn_distributional": off_policy(DQNConfig(), "dict", "discrete", flat, num_atoms=5, v_min=-3.0, v_max=3.0),
         "dqn_distributional_plain": off_policy(DQNConfig(), "vector", "discrete", dueling=False, num_atoms=5),
-        "dqn_lstm": off_policy(DQNConfig(), "vector", "discrete", model=LSTM, replay_buffer_config={"type": "EpisodeReplayBuffer", "capacity": 1000}),
+        "dqn_lstm": off_policy(DQNConfig(), "vector", "discrete", model=LSTM, replay_buffer_config=episodes),
     }  # fmt: skip
 
 
 def main(out: Path, only: list[str]) -> None:
-    zoo_spaces.ACTIONS["autoregressive"] = zoo_spaces.Tuple((zoo_spaces.Discrete(3), zoo_spaces.Box(-1.0, 1.0, (1,))))
     tune.register_env("spaces", zoo_spaces.Spaces)
     ray.init(num_cpus=1, include_dashboard=False, _temp_dir=str(out / "ray"), configure_logging=False)
-    failed = []
     try:
         for name, config in configurations().items():
             if only and name not in only:
                 continue
-            try:
-                algorithm = config.build_algo()
-                algorithm.train()
-                algorithm.save_to_path(str(out / name))
-                algorithm.restore_from_path(str(out / name))
-                record(algorithm, out / f"{name}.npz")
-                algorithm.stop()
-                print(name, flush=True)
-            except Exception as e:
-                import traceback
-                traceback.print_exc()
-                print("FAILED", name, type(e), str(e)[:200], flush=True)
-                failed.append(name)
+            algorithm = config.build_algo()
+            algorithm.train()
+            algorithm.save_to_path(str(out / name))
+            # An environment runner may lag behind its learner, and the checkpoint holds the learner's weights.
+            algorithm.restore_from_path(str(out / name))
+            record(algorithm, out / f"{name}.npz")
+            algorithm.stop()
+            print(name, flush=True)
     finally:
         ray.shutdown()
-    print("failed:", failed)
 
 
 if __name__ == "__main__":
