@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.connector_pipeline_v2 import ConnectorPipelineV2
 from ray.rllib.connectors.env_to_module.env_to_module_pipeline import EnvToModulePipeline
 from ray.rllib.connectors.module_to_env.module_to_env_pipeline import ModuleToEnvPipeline
@@ -25,11 +26,13 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.apis import InferenceOnlyAPI, QNetAPI, ValueFunctionAPI
 from ray.rllib.core.rl_module.rl_module import RLModule
 from ray.rllib.core.rl_module.torch import TorchRLModule
+from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from torch import Tensor, nn
 
 from rlservo.export.connectors import check_spaces, read_action_steps, read_observation_steps
 from rlservo.export.errors import CheckpointError, UnsupportedError
+from rlservo.export.facts import read_config
 from rlservo.export.heads import replace_heads
 from rlservo.export.location import CTOR_FILE, STATE_STEMS, CheckpointFiles
 from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf, parameter_count
@@ -44,6 +47,17 @@ DISTRIBUTIONS: dict[str, DistributionKind] = {
     "TorchMultiCategorical": "multi_categorical",
     "TorchMultiDistribution": "multi",
 }
+PIPELINE_SETTINGS = (
+    "normalize_actions",
+    "clip_actions",
+    "_env_to_module_connector",
+    "_module_to_env_connector",
+    "add_default_connectors_to_env_to_module_pipeline",
+    "add_default_connectors_to_module_to_env_pipeline",
+    "observation_space",
+    "action_space",
+)
+"""What of an algorithm's configuration decides its connector pipelines (ray 2.60)."""
 QF_PREDS = "qf_preds"  # DQN's key for the Q-values, in ray/rllib/algorithms/dqn/default_dqn_rl_module.py
 
 
@@ -241,11 +255,12 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
 
     Raises CheckpointError when it cannot be read, UnsupportedError when exporting it would lose something.
     """
-    for folder in (files.module, files.env_to_module, files.module_to_env):
-        unpickle(folder / CTOR_FILE)  # RLlib's own loader hides a missing class behind an unrelated error
     module: Any = _restore(RLModule, files.module)
-    env_to_module: Any = _restore(EnvToModulePipeline, files.env_to_module)
-    module_to_env: Any = _restore(ModuleToEnvPipeline, files.module_to_env)
+    if files.has_pipelines:
+        env_to_module: Any = _restore(EnvToModulePipeline, files.env_to_module)
+        module_to_env: Any = _restore(ModuleToEnvPipeline, files.module_to_env)
+    else:
+        env_to_module, module_to_env = _build_pipelines(files, module, notify)
 
     name = type(module).__name__
     if not isinstance(module, TorchRLModule):
@@ -291,7 +306,40 @@ def _tell(recipe: Recipe, notify: Callable[[str], None]) -> None:
         notify("the policy was trained with previous rewards: the graph has an input 'reward', 0 at an episode's start")
 
 
+def _build_pipelines(files: CheckpointFiles, module: Any, notify: Callable[[str], None]) -> tuple[Any, Any]:
+    """Return the pipelines RLlib would build for this policy, where none were saved.
+
+    From the algorithm's configuration; of a module alone, RLlib's default ones around the module's own spaces.
+    """
+    config: Any = AlgorithmConfig()
+    if files.alone:
+        notify(
+            f"{files.root} is an RLModule alone: the observation is what the module itself reads, so a filter, one-hot "
+            "or other step before it is NOT in the export; its actions are unsquashed to the bounds as RLlib does by "
+            "default"
+        )
+    else:
+        given = read_config(unpickle(files.root / CTOR_FILE).get("ctor_args_and_kwargs"))
+        for name in PIPELINE_SETTINGS:
+            if name in given:
+                setattr(config, name, given[name])
+        notify(
+            "the checkpoint has no environment runner (recorded data): the pipelines are built from its configuration"
+        )
+    spaces = (config.observation_space or module.observation_space, config.action_space or module.action_space)
+    try:
+        return (
+            config.build_env_to_module_connector(spaces={INPUT_ENV_SINGLE_SPACES: spaces, INPUT_ENV_SPACES: spaces}),
+            config.build_module_to_env_connector(spaces={INPUT_ENV_SINGLE_SPACES: spaces, INPUT_ENV_SPACES: spaces}),
+        )
+    except Exception as error:  # the user's own functions may raise anything
+        raise CheckpointError(
+            f"{files.root}: the connector pipelines cannot be built from its configuration: {explain(error)}"
+        ) from error
+
+
 def _restore(kind: Any, folder: Path) -> Any:
+    unpickle(folder / CTOR_FILE)  # RLlib's own loader hides a missing class behind an unrelated error
     deprecation = logging.getLogger("ray._common.deprecation")
     deprecation.addFilter(_not_rllibs_own)
     try:

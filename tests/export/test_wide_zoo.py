@@ -35,6 +35,7 @@ STATELESS = [
     "obs_integers_filtered_first", "obs_bytes", "obs_dict", "obs_tuple", "obs_nested", "dict_module", "greedy_module",
     "image", "byte_image", "act_multi_discrete", "act_dict", "act_tuple", "masked", "autoregressive", "scaled",
     "halved", "impala", "sac_discrete", "tqc", "dqn_plain", "dqn_distributional", "dqn_distributional_plain",
+    "bc", "marwil", "cql", "iql",
 ]  # fmt: skip
 # RLlib's own classes and zoo environments, on the way from a checkpoint to the contract.
 pytestmark = pytest.mark.filterwarnings("ignore:.*PPOTorchRLModule.*:DeprecationWarning")

@@ -9,11 +9,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow.parquet
 import ray
 from ray import tune
 from ray.rllib.algorithms.appo import APPOConfig
+from ray.rllib.algorithms.bc import BCConfig
+from ray.rllib.algorithms.cql import CQLConfig
 from ray.rllib.algorithms.dqn import DQNConfig
 from ray.rllib.algorithms.impala import IMPALAConfig
+from ray.rllib.algorithms.iql import IQLConfig
+from ray.rllib.algorithms.marwil import MARWILConfig
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.algorithms.sac import SACConfig
 from ray.rllib.algorithms.tqc import TQCConfig
@@ -79,8 +85,43 @@ def off_policy(config: Any, obs: str, action: str, *before: Any, model: Any = SM
     return config.rl_module(model_config=model)
 
 
-def configurations() -> dict[str, Any]:
+def recorded(folder: Path, action: str) -> str:
+    """Write six random episodes as the rows RLlib's offline algorithms read; return their folder."""
+    env = zoo_spaces.Spaces({"obs": "vector", "action": action})
+    env.action_space.seed(0)
+    rows: list[dict[str, Any]] = []
+    for episode in range(6):
+        obs, done = env.reset(seed=episode)[0], False
+        while not done:
+            chosen = env.action_space.sample()
+            after, reward, done, _, _ = env.step(chosen)
+            row = {"eps_id": str(episode), "obs": obs.tolist(), "actions": np.asarray(chosen).tolist()}
+            rows.append({**row, "rewards": reward, "new_obs": after.tolist(), "terminateds": done, "truncateds": False})
+            obs = after
+    target = folder / f"recorded_{action}"
+    target.mkdir(exist_ok=True)
+    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), str(target / "rows.parquet"))
+    return str(target)
+
+
+def offline(config: Any, data: str, action: str, **training: Any) -> Any:
+    env = zoo_spaces.Spaces({"obs": "vector", "action": action})
+    spaces_env(config, "vector", action)
+    config.environment(observation_space=env.observation_space, action_space=env.action_space)
+    config.offline_data(
+        input_=[data],
+        dataset_num_iters_per_learner=1,
+        map_batches_kwargs={"concurrency": 1, "num_cpus": 0.5},
+        iter_batches_kwargs={"prefetch_batches": 0},
+    )
+    config.evaluation(evaluation_interval=1, evaluation_num_env_runners=0, evaluation_duration=1)
+    config.learners(num_learners=0).training(train_batch_size_per_learner=32, **training)
+    return config.rl_module(model_config=SMALL)
+
+
+def configurations(out: Path) -> dict[str, Any]:
     flat = FlattenObservations
+    choices, numbers = (recorded(out, action) for action in ("discrete", "box"))
     impala = spaces_env(IMPALAConfig(), "vector", "box").learners(num_learners=0).rl_module(model_config=SMALL)
     appo = spaces_env(APPOConfig(), "vector", "multi_discrete").learners(num_learners=0).rl_module(model_config=LSTM)
     gru = RLModuleSpec(module_class=zoo_spaces.GruModule, model_config={"max_seq_len": 10})
@@ -117,6 +158,10 @@ def configurations() -> dict[str, Any]:
         "scaled": ppo("vector", "discrete", zoo_spaces.Scaled),
         "wrongly_scaled": ppo("vector", "discrete", zoo_spaces.WronglyScaled),
         "halved": ppo("vector", "box", after=zoo_spaces.Halved),
+        "bc": offline(BCConfig(), choices, "discrete"),
+        "marwil": offline(MARWILConfig(), numbers, "box"),
+        "cql": offline(CQLConfig(), numbers, "box", lr=None),
+        "iql": offline(IQLConfig(), numbers, "box"),
         "impala": impala.training(train_batch_size_per_learner=64),
         "sac_discrete": off_policy(SACConfig(), "vector", "discrete"),
         "tqc": off_policy(TQCConfig(), "vector", "box", MeanStdFilter),
@@ -129,16 +174,17 @@ def configurations() -> dict[str, Any]:
 
 def main(out: Path, only: list[str]) -> None:
     tune.register_env("spaces", zoo_spaces.Spaces)
-    ray.init(num_cpus=1, include_dashboard=False, _temp_dir=str(out / "ray"), configure_logging=False)
+    ray.init(num_cpus=2, include_dashboard=False, _temp_dir=str(out / "ray"), configure_logging=False)
     try:
-        for name, config in configurations().items():
+        for name, config in configurations(out).items():
             if only and name not in only:
                 continue
             algorithm = config.build_algo()
             algorithm.train()
             algorithm.save_to_path(str(out / name))
             # An environment runner may lag behind its learner, and the checkpoint holds the learner's weights.
-            algorithm.restore_from_path(str(out / name))
+            if algorithm.env_runner is not None:
+                algorithm.restore_from_path(str(out / name))
             record(algorithm, out / f"{name}.npz")
             algorithm.stop()
             print(name, flush=True)
