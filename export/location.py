@@ -15,8 +15,10 @@ from pathlib import Path
 from rlservo.export.errors import CheckpointError, UnsupportedError
 
 MODULES = Path("learner_group") / "learner" / "rl_module"
-ENV_TO_MODULE = Path("env_runner") / "env_to_module_connector"
-MODULE_TO_ENV = Path("env_runner") / "module_to_env_connector"
+RUNNERS = ("env_runner", "eval_env_runner")
+"""Where the connectors are; an algorithm that trains from recorded data has a runner only if it was evaluated."""
+ENV_TO_MODULE = "env_to_module_connector"
+MODULE_TO_ENV = "module_to_env_connector"
 CTOR_FILE = "class_and_ctor_args.pkl"
 STATE_STEMS = {"module": "module_state", "connector": "state"}
 STATE_SUFFIXES = (".pkl", ".msgpack")
@@ -31,7 +33,7 @@ _TUNE_CHECKPOINT = re.compile(r"checkpoint_(\d{6,})")
 class CheckpointFiles:
     """The folders of one policy in one new-stack algorithm checkpoint, or of one RLModule alone.
 
-    An algorithm that trains from recorded data has no environment runner, and then no connector folders either.
+    An algorithm that trains from recorded data may have no environment runner, and then no connector folders either.
     """
 
     root: Path
@@ -43,17 +45,22 @@ class CheckpointFiles:
         return self.root if self.alone else self.root / MODULES / self.module_id
 
     @property
+    def runner(self) -> Path:
+        """The environment runner's folder, which holds the connector pipelines; it may not exist."""
+        return next((self.root / name for name in RUNNERS if (self.root / name).is_dir()), self.root / RUNNERS[0])
+
+    @property
     def has_pipelines(self) -> bool:
         """Whether the checkpoint holds the connector pipelines, with what they have learned."""
-        return (self.root / ENV_TO_MODULE.parent).is_dir()
+        return self.runner.is_dir()
 
     @property
     def env_to_module(self) -> Path:
-        return self.root / ENV_TO_MODULE
+        return self.runner / ENV_TO_MODULE
 
     @property
     def module_to_env(self) -> Path:
-        return self.root / MODULE_TO_ENV
+        return self.runner / MODULE_TO_ENV
 
     def files(self) -> list[Path]:
         """Return every file that decides what the policy does, in a fixed order."""
@@ -178,7 +185,7 @@ def _check_complete(files: CheckpointFiles) -> None:
         needed += pipelines
     elif not files.alone and not (files.root / CTOR_FILE).is_file():
         raise CheckpointError(
-            f"{files.root} is incomplete: it has neither {ENV_TO_MODULE.parent}/ (the connector pipelines) nor "
+            f"{files.root} is incomplete: it has neither {RUNNERS[0]}/ (the connector pipelines) nor "
             f"{CTOR_FILE} (the configuration they are built from)"
         )
     for folder, stem, what in needed:

@@ -110,7 +110,7 @@ def offline(config: Any, data: str, action: str, **training: Any) -> Any:
     config.environment(observation_space=env.observation_space, action_space=env.action_space)
     config.offline_data(
         input_=[data],
-        dataset_num_iters_per_learner=1,
+        dataset_num_iters_per_learner=2,  # CQL's training step takes no batch, only an iterator (ray 2.60)
         map_batches_kwargs={"concurrency": 1, "num_cpus": 0.5},
         iter_batches_kwargs={"prefetch_batches": 0},
     )

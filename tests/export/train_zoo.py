@@ -95,9 +95,8 @@ def configurations() -> dict[str, Any]:
 def record(algorithm: Any, file: Path) -> None:
     """Let RLlib roll out by itself and write down what went in and out of the environment."""
     runner = algorithm.env_runner
-    if runner is None:  # an algorithm that trains from recorded data acts only when it is evaluated
+    if runner is None:  # an algorithm that trains from recorded data acts only when it is evaluated, after training
         runner = algorithm.eval_env_runner
-        runner.module.set_state(algorithm.get_module().get_state())
     for piece in runner._env_to_module.connectors:
         if isinstance(piece, MeanStdFilter):
             piece._update_stats = False
