@@ -42,6 +42,13 @@ class Rate(str, Enum):
     max = "max"
 
 
+class Pick(str, Enum):
+    """Which end of a metric is the better one."""
+
+    max = "max"
+    min = "min"
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document for programs.")]
 
 
@@ -99,16 +106,27 @@ def export(
     description: Annotated[str, typer.Option(help="A sentence for people, kept in the contract.")] = "",
     module_id: Annotated[str | None, typer.Option(help="Which RLModule; needed when there are several.")] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+    metric: Annotated[
+        str | None, typer.Option(help="Of a Tune trial or experiment, the checkpoint with the best of this metric.")
+    ] = None,
+    mode: Annotated[Pick, typer.Option(help="Whether the best is the largest or the smallest.")] = Pick.max,
     as_json: Json = False,
 ) -> None:
     """Turn an RLlib checkpoint into a policy bundle, proven equal to RLlib's own actions, or write nothing.
 
-    Example: `rlservo export examples/checkpoints/ur5_positioning --out policies`
+    Examples: `rlservo export examples/checkpoints/ur5_positioning --out policies`,
+    `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
     """
     with _extra("train"):
-        from rlservo.export.exporter import export_checkpoint
+        from rlservo.export.experiment import best_checkpoint
+        from rlservo.export.exporter import LOADING_RUNS_CODE, export_checkpoint
         from rlservo.export.report import export_report
 
+    if metric is not None:
+        _note(LOADING_RUNS_CODE.format(path=checkpoint))
+        best = best_checkpoint(checkpoint, metric, mode.value, app_dir=app_dir, notify=_note)
+        _note(f"{best.path} has the {mode.value} {metric}: {best.score:g}")
+        checkpoint = best.path
     result = export_checkpoint(
         checkpoint,
         out,

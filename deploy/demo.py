@@ -20,7 +20,6 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from typing_extensions import Self
@@ -111,7 +110,7 @@ class _Recorder:
     def contract(self) -> Contract:
         return self._policy.contract
 
-    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> NDArray[Any]:
+    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> Any:
         self._traces[-1].append(float(np.asarray(obs)[0]))  # both robots' first element is the distance to the target
         return self._policy.act(obs, explore=explore, seed=seed)
 

@@ -44,7 +44,7 @@ def read_facts(root: Path, notify: Callable[[str], None]) -> CheckpointFacts:
     config: Mapping[str, Any] = {}
     if (opened := _open(root / CTOR_FILE, "algorithm and environment", notify)) is not None:
         algorithm = getattr(opened.get("class"), "__name__", "unknown")
-        config = _config(opened.get("ctor_args_and_kwargs"))
+        config = read_config(opened.get("ctor_args_and_kwargs"))
     state = _open(root / "algorithm_state.pkl", "training progress", notify) or {}
     stats = state.get("metrics_logger", {}).get("stats", {})
     return CheckpointFacts(
@@ -76,7 +76,7 @@ def _open(file: Path, what: str, notify: Callable[[str], None]) -> dict[str, Any
     return opened if isinstance(opened, dict) else None
 
 
-def _config(ctor_args_and_kwargs: Any) -> Mapping[str, Any]:
+def read_config(ctor_args_and_kwargs: Any) -> Mapping[str, Any]:
     """Return the algorithm's configuration as a mapping, wherever RLlib put it among the constructor's arguments."""
     if not isinstance(ctor_args_and_kwargs, tuple) or len(ctor_args_and_kwargs) != 2:
         return {}
@@ -84,7 +84,7 @@ def _config(ctor_args_and_kwargs: Any) -> Mapping[str, Any]:
     config = kwargs.get("config", args[0] if args else {})
     if isinstance(config, Mapping):
         return config
-    return {name: getattr(config, name, None) for name in ("env", "env_config")}
+    return dict(vars(config))
 
 
 def _env_name(env: Any) -> str | None:

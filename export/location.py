@@ -15,11 +15,14 @@ from pathlib import Path
 from rlservo.export.errors import CheckpointError, UnsupportedError
 
 MODULES = Path("learner_group") / "learner" / "rl_module"
-ENV_TO_MODULE = Path("env_runner") / "env_to_module_connector"
-MODULE_TO_ENV = Path("env_runner") / "module_to_env_connector"
+RUNNERS = ("env_runner", "eval_env_runner")
+"""Where the connectors are; an algorithm that trains from recorded data has a runner only if it was evaluated."""
+ENV_TO_MODULE = "env_to_module_connector"
+MODULE_TO_ENV = "module_to_env_connector"
 CTOR_FILE = "class_and_ctor_args.pkl"
 STATE_STEMS = {"module": "module_state", "connector": "state"}
 STATE_SUFFIXES = (".pkl", ".msgpack")
+DEFAULT_MODULE = "default_policy"
 FACTS_FILE = "rlservo_facts.json"
 """Written by `prune.py` in place of RLlib's own configuration pickles."""
 
@@ -28,27 +31,44 @@ _TUNE_CHECKPOINT = re.compile(r"checkpoint_(\d{6,})")
 
 @dataclass(frozen=True)
 class CheckpointFiles:
-    """The folders of one policy in one new-stack algorithm checkpoint; all of them exist."""
+    """The folders of one policy in one new-stack algorithm checkpoint, or of one RLModule alone.
+
+    An algorithm that trains from recorded data may have no environment runner, and then no connector folders either.
+    """
 
     root: Path
     module_id: str
+    alone: bool = False
 
     @property
     def module(self) -> Path:
-        return self.root / MODULES / self.module_id
+        return self.root if self.alone else self.root / MODULES / self.module_id
+
+    @property
+    def runner(self) -> Path:
+        """The environment runner's folder, which holds the connector pipelines; it may not exist."""
+        return next((self.root / name for name in RUNNERS if (self.root / name).is_dir()), self.root / RUNNERS[0])
+
+    @property
+    def has_pipelines(self) -> bool:
+        """Whether the checkpoint holds the connector pipelines, with what they have learned."""
+        return self.runner.is_dir()
 
     @property
     def env_to_module(self) -> Path:
-        return self.root / ENV_TO_MODULE
+        return self.runner / ENV_TO_MODULE
 
     @property
     def module_to_env(self) -> Path:
-        return self.root / MODULE_TO_ENV
+        return self.runner / MODULE_TO_ENV
 
     def files(self) -> list[Path]:
         """Return every file that decides what the policy does, in a fixed order."""
         folders = (self.module, self.env_to_module, self.module_to_env)
-        return sorted(file for folder in folders for file in folder.rglob("*") if file.is_file())
+        found = {file for folder in folders for file in folder.rglob("*") if file.is_file()}
+        if not self.has_pipelines and not self.alone:
+            found.add(self.root / CTOR_FILE)  # the configuration they are built from
+        return sorted(found)
 
     def sha256(self) -> str:
         """Return a hash over those files' names and contents: the same for a checkpoint and its pruned copy."""
@@ -73,6 +93,10 @@ def locate_checkpoint(path: str | Path, module_id: str | None = None) -> Checkpo
     if not given.is_dir():
         raise CheckpointError(f"{given} is a file: expected the folder of an RLlib checkpoint")
     root = _find_root(given)
+    if _is_module(root):
+        alone = CheckpointFiles(root, module_id or DEFAULT_MODULE, alone=True)
+        _check_complete(alone)
+        return alone
     if root != given and (root / MODULES) in given.parents and module_id is None:
         module_id = given.relative_to(root / MODULES).parts[0]
     files = CheckpointFiles(root, _choose_module(root, module_id))
@@ -88,21 +112,23 @@ def _find_root(given: Path) -> Path:
     _refuse_old_stack(given)
     if newest := _newest_checkpoint(given):
         return _find_root(newest)
+    if _is_module(given):
+        return given
     trials = [trial for trial in sorted(given.iterdir()) if trial.is_dir() and _newest_checkpoint(trial)]
     if len(trials) == 1:
         return _find_root(trials[0])
     if trials:
         names = ", ".join(trial.name for trial in trials[:4]) + (", ..." if len(trials) > 4 else "")
         raise CheckpointError(f"{given} holds {len(trials)} trials with checkpoints ({names}): name one of them")
-    if any((given / f"module_state{suffix}").is_file() for suffix in STATE_SUFFIXES):
-        raise UnsupportedError(
-            f"{given} is an RLModule on its own: the observation filter and the action scaling are kept outside it, in "
-            "the algorithm checkpoint's env_runner folder; give the whole algorithm checkpoint"
-        )
     raise CheckpointError(
         f"{given} is not an RLlib checkpoint: looked for {MODULES}/ (an algorithm checkpoint of the new API stack), "
         "policies/ (the old stack) and checkpoint_NNNNNN/ (a Tune trial), found none of them"
     )
+
+
+def _is_module(folder: Path) -> bool:
+    """Return whether `folder` is an RLModule that was saved, or copied, by itself."""
+    return any((folder / f"{STATE_STEMS['module']}{suffix}").is_file() for suffix in STATE_SUFFIXES)
 
 
 def _newest_checkpoint(folder: Path) -> Path | None:
@@ -150,11 +176,18 @@ def _choose_module(root: Path, module_id: str | None) -> str:
 
 
 def _check_complete(files: CheckpointFiles) -> None:
-    needed = (
-        (files.module, STATE_STEMS["module"], "the weights"),
+    needed = [(files.module, STATE_STEMS["module"], "the weights")]
+    pipelines = (
         (files.env_to_module, STATE_STEMS["connector"], "the observation filter and other steps before the network"),
         (files.module_to_env, STATE_STEMS["connector"], "the action scaling and other steps after the network"),
     )
+    if files.has_pipelines:
+        needed += pipelines
+    elif not files.alone and not (files.root / CTOR_FILE).is_file():
+        raise CheckpointError(
+            f"{files.root} is incomplete: it has neither {RUNNERS[0]}/ (the connector pipelines) nor "
+            f"{CTOR_FILE} (the configuration they are built from)"
+        )
     for folder, stem, what in needed:
         for present, name in (
             ((folder / CTOR_FILE).is_file(), CTOR_FILE),

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from rlservo.export.actor import PolicyGraph
 from rlservo.export.errors import UnsupportedError
 from rlservo.export.parity import Runner
+from rlservo.export.samples import Inputs
 from rlservo.export.unpickle import first_line
 
 TORCHSCRIPT_OPSET = 17
@@ -34,10 +35,10 @@ IR_VERSION = 8
 CONTRACT_KEY = "rlservo.contract"
 
 
-def write_onnx(graph: PolicyGraph, example: NDArray[Any], file: Path) -> None:
-    """Write `graph` to `file`, weights inside, input `obs` and the graph's outputs with a dynamic batch.
+def write_onnx(graph: PolicyGraph, example: Inputs, file: Path) -> None:
+    """Write `graph` to `file`, weights inside, the graph's inputs and outputs by name, with a dynamic batch.
 
-    `example` is any two observations. Raises UnsupportedError when an operation of the network has no ONNX form.
+    `example` is two rows of every input. Raises UnsupportedError when an operation of the network has no ONNX form.
     """
     try:
         _export(graph, example, file, dynamo=False)
@@ -53,16 +54,21 @@ def write_onnx(graph: PolicyGraph, example: NDArray[Any], file: Path) -> None:
     onnx.save(model, str(file))
 
 
-def _export(graph: PolicyGraph, example: NDArray[Any], file: Path, *, dynamo: bool) -> None:
-    names = ["obs", *graph.output_names]
+def _export(graph: PolicyGraph, example: Inputs, file: Path, *, dynamo: bool) -> None:
+    inputs, outputs = list(graph.input_names), list(graph.output_names)
     how: dict[str, Any] = {"dynamo": False, "opset_version": TORCHSCRIPT_OPSET}
-    how["dynamic_axes"] = {name: {0: "batch"} for name in names}
+    how["dynamic_axes"] = {name: {0: "batch"} for name in (*inputs, *outputs)}
     if dynamo:
         how = {"dynamo": True, "opset_version": DYNAMO_OPSET, "external_data": False, "verbose": False}
-        how["dynamic_shapes"] = {"obs": {0: torch.export.Dim("batch")}}
+        how["dynamic_shapes"] = {"inputs": tuple({0: torch.export.Dim("batch")} for _ in inputs)}
     with _quiet():
         torch.onnx.export(
-            graph, (torch.from_numpy(example),), str(file), input_names=names[:1], output_names=names[1:], **how
+            graph,
+            tuple(torch.from_numpy(example[name]) for name in inputs),
+            str(file),
+            input_names=inputs,
+            output_names=outputs,
+            **how,
         )
 
 
@@ -122,8 +128,8 @@ def run_onnx(file: Path) -> Runner:
     session = onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
 
-    def run(obs: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        values = session.run(names, {"obs": obs})
+    def run(inputs: Inputs) -> dict[str, NDArray[Any]]:
+        values = session.run(names, inputs)
         return {name: np.asarray(value) for name, value in zip(names, values, strict=True)}
 
     return run

@@ -12,7 +12,18 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from rlservo.export.bundle import BakedStep, BoxSpec, Contract, DiscreteSpec, Element, Evaluation, Parity
+from rlservo.export.bundle import (
+    BakedStep,
+    Contract,
+    DiscreteSpec,
+    Element,
+    Evaluation,
+    LeafSpec,
+    Parity,
+    SpaceSpec,
+    StateSpec,
+    leaf_specs,
+)
 
 MANY = 64  # elements shown one by one; of more, the first and the last few
 ENDS = 8
@@ -22,9 +33,10 @@ def contract_report(contract: Contract) -> RenderableType:
     """Return the whole contract: what it is, what goes in, what is baked in, what comes out, how it was proven."""
     parts: list[RenderableType] = [
         _summary(contract),
-        _space_table("Goes in: observation", contract.observation_space, _filter(contract)),
+        *_space_tables("Goes in: observation", "obs", contract.observation_space, _filter(contract)),
         _baked_table(contract.baked_in),
-        _space_table("Comes out: action", contract.action_space, None),
+        *_space_tables("Comes out: action", "action", contract.action_space, None),
+        *([_state_table(contract.state)] if contract.state else []),
         _tensor_table(contract),
         _proof(contract.parity),
     ]
@@ -39,6 +51,8 @@ def export_report(contract: Contract) -> Text:
     differences = ", ".join(f"{name} {result.max_rel:.1e}" for name, result in contract.parity.formats.items())
     rate = f" at {contract.control_rate_hz:g} Hz" if contract.control_rate_hz else ""
     outcome = f"one of {action.n} actions" if isinstance(action, DiscreteSpec) else f"{action.size} action elements"
+    if contract.state:
+        outcome += f", remembering {', '.join(state.name for state in contract.state)}"
     return Text(
         f"policy    {contract.name} version {contract.version}\n"
         f"graph     {observation.size} observation elements to {outcome}{rate}\n"
@@ -92,7 +106,14 @@ def _exploration(contract: Contract) -> str:
     return f"sampling a {kind}{transform[contract.distribution.transform]}"
 
 
-def _space_table(title: str, space: BoxSpec | DiscreteSpec, frozen: BakedStep | None) -> Table:
+def _space_tables(title: str, root: str, space: SpaceSpec, frozen: BakedStep | None) -> list[Table]:
+    leaves = leaf_specs(space, root)
+    return [
+        _space_table(title if len(leaves) == 1 else f"{title}, {name}", leaf, frozen) for name, leaf in leaves.items()
+    ]
+
+
+def _space_table(title: str, space: LeafSpec, frozen: BakedStep | None) -> Table:
     """Return one row an element: index, name, unit, bounds and, behind a filter, its numbers."""
     if isinstance(space, DiscreteSpec):
         table = Table(title=f"{title} (one of {space.n} choices)", title_justify="left")
@@ -121,6 +142,17 @@ def _space_table(title: str, space: BoxSpec | DiscreteSpec, frozen: BakedStep | 
         element = space.elements[index] if space.elements else Element(name="-", unit="")
         row = [str(index), element.name, element.unit or "-", _number(low[index]), _number(high[index])]
         table.add_row(*row, *([_number(mean[index]), _number(std[index])] if mean else []))
+    return table
+
+
+def _state_table(state: Sequence[StateSpec]) -> Table:
+    table = Table(title="Remembered from step to step", title_justify="left")
+    for column in ("name", "kind", "type", "shape", "at an episode's start"):
+        table.add_column(column, overflow="fold")
+    for one in state:
+        shape = "x".join(str(size) for size in one.shape) or "scalar"
+        start = _number(one.initial) if isinstance(one.initial, float) else "as in contract.json"
+        table.add_row(one.name, one.kind.replace("_", " "), one.dtype, shape, start)
     return table
 
 

@@ -9,13 +9,14 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Protocol, TypeAlias
 
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from typing_extensions import Self
 
 from rlservo.export.bundle import Contract
 
-Observation: TypeAlias = ArrayLike | Mapping[str, Any]
-"""An array of the observation space's shape, a batch of them, or a map from element name to value (or batch)."""
+Observation: TypeAlias = ArrayLike | Mapping[str, Any] | tuple[Any, ...]
+"""An array of the observation space's shape, a batch of them, a map from element name to value (or batch), or for a
+nested space maps and tuples of such."""
 
 
 class ActingPolicy(Protocol):
@@ -33,12 +34,15 @@ class ActingPolicy(Protocol):
         """What goes in and what comes out: spaces, element names and units, control rate."""
         ...
 
-    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> NDArray[Any]:
+    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> Any:
         """Return the action for `obs`, ready for `env.step`.
 
         One observation gives one action of the action space's shape and dtype (Discrete: an integer array of shape
-        `()`); a batch `(B, *obs_shape)` gives a batch `(B, *action_shape)`. `explore` samples the policy's action
-        distribution instead of taking its mode; the same `seed` draws the same sample, None draws a fresh one.
+        `()`); a batch `(B, *obs_shape)` gives a batch `(B, *action_shape)`. A nested (Dict or Tuple) observation is
+        given in the space's own form, and a nested action is returned so, a batch with its axis on every leaf.
+
+        `explore` samples the policy's action distribution instead of taking its mode; the same `seed` draws the same
+        sample, None draws a fresh one.
 
         Raises ObservationError when the observation does not fit the contract, ActionError when the policy's answer
         must not reach a robot, and, over a network, UnavailableError or DeadlineError.

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 from typing_extensions import Self
 
-from rlservo.export.bundle import Contract
+from rlservo.export.bundle import Contract, DictSpec, LeafSpec, SpaceSpec, TupleSpec, leaf_specs
 from rlservo.export.errors import (
     ActionError,
     DeadlineError,
@@ -28,6 +28,7 @@ from rlservo.export.errors import (
     UsageError,
 )
 from rlservo.serve_app.acting import Observation
+from rlservo.serve_app.structure import build_action
 from rlservo.serve_app.transport import Transport, encode
 
 POLL_S = 0.1  # between two looks at a server that is starting
@@ -86,7 +87,7 @@ class PolicyClient:
             self._contract = self._fetch()
         return self._contract
 
-    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> NDArray[Any]:
+    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> Any:
         """Return the action for `obs`, as `ActingPolicy.act` describes.
 
         Raises ObservationError (non-finite numbers are refused here, the rest by the server), ActionError when the
@@ -196,12 +197,29 @@ def _only_policy(listing: Any) -> str:
 def _sendable(obs: Observation, contract: Contract) -> tuple[Any, tuple[int, ...]]:
     """Return (what goes into the JSON, the batch axis as () or (B,)); the server checks shapes and names."""
     space = contract.observation_space
+    if isinstance(space, DictSpec | TupleSpec):
+        return _sendable_part(obs, space, "obs")
     if isinstance(obs, Mapping):
         named = {str(name): _finite(value, f"element {name!r}") for name, value in obs.items()}
         return named, next((value.shape[:1] for value in named.values()), ())
     array = _finite(obs, "")
     batch = array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
     return array, batch
+
+
+def _sendable_part(obs: Any, space: SpaceSpec, path: str) -> tuple[Any, tuple[int, ...]]:
+    """Return (a nested observation's JSON form, the batch axis of its leaves); the server checks that it fits."""
+    if isinstance(space, DictSpec | TupleSpec):
+        inside = space.spaces.items() if isinstance(space, DictSpec) else enumerate(space.spaces)
+        try:
+            parts = {key: _sendable_part(obs[key], child, f"{path}.{key}") for key, child in inside}
+        except (KeyError, IndexError, TypeError) as error:
+            raise ObservationError(f"the observation does not have the parts of {path}: {error!r}") from error
+        plain = {key: part for key, (part, _) in parts.items()}
+        batch = next((axis for _, axis in parts.values()), ())
+        return (plain if isinstance(space, DictSpec) else list(plain.values())), batch
+    array = _finite(obs, f"part {path}")
+    return array, array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
 
 
 def _finite(value: ArrayLike, where: str) -> NDArray[Any]:
@@ -223,21 +241,44 @@ def _finite(value: ArrayLike, where: str) -> NDArray[Any]:
     return array
 
 
-def _restored(action: Any, batch: tuple[int, ...], contract: Contract) -> NDArray[Any]:
-    """Return the JSON action as an array of the contract's dtype and shape, or raise ActionError."""
-    space = contract.action_space
+def _restored(action: Any, batch: tuple[int, ...], contract: Contract) -> Any:
+    """Return the JSON action in the space's form, arrays of its dtype and shape, or raise ActionError."""
+    return build_action(
+        contract.action_space,
+        {
+            name: _restored_leaf(_part(action, name, contract), batch, name, leaf, contract)
+            for name, leaf in leaf_specs(contract.action_space, "action").items()
+        },
+    )
+
+
+def _part(action: Any, name: str, contract: Contract) -> Any:
+    """Return the leaf `action.<path>` of a nested JSON action, or raise ActionError."""
+    part = action
+    for step in name.split(".")[1:]:
+        if isinstance(part, dict) and step in part:
+            part = part[step]
+        elif isinstance(part, list) and step.isdigit() and int(step) < len(part):
+            part = part[int(step)]
+        else:
+            raise ActionError(f"the server's action for {contract.name!r} lacks the part {name!r}")
+    return part
+
+
+def _restored_leaf(action: Any, batch: tuple[int, ...], name: str, space: LeafSpec, contract: Contract) -> NDArray[Any]:
     expected = (*batch, *space.shape)
+    what = f"action for {contract.name!r}" if name == "action" else f"{name} for {contract.name!r}"
     try:
         array = np.asarray(action)
     except ValueError:
         array = np.asarray(None)
     if array.dtype.kind not in "fiu" and array.size:
-        raise ActionError(f"the server's action for {contract.name!r} is {str(action)[:80]}, expected numbers")
+        raise ActionError(f"the server's {what} is {str(action)[:80]}, expected numbers")
     if array.shape != expected:
-        raise ActionError(f"the server's action for {contract.name!r} has shape {array.shape}, expected {expected}")
+        raise ActionError(f"the server's {what} has shape {array.shape}, expected {expected}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ActionError(f"the server's action for {contract.name!r} has an element that is not finite")
+        raise ActionError(f"the server's {what} has an element that is not finite")
     typed = array.astype(space.dtype)
     if typed.dtype.kind in "iu" and not np.array_equal(typed, array):
-        raise ActionError(f"the server's action for {contract.name!r} is {str(action)[:80]}, expected {space.dtype}")
+        raise ActionError(f"the server's {what} is {str(action)[:80]}, expected {space.dtype}")
     return typed

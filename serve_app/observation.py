@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.bundle import BoxSpec, DiscreteSpec, iter_elements
+from rlservo.export.bundle import BoxSpec, LeafSpec, iter_elements
 from rlservo.export.errors import ObservationError
 
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
@@ -25,16 +25,19 @@ LISTED = 8  # names listed in a message before "and N more"
 
 
 class ObservationReader:
-    """Reads observations for one policy."""
+    """Reads one array of a policy's observations: the whole of it, or the leaf `name` of a nested one."""
 
-    def __init__(self, policy: str, space: BoxSpec | DiscreteSpec) -> None:
+    def __init__(self, policy: str, space: LeafSpec, name: str = "obs") -> None:
         self._policy = policy
+        self._name = name
         self._space = space
         self._shape = space.shape
         self._one = (1, *self._shape)
         self._ndim = len(self._shape)
         self._dtype = np.dtype(space.dtype)
         self._is_float = self._dtype.kind == "f"
+        # Of a choice that does not exist RLlib makes an error or a one-hot of nothing; a Box may be left.
+        self._choices = None if isinstance(space, BoxSpec) else space.bounds()
         self._names = tuple(element.name for element in space.elements)
         self._named = bool(self._names) and len(set(self._names)) == len(self._names)
 
@@ -66,8 +69,8 @@ class ObservationReader:
             total = sum(array.ravel().tolist()) if array.size <= SMALL else math.inf
             if not math.isfinite(total):
                 self._check_finite(array)
-        elif isinstance(self._space, DiscreteSpec):
-            self._check_range(array, self._space)
+        elif self._choices is not None:
+            self._check_range(array, *self._choices)
         return array, batch
 
     # How each form becomes an array.
@@ -138,14 +141,15 @@ class ObservationReader:
             self._refuse_element(sent, ~finite, f"too large for {self._dtype}")
         self._refuse_element(array, ~finite, "not a finite number")
 
-    def _check_range(self, array: NDArray[Any], space: DiscreteSpec) -> None:
-        outside = (array < space.start) | (array >= space.start + space.n)
+    def _check_range(self, array: NDArray[Any], low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        outside = np.asarray((array < low) | (array > high))
         if outside.any():
-            last = space.start + space.n - 1
-            self._refuse_element(array, outside, f"outside the observation space's {space.start}..{last}")
+            where = tuple(int(i) for i in np.argwhere(outside)[0])[1:]
+            span = f"{int(low[where])}..{int(high[where])}"
+            self._refuse_element(array, outside, f"outside the observation space's {span}")
 
     def _refuse_shape(self, shape: tuple[int, ...]) -> NoReturn:
-        message = f"policy '{self._policy}' expects obs of shape {self._shape}, got {shape}"
+        message = f"policy '{self._policy}' expects {self._name} of shape {self._shape}, got {shape}"
         if len(shape) == self._ndim + 1 and shape[1:] == self._shape:
             message = f"policy '{self._policy}' got an empty batch: send at least one observation of {self._shape}"
         elif shape == (1, *self._one):
@@ -166,7 +170,7 @@ class ObservationReader:
             label += f" ({self._names[index]})"
         what = f"element {label}" if where else "it"
         raise ObservationError(
-            f"policy '{self._policy}' cannot read obs: {what} is {_describe(value)}, not a number",
+            f"policy '{self._policy}' cannot read {self._name}: {what} is {_describe(value)}, not a number",
             {"policy": self._policy, "index": list(where)},
         )
 
@@ -189,13 +193,13 @@ class ObservationReader:
             label += f" of observation {index[0]}"
         value = array[index]
         raise ObservationError(
-            f"policy '{self._policy}' cannot use obs: element {label} is {value}, {why}",
+            f"policy '{self._policy}' cannot use {self._name}: element {label} is {value}, {why}",
             {"policy": self._policy, "index": list(index), "value": str(value)},
         )
 
     def _refuse(self, why: str) -> NoReturn:
         raise ObservationError(
-            f"policy '{self._policy}' cannot read obs: {why} (expected numbers of shape {self._shape})",
+            f"policy '{self._policy}' cannot read {self._name}: {why} (expected numbers of shape {self._shape})",
             {"policy": self._policy, "expected_shape": list(self._shape)},
         )
 

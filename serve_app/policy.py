@@ -8,28 +8,35 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from rlservo.export.bundle import (
     CONTRACT_FILE,
     GOLDEN_FILE,
+    BoxSpec,
     Bundle,
     Contract,
     DiscreteSpec,
-    iter_elements,
+    Distribution,
+    LeafSpec,
+    MultiDiscreteSpec,
+    leaf_specs,
     load_bundle,
 )
 from rlservo.export.errors import ActionError, BundleError, GoldenMismatchError, RequestError, UsageError
 from rlservo.serve_app.acting import Observation
-from rlservo.serve_app.exploring import distribution_size, sample_action
+from rlservo.serve_app.exploring import distribution_size, sample_leaves, split_scores
+from rlservo.serve_app.guard import ActionGuard
+from rlservo.serve_app.memory import REWARD, Memory, State
 from rlservo.serve_app.observation import ObservationReader
+from rlservo.serve_app.structure import StructureReader, build_action
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -40,8 +47,6 @@ GOLDEN_RTOL = (
     1e-4  # machines differ in the last bits of exp and in the order of sums; a wrong graph differs in the first
 )
 GOLDEN_ATOL = 1e-5  # the same for actions near zero
-OVERSHOOT = 1e-5  # relative to the bound: what float32 rounding in unsquash may leave outside the space; clipped
-SMALL_ACTION = 32  # elements up to which a Python loop checks bounds faster than numpy does
 
 _Run = Callable[[list[str], dict[str, NDArray[Any]]], Any]
 
@@ -61,26 +66,20 @@ class Policy:
         self._bundle = bundle
         self._contract = contract
         self._run: _Run = session.run
-        self._reader = ObservationReader(contract.name, contract.observation_space)
+        self._rng = np.random.default_rng()
+        self._reader = StructureReader(contract.name, contract.observation_space)
+        actions = leaf_specs(contract.action_space, "action")
+        self._guards = {name: ActionGuard(contract.name, name, leaf) for name, leaf in actions.items()}
+        self._memory = Memory(contract)
+        self._state: State | None = None
+        # Most policies read one array and give one: those few microseconds are what a control loop asks for.
+        observations = leaf_specs(contract.observation_space, "obs")
+        self._simple = len(observations) == len(actions) == 1 and len(contract.inputs) == 1
+        self._leaf_reader = ObservationReader(contract.name, next(iter(observations.values())))
+        self._guard = next(iter(self._guards.values()))
         self._input = contract.inputs[0].name
         self._action_only = ["action"]
         self._dist_only = ["action_dist_inputs"]
-        self._rng = np.random.default_rng()
-        space = contract.action_space
-        self._space = space
-        self._shape = space.shape
-        self._dtype = np.dtype(space.dtype)
-        if isinstance(space, DiscreteSpec):
-            low, high = np.array(space.start, np.float64), np.array(space.start + space.n - 1, np.float64)
-        else:
-            low, high = space.bounds()
-        if self._dtype.kind == "f":  # the largest finite number stands for unbounded: infinity is then outside as well
-            largest = float(np.finfo(self._dtype).max)
-            low, high = np.maximum(low, -largest), np.minimum(high, largest)
-        self._low, self._high = low, high
-        self._small_bounds: list[tuple[float, float]] = []
-        if space.size <= SMALL_ACTION:
-            self._small_bounds = list(zip(low.ravel().tolist(), high.ravel().tolist(), strict=True))
 
     @classmethod
     def load(cls, path: str | Path, *, threads: int = 1, check_golden: bool = True) -> Self:
@@ -110,19 +109,56 @@ class Policy:
         """The bundle folder this policy was loaded from."""
         return self._bundle.path
 
-    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> NDArray[Any]:
+    def act(
+        self, obs: Observation, *, explore: bool = False, seed: int | None = None, reward: ArrayLike | None = None
+    ) -> Any:
         """Return the action for `obs`: one for one observation, a batch for a batch (see `ActingPolicy.act`).
 
-        Raises ObservationError when `obs` does not fit the contract, RequestError when the policy cannot explore, and
-        ActionError when what came out is not finite or not in the action space.
+        A nested observation is given, and a nested action returned, in the space's own form. A recurrent policy goes
+        on from the `act` before, `reset()` begins an episode; a batch is so many episodes side by side, row i going on
+        from row i. `reward` is what the last action brought, for a policy that was trained to see it.
+
+        Raises ObservationError when `obs` does not fit the contract, RequestError when the policy cannot explore, lacks
+        the reward, or remembers another number of episodes, and ActionError when what came out is not finite or not in
+        the action space.
         """
-        array, batch = self._reader.read(obs)
-        action = self._sample(array, seed) if explore else self._run(self._action_only, {self._input: array})[0]
-        self._check_action(action)
+        if not self._simple:
+            return self._act_on(obs, explore, seed, reward)
+        array, batch = self._leaf_reader.read(obs)
+        if explore:
+            self._check_explores()
+            action = self._sample(self._run(self._dist_only, {self._input: array})[0], seed)["action"]
+        else:
+            action = self._run(self._action_only, {self._input: array})[0]
+        self._guard.check(action)
         return action if batch else action[0, ...]
 
+    def act_from(
+        self,
+        obs: Observation,
+        state: Mapping[str, ArrayLike] | None,
+        *,
+        explore: bool = False,
+        seed: int | None = None,
+        reward: ArrayLike | None = None,
+    ) -> tuple[Any, State]:
+        """Return (action, next state) and remember nothing: for a server, whose callers carry their own state.
+
+        `state` is what this method returned for the step before, by state name, with a batch axis where `obs` has one;
+        None begins an episode. Raises RequestError when it does not fit the contract, and what `act` raises.
+        """
+        feed, batch = self._reader.read(obs)
+        rows = len(next(iter(feed.values())))
+        before = None if state is None else self._memory.read(state, rows, batch=batch)
+        action, after = self._decide(feed, rows, before, explore, seed, reward)
+        if batch:
+            return build_action(self._contract.action_space, action), after
+        one = {name: leaf[0, ...] for name, leaf in action.items()}
+        return build_action(self._contract.action_space, one), {name: leaf[0, ...] for name, leaf in after.items()}
+
     def reset(self) -> None:
-        """Start an episode. The policies this version runs have no state to reset."""
+        """Start an episode: a recurrent policy forgets. Nothing to do for a stateless one."""
+        self._state = None
 
     def close(self) -> None:
         """Drop the session; `act` raises UsageError from now on."""
@@ -136,50 +172,60 @@ class Policy:
     ) -> None:
         self.close()
 
-    def _sample(self, array: NDArray[Any], seed: int | None) -> NDArray[Any]:
+    def _act_on(self, obs: Observation, explore: bool, seed: int | None, reward: ArrayLike | None) -> Any:
+        feed, batch = self._reader.read(obs)
+        rows = len(next(iter(feed.values())))
+        known = rows if self._state is None else len(next(iter(self._state.values())))
+        if known != rows:
+            raise RequestError(
+                f"policy '{self._contract.name}' remembers {known} episode{'s' if known > 1 else ''} and got {rows} "
+                f"observation{'s' if rows > 1 else ''}: call reset() to begin others"
+            )
+        action, after = self._decide(feed, rows, self._state, explore, seed, reward)
+        self._state = after or None
+        if not batch:
+            action = {name: leaf[0, ...] for name, leaf in action.items()}
+        return build_action(self._contract.action_space, action)
+
+    def _decide(
+        self,
+        feed: dict[str, NDArray[Any]],
+        rows: int,
+        before: State | None,
+        explore: bool,
+        seed: int | None,
+        reward: ArrayLike | None,
+    ) -> tuple[dict[str, NDArray[Any]], State]:
+        """Return (action leaves `[batch, ...]`, next state) for checked observations."""
+        feed.update(self._memory.feed(before, rows, reward))
+        names = (["action_dist_inputs"] if explore else list(self._guards)) + self._memory.outputs
+        if explore:
+            self._check_explores()
+        computed = dict(zip(names, self._run(names, feed), strict=True))
+        action = self._sample(computed["action_dist_inputs"], seed) if explore else computed
+        for name, guard in self._guards.items():
+            guard.check(action[name])
+        after = self._memory.keep(computed, action if explore else None)
+        return {name: action[name] for name in self._guards}, after
+
+    def _check_explores(self) -> Distribution:
         distribution = self._contract.distribution
         if distribution is None:
             raise RequestError(
                 f"policy '{self._contract.name}' has no action distribution and cannot explore: leave 'explore' out"
             )
+        return distribution
+
+    def _sample(self, inputs: NDArray[Any], seed: int | None) -> dict[str, NDArray[Any]]:
         if seed is not None and seed < 0:
             raise RequestError(f"seed must be a non-negative integer, got {seed}")
         rng = self._rng if seed is None else np.random.default_rng(seed)
-        inputs = self._run(self._dist_only, {self._input: array})[0]
-        if not np.isfinite(inputs).all():
+        # Minus infinity is how a policy says 'not allowed'; where it is a mean, the guard refuses the action.
+        if np.isnan(inputs).any() or np.isposinf(inputs).any():
             raise ActionError(
                 f"policy '{self._contract.name}' gave a non-finite action distribution for this observation"
             )
-        return sample_action(inputs, distribution, self._space, rng).astype(self._dtype)
-
-    def _check_action(self, action: NDArray[Any]) -> None:
-        """Let only finite actions of the action space pass; rounding overshoot is clipped in place."""
-        if self._small_bounds and len(action) == 1:
-            for value, (low, high) in zip(action.ravel().tolist(), self._small_bounds, strict=True):
-                if not low <= value <= high:  # so written, it holds for not-a-number too
-                    break
-            else:
-                return
-        elif ((action >= self._low) & (action <= self._high)).all():
-            return
-        self._clip_or_refuse(action)
-
-    def _clip_or_refuse(self, action: NDArray[Any]) -> None:
-        slack = OVERSHOOT * np.maximum(1.0, np.minimum(np.abs(self._low), np.abs(self._high)))
-        bad = ~((action >= self._low - slack) & (action <= self._high + slack))
-        if bad.any():
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            flat = int(np.ravel_multi_index(index[1:], self._shape)) if self._shape else 0
-            label = dict(iter_elements(self._space))[flat] if self._shape else "0"
-            low, high = self._low[index[1:]], self._high[index[1:]]
-            value = action[index]
-            why = f"not in [{low:g}, {high:g}]" if np.isfinite(value) else "not a finite number"
-            raise ActionError(
-                f"policy '{self._contract.name}' computed an action that must not reach a robot: "
-                f"element {label} is {value}, {why}",
-                {"policy": self._contract.name, "index": list(index), "value": str(value)},
-            )
-        np.clip(action, self._low.astype(self._dtype), self._high.astype(self._dtype), out=action)
+        return sample_leaves(inputs, self._check_explores(), self._contract.action_space, rng)
 
 
 def _refuse_closed(_names: list[str], _feed: Mapping[str, Any]) -> NoReturn:
@@ -192,35 +238,58 @@ def _refuse_closed(_names: list[str], _feed: Mapping[str, Any]) -> NoReturn:
 def _check_contract(bundle: Bundle) -> None:
     """Refuse what this runtime cannot run faithfully, and contracts that contradict themselves."""
     contract = bundle.contract
-    if contract.state:
-        states = ", ".join(state.name for state in contract.state)
-        raise BundleError(f"{bundle.path}: the policy is recurrent (state {states}); this version runs stateless ones")
-    if [tensor.name for tensor in contract.inputs] != ["obs"]:
-        names = ", ".join(tensor.name for tensor in contract.inputs) or "none"
-        raise BundleError(f"{bundle.path}: this version runs policies with the one input 'obs', got {names}")
-    if "action" not in {tensor.name for tensor in contract.outputs}:
-        raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no output 'action'")
-    for which, space in (("observation_space", contract.observation_space), ("action_space", contract.action_space)):
-        try:
-            kind: str = np.dtype(space.dtype).kind
-        except TypeError:
-            kind = "?"
-        if kind not in "fiub":
-            raise BundleError(f"{bundle.path}: {which} has dtype '{space.dtype}': expected a number type")
-        if space.elements and len(space.elements) != space.size:
-            raise BundleError(f"{bundle.path}: {which} names {len(space.elements)} elements of {space.size}")
-        if not isinstance(space, DiscreteSpec):
-            for side in (space.low, space.high):
-                if isinstance(side, tuple) and len(side) != space.size:
-                    raise BundleError(f"{bundle.path}: {which} has {len(side)} bounds for {space.size} elements")
+    observations = leaf_specs(contract.observation_space, "obs")
+    actions = leaf_specs(contract.action_space, "action")
+    known = {*observations, REWARD, *(f"state_in.{state.name}" for state in contract.state)}
+    listed = [tensor.name for tensor in contract.inputs]
+    if missing := [name for name in observations if name not in listed]:
+        raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no input {_quoted(missing)}")
+    if strange := [name for name in listed if name not in known]:
+        raise BundleError(f"{bundle.path}: the input {_quoted(strange)} is neither an observation nor a state")
+    outputs = {tensor.name: tensor for tensor in contract.outputs}
+    if missing := [name for name in actions if name not in outputs]:
+        raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no output {_quoted(missing)}")
+    for state in contract.state:
+        shape = (-1, *state.shape)
+        for name, tensors in (
+            (f"state_in.{state.name}", contract.inputs),
+            (f"state_out.{state.name}", contract.outputs),
+        ):
+            if not any(tensor.name == name and tensor.shape == shape for tensor in tensors):
+                raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no '{name}' of shape {shape}")
+    for name, space in {**observations, **actions}.items():
+        _check_leaf(bundle, name, space)
     expected = contract.distribution and distribution_size(contract.distribution, contract.action_space)
-    dist = {tensor.name: tensor for tensor in contract.outputs}.get("action_dist_inputs")
+    dist = outputs.get("action_dist_inputs")
     if expected is not None and (dist is None or dist.shape[1:] != (expected,)):
         got = "none" if dist is None else str(dist.shape)
         raise BundleError(
             f"{bundle.path}: a {contract.distribution.kind if contract.distribution else ''} policy needs the output "
             f"'action_dist_inputs' of shape (-1, {expected}), got {got}"
         )
+
+
+def _check_leaf(bundle: Bundle, name: str, space: LeafSpec) -> None:
+    where = f"{bundle.path}: the space of '{name}'"
+    try:
+        kind: str = np.dtype(space.dtype).kind
+    except TypeError:
+        kind = "?"
+    if kind not in "fiub":
+        raise BundleError(f"{where} has dtype '{space.dtype}': expected a number type")
+    if space.elements and len(space.elements) != space.size:
+        raise BundleError(f"{where} names {len(space.elements)} elements of {space.size}")
+    if isinstance(space, BoxSpec):
+        sides: tuple[Any, ...] = (space.low, space.high)
+    else:
+        sides = (space.nvec, space.start) if isinstance(space, MultiDiscreteSpec) else ()
+    for side in sides:
+        if isinstance(side, tuple) and len(side) != space.size:
+            raise BundleError(f"{where} has {len(side)} bounds for {space.size} elements")
+
+
+def _quoted(names: Sequence[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)
 
 
 def _open_session(bundle: Bundle, threads: int) -> onnxruntime.InferenceSession:
@@ -291,7 +360,7 @@ def check_golden_vectors(bundle: Bundle, run: _Run) -> None:
     atol = max(bundle.contract.parity.atol, GOLDEN_ATOL)
     for name in names:
         _compare(bundle, name, computed, recorded, rtol, atol)
-    logger.debug("%s: %d golden vectors reproduced", bundle.path, len(recorded["action"]))
+    logger.debug("%s: %d golden vectors reproduced", bundle.path, len(next(iter(recorded.values()))))
 
 
 def _compare(
@@ -332,16 +401,23 @@ def _ties(
 ) -> NDArray[np.bool_]:
     """Return where another discrete choice is as good: its score ties with the recorded one's within tolerance."""
     expected = recorded[name]
+    none = np.zeros(expected.shape, np.bool_)
     scores = next((recorded[key] for key in ("action_dist_inputs", "q_values") if key in recorded), None)
-    space = bundle.contract.action_space
-    if name != "action" or scores is None or not isinstance(space, DiscreteSpec) or scores.shape[1:] != (space.n,):
-        return np.zeros(expected.shape, np.bool_)
+    space = leaf_specs(bundle.contract.action_space, "action").get(name)
+    if scores is None or not isinstance(space, DiscreteSpec | MultiDiscreteSpec) or scores.ndim != 2:
+        return none
+    parts = split_scores(scores, bundle.contract.action_space)[name]
     rows = np.arange(len(expected))
-    here, there = computed[name] - space.start, expected - space.start
-    valid = (here >= 0) & (here < space.n) & (there >= 0) & (there < space.n)
-    a, b = scores[rows, np.where(valid, here, 0)], scores[rows, np.where(valid, there, 0)]
-    tied: NDArray[np.bool_] = valid & (np.abs(a - b) <= rtol * np.abs(b) + atol)
-    return tied
+    here = (computed[name] - space.bounds()[0]).reshape(len(expected), -1).astype(np.int64)
+    there = (expected - space.bounds()[0]).reshape(len(expected), -1).astype(np.int64)
+    tied = none.reshape(len(expected), -1)
+    for column, part in enumerate(parts):
+        choices = part.shape[1]
+        valid = (here >= 0) & (here < choices) & (there >= 0) & (there < choices)
+        a = part[rows, np.where(valid, here, 0)[:, column]]
+        b = part[rows, np.where(valid, there, 0)[:, column]]
+        tied[:, column] = valid[:, column] & (np.abs(a - b) <= rtol * np.abs(b) + atol)
+    return tied.reshape(expected.shape)
 
 
 def _first_line(error: Exception) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 
 from rlservo.export.errors import RlservoError, UsageError
 from rlservo.serve_app.acting import ActingPolicy
+from rlservo.serve_app.memory import REWARD
 from rlservo.serve_app.rollout_env import check_fit, control_rate_of, make_env
 from rlservo.serve_app.rollout_report import EpisodeRow, Rate, RolloutReport, summarise
 from rlservo.serve_app.video import VideoFile, rgb_frame
@@ -145,17 +146,18 @@ class _Loop:
 
     def run(self, index: int, seed: int | None, *, recorded: bool) -> EpisodeRow:
         """Run one episode: observe, act, step, until the environment ends it."""
-        discrete = self.policy.contract.action_space.kind == "discrete"
+        rewarded = any(tensor.name == REWARD for tensor in self.policy.contract.inputs)
         draws = np.random.default_rng(seed)  # one seed per exploring action; unused otherwise
         self.policy.reset()
         obs = self._in_env(index, 0, self.env.reset, seed=seed)[0]
         self._record(recorded)
-        steps, total = 0, 0.0
+        steps, total, reward = 0, 0.0, 0.0
         first = len(self.latencies_s)
         self.pacer.start()
         while True:
-            action = self._act(obs, index, steps, int(draws.integers(2**31)) if self.explore else None)
-            command = int(action) if discrete else action
+            seeded = int(draws.integers(2**31)) if self.explore else None
+            action = self._act(obs, index, steps, seeded, {REWARD: float(reward)} if rewarded else {})
+            command = _command(action)
             obs, reward, terminated, truncated, info = self._in_env(index, steps, self.env.step, command)
             self._record(recorded)
             steps, total = steps + 1, total + float(reward)
@@ -174,10 +176,11 @@ class _Loop:
             latency_max_ms=float(latencies.max()),
         )
 
-    def _act(self, obs: Any, index: int, step: int, seed: int | None) -> Any:
+    def _act(self, obs: Any, index: int, step: int, seed: int | None, earned: Mapping[str, float]) -> Any:
         began = time.perf_counter()
         try:
-            action = self.policy.act(obs, explore=self.explore, seed=seed)
+            # Only a policy that was trained to see its reward takes one.
+            action = self.policy.act(obs, explore=self.explore, seed=seed, **earned)
         except RlservoError as error:
             raise type(error)(f"episode {index}, step {step}: {error.message}", error.details) from error
         self.latencies_s.append(time.perf_counter() - began)
@@ -194,6 +197,15 @@ class _Loop:
     def _record(self, recorded: bool) -> None:
         if recorded and self.video is not None:
             self.video.add(rgb_frame(self.env))
+
+
+def _command(action: Any) -> Any:
+    """A choice is a plain number to most environments; a nested action has such parts."""
+    if isinstance(action, dict):
+        return {key: _command(part) for key, part in action.items()}
+    if isinstance(action, tuple):
+        return tuple(_command(part) for part in action)
+    return int(action) if action.ndim == 0 and action.dtype.kind in "iu" else action
 
 
 def success_of(info: Mapping[str, Any]) -> bool | None:

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlservo.export.bundle import BoxSpec, Contract, SpaceSpec
+from rlservo.export.bundle import (
+    BoxSpec,
+    Contract,
+    DictSpec,
+    MultiBinarySpec,
+    MultiDiscreteSpec,
+    SpaceSpec,
+    TupleSpec,
+)
 from rlservo.export.errors import UsageError
 
 if TYPE_CHECKING:
@@ -69,6 +77,18 @@ def check_fit(contract: Contract, env: gym.Env[Any, Any], arguments: Mapping[str
 def _difference(expected: SpaceSpec, actual: gym.Space[Any], *, bounds: bool) -> str | None:
     from gymnasium import spaces
 
+    if isinstance(expected, DictSpec | TupleSpec):
+        return _nested_difference(expected, actual, bounds=bounds)
+    if isinstance(expected, MultiDiscreteSpec):
+        if not isinstance(actual, spaces.MultiDiscrete):
+            return f"is a {type(actual).__name__} there, the policy has MultiDiscrete({list(expected.nvec)})"
+        if (actual.shape, tuple(actual.nvec.ravel().tolist())) != (expected.shape, expected.nvec):
+            return f"has {actual.nvec.tolist()} choices there, the policy has {list(expected.nvec)}"
+        return None
+    if isinstance(expected, MultiBinarySpec):
+        if not isinstance(actual, spaces.MultiBinary) or actual.shape != expected.shape:
+            return f"is {actual} there, the policy has MultiBinary of shape {expected.shape}"
+        return None
     if not isinstance(expected, BoxSpec):
         if not isinstance(actual, spaces.Discrete):
             return f"is a {type(actual).__name__} there, the policy has Discrete({expected.n})"
@@ -93,6 +113,24 @@ def _difference(expected: SpaceSpec, actual: gym.Space[Any], *, bounds: bool) ->
             index = int(np.ravel_multi_index(first, ours.shape)) if first else 0
             element = f" ({expected.elements[index].name})" if index < len(expected.elements) else ""
             return f"element {index}{element} has {word} {theirs[first]:g} there, the policy has {ours[first]:g}"
+    return None
+
+
+def _nested_difference(expected: DictSpec | TupleSpec, actual: gym.Space[Any], *, bounds: bool) -> str | None:
+    from gymnasium import spaces
+
+    kind = spaces.Dict if isinstance(expected, DictSpec) else spaces.Tuple
+    if not isinstance(actual, kind):
+        return f"is a {type(actual).__name__} there, the policy has a {kind.__name__}"
+    ours: dict[Any, SpaceSpec] = (
+        dict(expected.spaces) if isinstance(expected, DictSpec) else dict(enumerate(expected.spaces))
+    )
+    theirs: dict[Any, Any] = dict(actual.spaces) if isinstance(actual, spaces.Dict) else dict(enumerate(actual.spaces))
+    if set(ours) != set(theirs):
+        return f"has the parts {sorted(map(str, theirs))} there, the policy has {sorted(map(str, ours))}"
+    for key, child in ours.items():
+        if difference := _difference(child, theirs[key], bounds=bounds):
+            return f"part {key} {difference}"
     return None
 
 

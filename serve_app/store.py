@@ -11,10 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from rlservo.export.bundle import find_bundles, version_key
-from rlservo.export.errors import BundleError, RlservoError, UnknownPolicyError, UnknownVersionError, UsageError
+from rlservo.export.errors import (
+    BundleError,
+    RequestError,
+    RlservoError,
+    UnknownPolicyError,
+    UnknownVersionError,
+    UsageError,
+)
 from rlservo.serve_app.acting import Observation
 from rlservo.serve_app.policy import Policy
 
@@ -23,7 +28,8 @@ from rlservo.serve_app.policy import Policy
 class Decision:
     """An action, and who decided it how fast."""
 
-    action: NDArray[Any]
+    action: Any
+    """An array, or dicts and tuples of arrays where the action space is nested."""
     name: str
     version: str
     infer_ms: float  # [ms] checking the observation, the network, checking the action
@@ -113,6 +119,11 @@ class PolicyStore:
         Raises UnknownPolicyError, UnknownVersionError and what `Policy.act` raises.
         """
         policy = self.get(name, version)
+        if policy.contract.state:  # its memory belongs to one episode, and a server has many callers
+            raise RequestError(
+                f"policy '{name}' remembers its episode (state {', '.join(s.name for s in policy.contract.state)}), "
+                "which this server does not keep yet: use Policy.load in process"
+            )
         started = time.perf_counter()
         action = policy.act(obs, explore=explore, seed=seed)
         infer_ms = (time.perf_counter() - started) * 1e3

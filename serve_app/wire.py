@@ -127,7 +127,7 @@ def encode_decision(decision: Decision, seq: int | None) -> bytes:
     """Return the reply's JSON."""
     action = decision.action
     reply = {
-        "action": action if action.ndim else action.item(),  # orjson takes no 0-d arrays
+        "action": _plain(action),
         "policy": decision.name,
         "version": decision.version,
         "infer_ms": round(decision.infer_ms, 4),
@@ -135,6 +135,15 @@ def encode_decision(decision: Decision, seq: int | None) -> bytes:
     if seq is not None:
         reply["seq"] = seq
     return orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
+
+
+def _plain(action: Any) -> Any:
+    """Return an action for orjson, which takes no 0-d arrays."""
+    if isinstance(action, dict):
+        return {key: _plain(part) for key, part in action.items()}
+    if isinstance(action, tuple):
+        return [_plain(part) for part in action]
+    return action if action.ndim else action.item()
 
 
 def encode_json(document: Mapping[str, Any]) -> bytes:

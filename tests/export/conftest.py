@@ -13,8 +13,17 @@ from pathlib import Path
 
 import pytest
 
+from rlservo.export.threads import one_thread
+
 HERE = Path(__file__).parent
 APP = HERE / "app"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_torch_thread() -> Iterator[None]:
+    """Tests call parts of an export by themselves; see `one_thread` for why."""
+    with one_thread():
+        yield
 
 
 @pytest.fixture
@@ -29,20 +38,31 @@ def app() -> Path:
     return APP
 
 
-@pytest.fixture(scope="session")
-def zoo() -> Iterator[Path]:
-    """A folder of checkpoints `<name>/` and what the environment saw, `<name>.npz`."""
+def trained(script: str) -> Iterator[Path]:
+    """Run a training script into a folder of its own, and remove the folder afterwards."""
     # A short path: Ray's sockets live below it, and a socket's path may have 107 characters.
     folder = Path(tempfile.mkdtemp(prefix="zoo-"))
     # With the token in its environment Ray writes none to the user's home.
     environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
-    command = [sys.executable, "-W", "ignore", str(HERE / "train_zoo.py"), str(folder)]
+    command = [sys.executable, "-W", "ignore", str(HERE / script), str(folder)]
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
         assert done.returncode == 0, done.stderr[-3000:]
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def zoo() -> Iterator[Path]:
+    """A folder of checkpoints `<name>/` and what the environment saw, `<name>.npz`."""
+    yield from trained("train_zoo.py")
+
+
+@pytest.fixture(scope="session")
+def wide_zoo() -> Iterator[Path]:
+    """The same for spaces, recurrent policies, connectors and algorithms of every kind."""
+    yield from trained("train_wide_zoo.py")
 
 
 @pytest.fixture

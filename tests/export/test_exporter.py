@@ -34,8 +34,8 @@ def test_an_export_acts_as_rllib_did_in_its_own_rollout(
     seen = np.load(zoo / f"{name}.npz")
     assert len(seen["obs"]) >= 90
     outputs = tuple(output.name for output in result.contract.outputs)
-    for run in (run_onnx(result.path / "policy.onnx"), run_torchscript(result.path / "policy.ts", outputs)):
-        action = run(seen["obs"])["action"]
+    for run in (run_onnx(result.path / "policy.onnx"), run_torchscript(result.path / "policy.ts", ["obs"], outputs)):
+        action = run({"obs": seen["obs"]})["action"]
         if result.contract.action_space.kind == "discrete":
             assert action.dtype == np.int64
             np.testing.assert_array_equal(action, seen["action"])
@@ -88,7 +88,7 @@ def test_the_onnx_file_carries_names_a_dynamic_batch_and_the_contract(
     assert [tensor.name for tensor in session.get_outputs()] == ["action", "action_dist_inputs", "value"]
     run = run_onnx(result.path / "policy.onnx")
     for size in (1, 2, 3, 1024):
-        assert run(np.zeros((size, 5), np.float32))["action"].shape == (size, 3)
+        assert run({"obs": np.zeros((size, 5), np.float32)})["action"].shape == (size, 3)
 
 
 def test_golden_vectors_are_finite_and_reproduced(zoo: Path, tmp_path: Path, notices: list[str]) -> None:
@@ -97,7 +97,7 @@ def test_golden_vectors_are_finite_and_reproduced(zoo: Path, tmp_path: Path, not
     assert inputs["obs"].shape == (64, 3) and set(outputs) == {"action", "action_dist_inputs", "value"}
     assert all(np.isfinite(values).all() for values in (*inputs.values(), *outputs.values()))
     assert len(np.unique(outputs["action"])) > 10
-    replayed = run_onnx(result.path / "policy.onnx")(inputs["obs"])
+    replayed = run_onnx(result.path / "policy.onnx")(inputs)
     for name, values in outputs.items():
         np.testing.assert_array_equal(replayed[name], values)
 
@@ -127,7 +127,6 @@ def test_a_discrete_space_that_starts_elsewhere_is_told(
 @pytest.mark.parametrize(
     ("name", "error", "words"),
     [
-        ("lstm", UnsupportedError, "DefaultPPOTorchRLModule is recurrent"),
         ("user_connector", UnsupportedError, "connector Doubler"),
         ("old_stack", UnsupportedError, "old API stack"),
         ("batch_reader", ParityError, "a batch of 257 likely observations: output 'action_dist_inputs', element 0"),

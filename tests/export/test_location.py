@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,10 @@ import pytest
 
 from rlservo.export.checkpoint import load_checkpoint
 from rlservo.export.errors import CheckpointError, UnsupportedError
+from rlservo.export.exporter import export_checkpoint
 from rlservo.export.location import locate_checkpoint
+from rlservo.export.onnx import run_onnx
+from rlservo.export.unpickle import user_code
 
 MODULE = "learner_group/learner/rl_module/default_policy"
 
@@ -40,12 +44,40 @@ def test_what_is_no_checkpoint_is_said_in_one_sentence(
         locate_checkpoint(tmp_path / "given")
 
 
-def test_a_module_on_its_own_is_refused_with_what_would_be_needed(
-    zoo: Path, tmp_path: Path, copy_of: Callable[[str], Path]
+def test_a_module_on_its_own_is_taken_with_a_warning_of_what_it_lacks(
+    zoo: Path, tmp_path: Path, copy_of: Callable[[str], Path], notices: list[str]
 ) -> None:
-    (copy_of("pendulum") / MODULE).rename(tmp_path / "alone")
-    with pytest.raises(UnsupportedError, match="give the whole algorithm checkpoint"):
-        locate_checkpoint(tmp_path / "alone")
+    (copy_of("mixed") / MODULE).rename(tmp_path / "alone")
+    result = export_checkpoint(tmp_path / "alone", tmp_path / "out", notify=notices.append)
+    assert "a filter, one-hot or other step before it is NOT in the export" in " ".join(notices)
+    seen = np.load(zoo / "mixed.npz")  # this policy has nothing before its module
+    found = run_onnx(result.path / "policy.onnx")({"obs": seen["obs"]})["action"]
+    np.testing.assert_allclose(found, seen["action"], rtol=1e-5, atol=2e-6)
+
+
+def test_pipelines_that_were_not_saved_are_built_from_the_configuration(
+    zoo: Path, copy_of: Callable[[str], Path], tmp_path: Path, notices: list[str]
+) -> None:
+    damaged = copy_of("clipped")
+    shutil.rmtree(damaged / "env_runner")
+    result = export_checkpoint(damaged, tmp_path / "out", notify=notices.append)
+    assert "no environment runner" in " ".join(notices)
+    assert [step.step for step in result.contract.baked_in] == ["network", "mode", "clip"]  # as it was configured
+    seen = np.load(zoo / "clipped.npz")
+    found = run_onnx(result.path / "policy.onnx")({"obs": seen["obs"]})["action"]
+    np.testing.assert_allclose(found, seen["action"], rtol=1e-5, atol=2e-6)
+
+
+def test_a_filter_whose_statistics_were_not_saved_is_refused(
+    copy_of: Callable[[str], Path], app: Path, notices: list[str]
+) -> None:
+    damaged = copy_of("pendulum")
+    shutil.rmtree(damaged / "env_runner")
+    with user_code(app.parent), pytest.raises(CheckpointError, match="the observation filter's statistics"):
+        load_checkpoint(locate_checkpoint(damaged), notices.append)
+    (damaged / "class_and_ctor_args.pkl").unlink()
+    with pytest.raises(CheckpointError, match="it has neither env_runner/"):
+        locate_checkpoint(damaged)
 
 
 def test_old_stack_checkpoints_are_refused_with_what_would_be_needed(zoo: Path) -> None:

@@ -16,7 +16,7 @@ from rlservo.export.checkpoint import Checkpoint, load_checkpoint
 from rlservo.export.errors import ParityError
 from rlservo.export.location import locate_checkpoint
 from rlservo.export.onnx import run_onnx, write_onnx
-from rlservo.export.parity import Outputs, Runner, prove, record
+from rlservo.export.parity import GraphLoop, Outputs, Runner, prove, record
 from rlservo.export.recipe import ObservationFilter, Recipe, Transform
 from rlservo.export.samples import BATCH_SIZES, draw_batches
 from rlservo.export.unpickle import user_code
@@ -39,8 +39,10 @@ def filter_of(recipe: Recipe) -> ObservationFilter:
 def prove_as(checkpoint: Checkpoint, recipe: Recipe, tmp_path: Path) -> Parity:
     """Prove a graph built from `recipe` against RLlib's own pipeline of `checkpoint`."""
     graph = PolicyGraph(recipe, checkpoint.network)
-    recorded = record(checkpoint.reference, draw_batches(checkpoint.recipe, seed=3))
-    write_onnx(graph, recorded[-1].batch.obs, tmp_path / "policy.onnx")
+    recorded = record(checkpoint.reference, draw_batches(checkpoint.recipe, seed=3), checkpoint.loop)
+    pair = next(one.batch for one in recorded if len(one.batch) == 2)
+    example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(2, np.bool_))
+    write_onnx(graph, example, tmp_path / "policy.onnx")
     return prove(checkpoint.recipe, recorded, {"onnx": run_onnx(tmp_path / "policy.onnx")})
 
 
@@ -96,7 +98,7 @@ def test_a_wrong_action_transform_is_caught(
 ) -> None:
     checkpoint = load(name)
     if transform == "none":  # actions of a fresh network stay within bounds: make some that do not
-        for module in (checkpoint.network.module, checkpoint._module):
+        for module in (checkpoint.network.module, checkpoint.pipelines.module):
             module.pi.net.mlp[-1].weight *= 50
     with pytest.raises(ParityError, match="output 'action'"):
         prove_as(checkpoint, dataclasses.replace(checkpoint.recipe, transform=transform), tmp_path)
@@ -150,10 +152,10 @@ def test_an_error_names_output_element_sample_and_both_values(load: Callable[[st
 
 def test_the_reference_does_not_drift(load: Callable[[str], Checkpoint]) -> None:
     checkpoint = load("pendulum")
-    obs = np.array([[0.1, 0.9, 3.0]], np.float32)
+    obs = {"obs": np.array([[0.1, 0.9, 3.0]], np.float32)}
     before = checkpoint.reference(obs)
     for batch in draw_batches(checkpoint.recipe, seed=5):
-        checkpoint.reference(batch.obs.copy())
+        checkpoint.reference({"obs": batch.obs.copy()})
     after = checkpoint.reference(obs)
     for name, values in before.items():
         np.testing.assert_array_equal(after[name], values)

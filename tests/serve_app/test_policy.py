@@ -242,8 +242,8 @@ def test_a_contract_the_runtime_cannot_honour_is_refused(
     good = read_contract(folder)
     narrow = good.observation_space.model_copy(update={"shape": (26,), "elements": ()})
     cases: list[tuple[dict[str, object], str]] = [
-        ({"state": (StateSpec(name="h", dtype="float32", shape=(4,)),)}, "recurrent"),
-        ({"inputs": ()}, "one input 'obs'"),
+        ({"state": (StateSpec(name="h", dtype="float32", shape=(4,)),)}, r"lists no 'state_in.h' of shape \(-1, 4\)"),
+        ({"inputs": ()}, "no input 'obs'"),
         ({"outputs": good.outputs[1:]}, "no output 'action'"),
         ({"distribution": Distribution(kind="categorical", transform="none")}, "needs the output 'action_dist_inputs'"),
         ({"outputs": (good.outputs[0].model_copy(update={"shape": (-1, 7)}), good.outputs[1])}, "shape"),
