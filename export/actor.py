@@ -16,7 +16,7 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rlservo.export.recipe import Flatten, ObservationFilter, Recipe
+from rlservo.export.recipe import Flatten, ObservationFilter, ObservationStep, Recipe, Rescale
 
 # What may be left out of the filter's mean, in units of the filtered observation: below float32's step near 1.
 NEGLIGIBLE = 1e-7
@@ -38,9 +38,9 @@ class PolicyGraph(nn.Module):
         self.steps = nn.ModuleList()
         dtype = _dtype(recipe.observation_space)
         for step in recipe.steps:
-            if isinstance(step, Flatten):
+            if isinstance(step, Flatten | Rescale):
                 dtype = torch.float32
-            self.steps.append(FlattenNode() if isinstance(step, Flatten) else FilterNode(step, dtype))
+            self.steps.append(_node(step, dtype))
         self.network = network
         self.action = ActionNode(recipe)
         self.output_names = ("action", *network.names)
@@ -59,6 +59,17 @@ class FlattenNode(nn.Module):
 
     def forward(self, obs: Tensor) -> Tensor:
         return _cast(obs.flatten(1), torch.float32)
+
+
+class RescaleNode(nn.Module):
+    """`(x - offset) / divisor`, in float32 from the start as RLlib's preprocessor does it."""
+
+    def __init__(self, step: Rescale) -> None:
+        super().__init__()
+        self.offset, self.divisor = step.offset, step.divisor
+
+    def forward(self, obs: Tensor) -> Tensor:
+        return (_cast(obs, torch.float32) - self.offset) / self.divisor
 
 
 class FilterNode(nn.Module):
@@ -138,6 +149,12 @@ class ActionNode(nn.Module):
         if self.limits is not None:
             return torch.clamp(action, *self.limits)
         return torch.minimum(torch.maximum(action, self.low), self.high)
+
+
+def _node(step: ObservationStep, dtype: torch.dtype) -> nn.Module:
+    if isinstance(step, Flatten):
+        return FlattenNode()
+    return RescaleNode(step) if isinstance(step, Rescale) else FilterNode(step, dtype)
 
 
 def _same_everywhere(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[float, float] | None:

@@ -37,6 +37,7 @@ from rlservo.export.errors import ParityError, UsageError
 from rlservo.export.facts import CheckpointFacts, read_facts
 from rlservo.export.location import CheckpointFiles, locate_checkpoint
 from rlservo.export.naming import check_names, choose_target, default_name
+from rlservo.export.old_location import OldStackFiles
 from rlservo.export.parity import Outputs, Recorded, prove, record, ties
 from rlservo.export.samples import BATCH_SIZES, draw_batches
 from rlservo.export.spaces import space_spec
@@ -44,7 +45,7 @@ from rlservo.export.steps import baked_steps
 from rlservo.export.unpickle import user_code
 
 if TYPE_CHECKING:
-    from rlservo.export.checkpoint import Checkpoint
+    from rlservo.export.restore import Restored
 
 GOLDEN_SAMPLES = {"likely": 48, "wide": 8, "extreme": 8}
 SEED = 20240
@@ -91,7 +92,8 @@ def export_checkpoint(
         restored = _load(files, notify, value)
         elements = read_elements(facts.env_id, facts.env_config, restored.recipe, notify)
         with _temporary_folder(target) as folder:
-            parity, golden = _write_graphs(folder, restored, [element.name for element in elements.action])
+            labels = [element.name for element in elements.action]
+            parity, golden = _write_graphs(folder, restored, labels, files.api_stack)
             recipe = restored.recipe
             contract = Contract(
                 name=name,
@@ -114,11 +116,11 @@ def export_checkpoint(
     return ExportResult(target, contract)
 
 
-def _load(files: CheckpointFiles, notify: Callable[[str], None], value: bool) -> Checkpoint:
-    # Here and not at the top: RLlib takes seconds to import, and a wrong path should not have to wait for it.
-    from rlservo.export.checkpoint import load_checkpoint
+def _load(files: CheckpointFiles | OldStackFiles, notify: Callable[[str], None], value: bool) -> Restored:
+    # Here and not at the top: torch and RLlib take seconds to import, and a wrong path should not have to wait for it.
+    from rlservo.export.restore import restore
 
-    return load_checkpoint(files, notify, value=value)
+    return restore(files, notify, value=value)
 
 
 @contextlib.contextmanager
@@ -146,7 +148,9 @@ class _Golden:
     outputs: Outputs
 
 
-def _write_graphs(folder: Path, restored: Checkpoint, labels: list[str]) -> tuple[Parity, _Golden]:
+def _write_graphs(
+    folder: Path, restored: Restored, labels: list[str], api_stack: str
+) -> tuple[Parity, _Golden]:
     """Write both formats, prove them, and return the proof and the golden vectors."""
     from rlservo.export.actor import PolicyGraph
     from rlservo.export.onnx import run_onnx, write_onnx
@@ -160,7 +164,7 @@ def _write_graphs(folder: Path, restored: Checkpoint, labels: list[str]) -> tupl
     write_onnx(graph, example, folder / ONNX_FILE)
     onnx = run_onnx(folder / ONNX_FILE)
     formats = {"onnx": onnx, "torchscript": run_torchscript(folder / TORCHSCRIPT_FILE, graph.output_names)}
-    parity = prove(restored.recipe, recorded, formats, labels)
+    parity = prove(restored.recipe, recorded, formats, labels, api_stack)
     inputs = _golden_inputs(recorded, discrete=not isinstance(restored.recipe.action_space, Box))
     outputs = onnx(inputs)
     return parity, _Golden(inputs, {name: outputs[name] for name in graph.output_names})
@@ -182,13 +186,13 @@ def _tensor(name: str, values: NDArray[Any]) -> TensorSpec:
     return TensorSpec(name=name, dtype=str(values.dtype), shape=(-1, *values.shape[1:]))
 
 
-def _provenance(files: CheckpointFiles, facts: CheckpointFacts, restored: Checkpoint) -> Provenance:
+def _provenance(files: CheckpointFiles | OldStackFiles, facts: CheckpointFacts, restored: Restored) -> Provenance:
     import ray
     import torch
 
     return Provenance(
         algorithm=facts.algorithm,
-        api_stack="new",
+        api_stack=files.api_stack,
         module_id=files.module_id,
         module_class=restored.module_class,
         checkpoint_sha256=files.sha256(),

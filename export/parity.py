@@ -26,10 +26,13 @@ from rlservo.export.samples import BATCH_SIZES, Batch
 
 RTOL = 1e-5
 ATOL = 1e-6
-REFERENCE = (
-    "RLlib's own env-to-module connectors, inference forward and module-to-env connectors, restored from the "
-    "checkpoint, observation filter frozen, exploration off"
-)
+REFERENCES: dict[str, str] = {
+    "new": "RLlib's own env-to-module connectors, inference forward and module-to-env connectors, restored from the "
+    "checkpoint, observation filter frozen, exploration off",
+    "old": "RLlib's own agent connectors, compute_actions_from_input_dict and action connectors (old API stack), "
+    "restored from the checkpoint, observation filter frozen, exploration off",
+}
+"""What an export is compared with, by API stack."""
 
 Outputs: TypeAlias = dict[str, NDArray[Any]]
 Runner: TypeAlias = Callable[[NDArray[Any]], Outputs]
@@ -54,15 +57,16 @@ def prove(
     recorded: Sequence[Recorded],
     formats: Mapping[str, Runner],
     labels: Sequence[str] = (),
+    api_stack: str = "new",
 ) -> Parity:
     """Compare every format with what was recorded and return the largest differences.
 
-    `labels` name the action's elements for the message. Raises ParityError at the first output that differs, saying
+    `labels` name the action's elements for the message, `api_stack` what was recorded from. Raises ParityError at the first output that differs, saying
     which element of which sample by how much.
     """
     results = {name: _prove_format(name, recipe, recorded, run, labels) for name, run in formats.items()}
     return Parity(
-        reference=REFERENCE,
+        reference=REFERENCES[api_stack],
         samples=sum(len(one.batch.obs) for one in recorded),
         batch_sizes=BATCH_SIZES,
         rtol=RTOL,

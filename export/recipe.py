@@ -51,7 +51,15 @@ class Flatten:
     """RLlib's FlattenObservations on a Box: one row, as float32."""
 
 
-ObservationStep: TypeAlias = ObservationFilter | Flatten
+@dataclass(frozen=True)
+class Rescale:
+    """`(x - offset) / divisor` in float32, the same for every element: an old-stack preprocessor."""
+
+    offset: float
+    divisor: float
+
+
+ObservationStep: TypeAlias = ObservationFilter | Flatten | Rescale
 
 Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax"]
 """How the deterministic action comes out of the distribution's parameters (or, for argmax, of Q-values)."""

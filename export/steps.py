@@ -7,15 +7,12 @@ from typing import Any
 from gymnasium.spaces import Box
 
 from rlservo.export.bundle import BakedStep
-from rlservo.export.recipe import ObservationFilter, Recipe
+from rlservo.export.recipe import ObservationFilter, ObservationStep, Recipe, Rescale
 
 
 def baked_steps(recipe: Recipe, module_class: str, module: Any) -> tuple[BakedStep, ...]:
     """Return the contract's `baked_in` for a recipe and the torch module it surrounds."""
-    steps = [
-        _filter_step(step) if isinstance(step, ObservationFilter) else BakedStep(step="flatten", detail="to one row")
-        for step in recipe.steps
-    ]
+    steps = [_observation_step(step) for step in recipe.steps]
     parameters = sum(weights.numel() for weights in module.parameters())
     steps.append(
         BakedStep(
@@ -28,6 +25,15 @@ def baked_steps(recipe: Recipe, module_class: str, module: Any) -> tuple[BakedSt
     if recipe.transform != "none":
         steps.append(_transform_step(recipe))
     return tuple(steps)
+
+
+def _observation_step(step: ObservationStep) -> BakedStep:
+    if isinstance(step, ObservationFilter):
+        return _filter_step(step)
+    if isinstance(step, Rescale):
+        values = {"offset": step.offset, "divisor": step.divisor}
+        return BakedStep(step="rescale", detail=f"(obs - {step.offset:g}) / {step.divisor:g}", values=values)
+    return BakedStep(step="flatten", detail="to one row")
 
 
 def _filter_step(frozen: ObservationFilter) -> BakedStep:
