@@ -19,12 +19,14 @@ import ray
 from ray import tune
 from ray.rllib.algorithms.appo import APPOConfig
 from ray.rllib.algorithms.cql import CQLConfig
-from ray.rllib.algorithms.dqn import DQNConfig
+from ray.rllib.algorithms.dqn import DQN, DQNConfig
 from ray.rllib.algorithms.impala import IMPALAConfig
 from ray.rllib.algorithms.marwil import MARWILConfig
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.algorithms.sac import SACConfig
 from ray.rllib.policy.policy import PolicySpec
+from ray.rllib.utils.from_config import from_config
+from ray.rllib.utils.replay_buffers import ReplayBuffer
 
 sys.path.insert(0, str(Path(__file__).parent / "app"))
 import old_zoo_parts  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
@@ -43,7 +45,7 @@ def old(config: Any, env: str, *, filtered: str = "NoFilter", kind: str = "", **
         evaluation_interval=1000,
         evaluation_duration=STEPS,
         evaluation_duration_unit="timesteps",
-        evaluation_config={"explore": False},
+        evaluation_config={"explore": False, "input_": "sampler"},
     )
     return config
 
@@ -62,11 +64,20 @@ def user_model(model: Any) -> Any:
     return ppo("CartPole-v1", model={"custom_model": model})
 
 
+def make_replay_buffer(self: Any, config: Any) -> Any:
+    return from_config(ReplayBuffer, config["replay_buffer_config"])
+
+
+# DQN's validation turns the buffer's name into a class, in which ray 2.60 then looks for a word (TypeError).
+DQN._create_local_replay_buffer_if_necessary = make_replay_buffer
+
+
 def dqn(**training: Any) -> Any:
-    config = old(DQNConfig(), "CartPole-v1").env_runners(rollout_fragment_length=4)
+    config = old(DQNConfig(), "CartPole-v1")
+    config.env_runners(rollout_fragment_length=4)
     config.training(num_steps_sampled_before_learning_starts=4, train_batch_size=8, **training)
     config.reporting(min_sample_timesteps_per_iteration=8)
-    return config.training(model={"fcnet_hiddens": [16]}, replay_buffer_config=REPLAY)
+    return config.training(model={"fcnet_hiddens": [16]}, replay_buffer_config=dict(REPLAY))
 
 
 def sac(env: str, **more: Any) -> Any:
@@ -74,7 +85,7 @@ def sac(env: str, **more: Any) -> Any:
     small = {"fcnet_hiddens": [16], "fcnet_activation": "relu"}
     config.training(num_steps_sampled_before_learning_starts=4, train_batch_size=8, policy_model_config=small)
     config.reporting(min_sample_timesteps_per_iteration=8)
-    return config.training(q_model_config=small, replay_buffer_config=REPLAY)
+    return config.training(q_model_config=small, replay_buffer_config=dict(REPLAY))
 
 
 def parallel(config: Any) -> Any:
@@ -154,7 +165,8 @@ def configurations(out: Path) -> dict[str, Any]:
 def record(algorithm: Any) -> dict[str, dict[str, Any]]:
     """Let RLlib evaluate by itself and return what went in and out of the environment, by agent."""
     worker = algorithm.eval_env_runner_group.local_env_runner
-    algorithm.env_runner.foreach_policy(lambda policy, _: policy.agent_connectors.in_eval())
+    # RLlib hands the filters to remote evaluation workers only (`FilterManager.synchronize`, ray 2.60).
+    worker.sync_filters(algorithm.env_runner.get_filters())
     worker.foreach_policy(lambda policy, _: policy.agent_connectors.in_eval())
     env = worker.async_env.get_sub_environments()[0]
     seen: dict[str, list[tuple[Any, Any]]] = {}

@@ -126,6 +126,10 @@ class OldPreviousAction(OldModel):
         super().__init__(obs_space, action_space, *others, **more)
         self.view_requirements["prev_actions"] = ViewRequirement("actions", shift=-1, space=action_space)
 
+    def forward(self, input_dict: Any, state: Any, seq_lens: Any) -> Any:
+        outputs, state = super().forward(input_dict, state, seq_lens)
+        return outputs + input_dict["prev_actions"].float().reshape(len(outputs), 1), state
+
 
 class OldClockReader(OldModel):
     """A network that asks how many steps the episode has had."""
