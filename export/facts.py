@@ -65,7 +65,9 @@ def _read_old_facts(root: Path, notify: Callable[[str], None]) -> CheckpointFact
     state = _open(root / ALGORITHM_STATE, "algorithm, environment and progress", notify) or {}
     algorithm = getattr(state.get("algorithm_class"), "__name__", "unknown")
     config = _as_mapping(state.get("config"))
-    if not state and (spec := (_open(root / POLICY_STATE, "algorithm and environment", notify) or {}).get("policy_spec")):
+    if not state and (
+        spec := (_open(root / POLICY_STATE, "algorithm and environment", notify) or {}).get("policy_spec")
+    ):
         kind = spec.get("policy_class")
         name = kind if isinstance(kind, str) else getattr(kind, "__name__", "")
         algorithm = name.removesuffix("TorchPolicy") or "unknown"  # BC's policy is MARWIL's: not told apart

@@ -72,8 +72,8 @@ def old_stack_root(given: Path) -> Path | None:
         )
     if _major_version(given) == "1":
         raise CheckpointError(
-            f"{given} is incomplete: a checkpoint of RLlib's old API stack holds {POLICIES}/<policy id>/{POLICY_STATE}, "
-            "and this one holds no policy"
+            f"{given} is incomplete: a checkpoint of RLlib's old API stack holds "
+            f"{POLICIES}/<policy id>/{POLICY_STATE}, and this one holds no policy"
         )
     return None
 
@@ -97,8 +97,8 @@ def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFil
     files = OldStackFiles(root, policy_id or present[0])
     if not files.state.is_file():
         raise UnsupportedError(
-            f"{files.policy} holds its state as msgpack, which RLlib (ray 2.60) writes but cannot restore a policy "
-            f"from: save the checkpoint in RLlib's default format ({POLICY_STATE})"
+            f"{files.policy} holds its state as msgpack, which is not exported: only {POLICY_STATE}, RLlib's default, "
+            "is; restore the algorithm with RLlib (and msgpack_numpy) and save it again without msgpack"
         )
     return files
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,15 +44,13 @@ DISTRIBUTIONS: dict[type, DistributionKind] = {
     TorchSquashedGaussian: "squashed_gaussian",
     TorchCategorical: "categorical",
 }
-AGENT = 0  # the one agent's id; RLlib's own default is a string, and none of the connectors reads it
-
-AnyTorchPolicy: TypeAlias = "TorchPolicy | TorchPolicyV2"
+AGENT = "agent0"  # what RLlib calls the one agent of an environment
 
 
 class OldStackNetwork(nn.Module):
     """The policy's forward pass as a module that can be traced: network input to named tensors."""
 
-    def __init__(self, policy: AnyTorchPolicy, names: tuple[str, ...]) -> None:
+    def __init__(self, policy: Any, names: tuple[str, ...]) -> None:
         super().__init__()
         self.module: Any = policy.model
         self.names = names
@@ -64,15 +62,15 @@ class OldStackNetwork(nn.Module):
         return tuple(self.module.value_function() if name == "value" else inputs for name in self.names)
 
 
-def _distribution(policy: AnyTorchPolicy, obs: Any) -> tuple[Tensor, Any]:
+def _distribution(policy: Any, obs: Any) -> tuple[Tensor, Any]:
     """Return (distribution parameters or Q-values, distribution class), computed as `_compute_action_helper` does."""
     batch = policy._lazy_tensor_dict({SampleBatch.OBS: obs})
     batch.set_training(True)  # RLlib does so for inference, too
     how: dict[str, Any] = {"explore": False, "timestep": 0, "is_training": False, "state_batches": [], "seq_lens": None}
     kind: Any = policy.dist_class
-    if isinstance(policy, TorchPolicyV2) and is_overridden(policy.action_distribution_fn):
+    if issubclass(type(policy), TorchPolicyV2) and is_overridden(policy.action_distribution_fn):
         inputs, kind, _ = policy.action_distribution_fn(policy.model, obs_batch=batch, **how)
-    elif isinstance(policy, TorchPolicy) and policy.action_distribution_fn:
+    elif issubclass(type(policy), TorchPolicy) and policy.action_distribution_fn:
         inputs, kind, _ = policy.action_distribution_fn(policy, policy.model, input_dict=batch, **how)
     else:
         inputs, _ = policy.model(batch, [], None)
@@ -95,11 +93,13 @@ class OldStackCheckpoint:
         episode in an environment of its own. This repeats the steps of `EnvRunnerV2` (ray 2.60).
         """
         policy = self._policy
-        for env in range(len(obs)):
+        envs = [str(row) for row in range(len(obs))]
+        for env in envs:
             policy.agent_connectors.reset(env)
         first = {SampleBatch.INFOS: {}, SampleBatch.T: -1, SampleBatch.AGENT_INDEX: 0}
         items = [
-            AgentConnectorDataType(env, AGENT, {SampleBatch.NEXT_OBS: one, **first}) for env, one in enumerate(obs)
+            AgentConnectorDataType(env, AGENT, {SampleBatch.NEXT_OBS: one, **first})
+            for env, one in zip(envs, obs, strict=True)
         ]
         processed = policy.agent_connectors(items)
         batch = _batch_inference_sample_batches([item.data.sample_batch for item in processed])
@@ -114,7 +114,7 @@ class OldStackCheckpoint:
                 parameters = _distribution(policy, seen)[0].numpy()
         sent = [
             policy.action_connectors(ActionConnectorDataType(env, AGENT, item.data.raw_dict, (action, [], {}))).output
-            for env, (item, action) in enumerate(zip(processed, unbatch(convert_to_numpy(actions)), strict=True))
+            for env, item, action in zip(envs, processed, unbatch(convert_to_numpy(actions)), strict=True)
         ]
         outputs = {"action": np.stack([action for action, _, _ in sent]), self.network.names[0]: np.asarray(parameters)}
         return outputs if value is None else {**outputs, "value": value}
@@ -154,7 +154,7 @@ def load_old_stack(files: OldStackFiles, notify: Callable[[str], None], *, value
     )
 
 
-def _restore(files: OldStackFiles) -> AnyTorchPolicy:
+def _restore(files: OldStackFiles) -> Any:
     """Return the policy, as `Policy.from_checkpoint` would, but always on the CPU and without its optimizer."""
     state = unpickle(files.state)
     if not isinstance(state, dict) or not isinstance(state.get("policy_spec"), dict) or "weights" not in state:
@@ -174,11 +174,15 @@ def _restore(files: OldStackFiles) -> AnyTorchPolicy:
     try:
         policy: Any = Policy.from_state(state)
     except Exception as error:  # whatever RLlib, torch or the user's own constructor raises
-        raise CheckpointError(f"{files.state} cannot be restored: {explain(error)}") from error
+        # torch says which weights are missing on the lines below the first.
+        reason = " ".join(str(error).split())[:300] if "state_dict" in str(error) else explain(error)
+        raise CheckpointError(f"{files.state} cannot be restored: {reason}") from error
     finally:
         chatty.setLevel(level)
-    if not isinstance(policy, TorchPolicy | TorchPolicyV2):
-        raise UnsupportedError(f"policy {type(policy).__name__} is not a torch policy: only torch policies are exported")
+    if not issubclass(type(policy), TorchPolicy | TorchPolicyV2):
+        raise UnsupportedError(
+            f"policy {type(policy).__name__} is not a torch policy: only torch policies are exported"
+        )
     return policy
 
 
@@ -211,7 +215,7 @@ def _check_policy(files: OldStackFiles, policy: Any) -> None:
                 f"{view.shift}), which is not exported yet: the graph's only input is the observation"
             )
     samples_itself = (
-        is_overridden(policy.action_sampler_fn) if isinstance(policy, TorchPolicyV2) else policy.action_sampler_fn
+        is_overridden(policy.action_sampler_fn) if issubclass(type(policy), TorchPolicyV2) else policy.action_sampler_fn
     )
     if samples_itself:
         raise UnsupportedError(f"policy {name} samples its actions itself (action_sampler_fn), which is not exported")
@@ -252,14 +256,16 @@ def _action_rule(policy: Any, action_space: Box | AnyDiscrete) -> tuple[Distribu
     zeros = np.zeros((2, *policy.observation_space.shape), np.float32)
     try:
         with torch.no_grad():
-            inputs, kind = _distribution(policy, zeros)
+            _, kind = _distribution(policy, zeros)
     except KeyError as error:
         raise UnsupportedError(
             f"model {model} reads {error} besides the observation, which is not exported: the graph's only input is "
             "the observation"
         ) from error
     except Exception as error:  # the user's own forward may raise anything
-        raise UnsupportedError(f"model {model} does not run on a plain batch of observations: {first_line(error)}") from error
+        raise UnsupportedError(
+            f"model {model} does not run on a plain batch of observations: {first_line(error)}"
+        ) from error
     plain = getattr(kind, "func", kind)  # RLlib binds the space to some of its classes
     if isinstance(policy.model, DQNTorchModel) and issubclass(plain, TorchCategorical):
         return None, "argmax"
@@ -281,7 +287,7 @@ def _action_rule(policy: Any, action_space: Box | AnyDiscrete) -> tuple[Distribu
 
 def _has_value(policy: Any, notify: Callable[[str], None]) -> bool:
     """Return whether the policy's loss trains a value head (DQN's and SAC's models have one that nothing trains)."""
-    if not isinstance(policy, ValueNetworkMixin):
+    if not issubclass(type(policy), ValueNetworkMixin):
         return False
     for setting, untrained in (("beta", 0), ("use_critic", False)):  # of MARWIL (then it is BC) and of PPO
         if setting in policy.config and policy.config[setting] == untrained:

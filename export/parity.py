@@ -61,8 +61,8 @@ def prove(
 ) -> Parity:
     """Compare every format with what was recorded and return the largest differences.
 
-    `labels` name the action's elements for the message, `api_stack` what was recorded from. Raises ParityError at the first output that differs, saying
-    which element of which sample by how much.
+    `labels` name the action's elements for the message, `api_stack` is whose pipeline was recorded. Raises ParityError
+    at the first output that differs, saying which element of which sample by how much.
     """
     results = {name: _prove_format(name, recipe, recorded, run, labels) for name, run in formats.items()}
     return Parity(

@@ -32,11 +32,21 @@ def app() -> Path:
 @pytest.fixture(scope="session")
 def zoo() -> Iterator[Path]:
     """A folder of checkpoints `<name>/` and what the environment saw, `<name>.npz`."""
+    yield from trained("train_zoo.py")
+
+
+@pytest.fixture(scope="session")
+def old_zoo() -> Iterator[Path]:
+    """The same for RLlib's old API stack."""
+    yield from trained("train_old_zoo.py")
+
+
+def trained(script: str) -> Iterator[Path]:
     # A short path: Ray's sockets live below it, and a socket's path may have 107 characters.
     folder = Path(tempfile.mkdtemp(prefix="zoo-"))
     # With the token in its environment Ray writes none to the user's home.
     environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
-    command = [sys.executable, "-W", "ignore", str(HERE / "train_zoo.py"), str(folder)]
+    command = [sys.executable, "-W", "ignore", str(HERE / script), str(folder)]
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
         assert done.returncode == 0, done.stderr[-3000:]

@@ -33,6 +33,9 @@ import old_zoo_parts  # pyright: ignore[reportMissingImports]  # in app/, added 
 import old_zoo_registry  # pyright: ignore[reportMissingImports]
 
 STEPS = 100  # recorded
+REFUSED = {
+    "noisy_dqn", "batch_reader", "previous_action", "clock_reader", "lstm", "attention", "choice", "nested", "levers",
+}  # fmt: skip
 REPLAY = {"type": "MultiAgentPrioritizedReplayBuffer", "capacity": 100}
 
 
@@ -115,7 +118,9 @@ def configurations(out: Path) -> dict[str, Any]:
     attention = {"fcnet_hiddens": [8], "use_attention": True, "attention_dim": 8, "attention_num_transformer_units": 1}
     picture = {"conv_filters": [[4, [3, 3], 2], [8, [5, 5], 1]], "fcnet_hiddens": []}
     return {
-        "pendulum": ppo("Pendulum-v1", filtered="MeanStdFilter").offline_data(output=continuous, output_write_episodes=False),
+        "pendulum": ppo("Pendulum-v1", filtered="MeanStdFilter").offline_data(
+            output=continuous, output_write_episodes=False
+        ),
         "cart_pole": ppo("CartPole-v1").offline_data(output=discrete, output_write_episodes=False),
         "clipped": ppo("Pendulum-v1", **clip),
         "shared": ppo("Pendulum-v1", model={"vf_share_layers": True, "fcnet_activation": "relu"}),
@@ -215,7 +220,7 @@ def main(out: Path, only: list[str]) -> None:
             algorithm = config.build_algo()
             algorithm.train()
             algorithm.save(str(out / name))
-            if not isinstance(algorithm.env_runner.policy_map["arm" if name == "several" else "default_policy"].action_space, old_zoo_parts.gym.spaces.MultiDiscrete) and name != "nested":
+            if name not in REFUSED:
                 for agent, pairs in record(algorithm).items():
                     np.savez(out / f"{name if agent == 'agent' else f'{name}_{agent}'}.npz", **pairs)
             algorithm.stop()

@@ -36,7 +36,6 @@ SPACES: dict[str, tuple[gym.Space[Any], gym.Space[Any]]] = {
         Box(-1.0, 1.0, (2,), np.float32),
     ),
     "levers": (Box(-1.0, 1.0, (3,), np.float32), gym.spaces.MultiDiscrete([2, 3])),
-    "flat": (Box(-1.0, 1.0, (3,), np.float32), Box(-1.0, 1.0, (2, 2), np.float32)),
 }
 
 
@@ -46,7 +45,6 @@ class OldToy(gym.Env[Any, Any]):
     def __init__(self, config: Any = None) -> None:
         self.kind = dict(config)["kind"]
         self.observation_space, self.action_space = SPACES[self.kind]
-        self.seed = 1
 
     def _observe(self) -> Any:
         space = self.observation_space
@@ -137,10 +135,3 @@ class OldClockReader(OldModel):
     def forward(self, input_dict: Any, state: Any, seq_lens: Any) -> Any:
         input_dict["t"]
         return super().forward(input_dict, state, seq_lens)
-
-
-class OldNoValue(OldModel):
-    """A network without a value function, trained without a critic."""
-
-    def value_function(self) -> Any:
-        return torch.zeros(len(self.features)).to(self.features.device)
