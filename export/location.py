@@ -65,8 +65,9 @@ class CheckpointFiles:
 def locate_checkpoint(path: str | Path, module_id: str | None = None) -> CheckpointFiles | OldStackFiles:
     """Return the files of one policy.
 
-    `path` may be an algorithm checkpoint, a folder inside one (such as its RLModule folder), or a Tune trial folder,
-    of which the newest `checkpoint_NNNNNN` is taken.
+    `path` may be an algorithm checkpoint of either API stack, a folder inside one (such as its RLModule or policy
+    folder), an old-stack policy's folder on its own, or a Tune trial folder, of which the newest `checkpoint_NNNNNN` is
+    taken.
 
     Raises CheckpointError when there is nothing to read, UnsupportedError when it is of a kind that is not exported.
     """

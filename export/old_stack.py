@@ -1,4 +1,4 @@
-"""Restore a policy of RLlib's old API stack, and run it as RLlib itself would. Beside checkpoint.py, imports ray.rllib.
+"""Restore a policy of RLlib's old API stack, and run it as RLlib itself would. It imports ray.rllib, as checkpoint.py.
 
 Restoring starts nothing: no `ray.init`, no environment, no worker. `OldStackCheckpoint.reference` is the truth an
 export is compared with: the policy's own agent connectors, `compute_actions_from_input_dict` and action connectors, as
@@ -194,7 +194,8 @@ def _check_config(files: OldStackFiles, policy_class: Any, config: Mapping[str, 
             f"policy {name} of {files.root} is written in {framework} (TensorFlow): only torch policies are exported; "
             "train with framework='torch'"
         )
-    if config.get("enable_rl_module_and_learner") is True or config.get("_enable_rl_module_api") is True:
+    mixtures = ("enable_rl_module_and_learner", "_enable_rl_module_api", "_enable_new_api_stack")
+    if any(config.get(setting) is True for setting in mixtures):
         raise UnsupportedError(
             f"{files.root} holds an RLModule inside an old-stack policy ({name}), a mixture that Ray 2.5 to 2.9 wrote "
             "and today's cannot restore: restore it in the Ray that wrote it"

@@ -231,7 +231,7 @@ def test_a_clip_the_filter_does_not_have_is_caught(load: Callable[..., OldStackC
     frozen = restored.recipe.filter
     assert frozen is not None and frozen.clip is None
     clipped = dataclasses.replace(restored.recipe, steps=(dataclasses.replace(frozen, clip=10.0),))
-    with pytest.raises(ParityError, match=r"wide|extreme"):
+    with pytest.raises(ParityError, match=r"output 'action(_dist_inputs)?'"):
         prove_as(restored, clipped, tmp_path)
 
 
@@ -320,6 +320,10 @@ def spec_of(state: dict[str, Any]) -> dict[str, Any]:
     return dict.__getitem__(state, "policy_spec")["config"]  # type: ignore[no-any-return]
 
 
+def filter_of(state: dict[str, Any]) -> dict[str, Any]:
+    return dict(state["connector_configs"]["agent"][1])["MeanStdObservationFilterAgentConnector"]  # type: ignore[no-any-return]
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
@@ -353,6 +357,16 @@ def spec_of(state: dict[str, Any]) -> dict[str, Any]:
             lambda state: np.copyto(state["weights"]["_logits._model.0.bias"], np.nan),
             CheckpointError,
             "'_logits._model.0.bias' are not all finite: training diverged",
+        ),
+        (
+            lambda state: filter_of(state)["running_stats"][0].pop("sum_sq_diff_array"),
+            UnsupportedError,
+            "the observation filter's statistics are in an earlier Ray's form",
+        ),
+        (
+            lambda state: filter_of(state)["running_stats"][0].update(mean_array="eJyb"),
+            CheckpointError,
+            "policy_state.pkl cannot be restored",
         ),
         (lambda state: state.pop("policy_spec"), CheckpointError, "is not a policy's state"),
         (
@@ -393,6 +407,22 @@ def test_a_damaged_algorithm_state_costs_only_the_facts(
     result = export_checkpoint(damaged, tmp_path / "out", notify=notices.append)
     assert result.contract.provenance.algorithm == "unknown"
     assert "algorithm, environment and progress cannot be told" in " ".join(notices)
+
+
+def test_settings_that_an_earlier_ray_did_not_know_take_their_defaults(
+    old_copy: Callable[[str], Path], load: Callable[..., OldStackCheckpoint], old_zoo: Path
+) -> None:
+    newer = ("callbacks_on_", "offline_", "num_gpus_per_env_runner", "num_env_runners", "enable_rl_module", "torch_")
+
+    def forget(state: dict[str, Any]) -> None:
+        for key in [key for key in spec_of(state) if key.startswith(newer)]:
+            del spec_of(state)[key]
+
+    damaged = old_copy("pendulum")
+    rewrite(damaged / STATE, forget)
+    seen = np.load(old_zoo / "pendulum.npz")
+    action = load("pendulum", damaged.parent).reference(seen["obs"])["action"]
+    np.testing.assert_allclose(action, seen["action"], rtol=1e-5, atol=1e-6)
 
 
 def test_a_gpu_checkpoint_is_read_on_the_cpu(
