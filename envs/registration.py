@@ -5,8 +5,6 @@ It must stay light: every program that imports gymnasium runs it. MuJoCo is impo
 
 from __future__ import annotations
 
-from gymnasium.envs.registration import register, registry
-
 NAMESPACE = "rlservo"
 ENTRY_POINTS = {
     "EndEffectorPositioningURSim-v0": "rlservo.envs.ur.end_effector_positioning:EndEffectorPositioningURSim",
@@ -20,6 +18,9 @@ def register_envs() -> None:
 
     The episode limit is the environment's own, so no `max_episode_steps` is given here.
     """
+    # Not at the top: importing gymnasium calls this function (discovery.py), which must exist by then.
+    from gymnasium.envs.registration import register, registry
+
     for name, entry_point in ENTRY_POINTS.items():
         if f"{NAMESPACE}/{name}" not in registry:
             register(id=f"{NAMESPACE}/{name}", entry_point=entry_point)

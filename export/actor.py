@@ -8,103 +8,123 @@ single precision allows.
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, MultiDiscrete
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rlservo.export.recipe import Flatten, ObservationFilter, ObservationStep, Recipe, Rescale
+from rlservo.export.observing import ObservationNode, observation_nodes
+from rlservo.export.recipe import Recipe, leaf_transform, parameter_count
+from rlservo.export.trees import Tree, build, map_tree, named_leaves
 
-# What may be left out of the filter's mean, in units of the filtered observation: below float32's step near 1.
-NEGLIGIBLE = 1e-7
+REWARD = "reward"
 
 
 class TracedNetwork(Protocol):
-    """A module from the network's input to one tensor for each name."""
+    """A module from the network's input to one tensor for each name.
+
+    Where it computes the actions itself, their `given` leaves come before the named ones. A recurrent one takes its
+    state as a second argument, a list in the order of `Recipe.network_state`, and returns the next state's tensors
+    after the named ones.
+    """
 
     names: tuple[str, ...]
+    given: int
 
-    def __call__(self, obs: Tensor) -> tuple[Tensor, ...]: ...
+    def __call__(self, obs: Tree, *state: list[Tensor]) -> tuple[Tensor, ...]: ...
 
 
 class PolicyGraph(nn.Module):
-    """Observation steps, network, action rule. Outputs are `output_names`, in that order."""
+    """Observation steps, network, action rule. Inputs are `input_names`, outputs `output_names`, in that order."""
 
     def __init__(self, recipe: Recipe, network: TracedNetwork) -> None:
         super().__init__()
-        self.steps = nn.ModuleList()
-        dtype = _dtype(recipe.observation_space)
-        for step in recipe.steps:
-            if isinstance(step, Flatten | Rescale):
-                dtype = torch.float32
-            self.steps.append(_node(step, dtype))
+        self.space = recipe.observation_space
+        self.leaves = len(recipe.observation_leaves)
+        self.steps: nn.ModuleList = observation_nodes(recipe)
         self.network = network
         self.action = ActionNode(recipe)
-        self.output_names = ("action", *network.names)
+        self.remembered = [state.name for state in recipe.state]
+        self.carried = len(recipe.state) - len(recipe.network_state)
+        self.recurrent = bool(recipe.network_state)
+        self.rewarded = recipe.needs_reward
+        self.input_names = (
+            *recipe.observation_leaves,
+            *([REWARD] if self.rewarded else []),
+            *(f"state_in.{name}" for name in self.remembered),
+        )
+        self.output_names = (
+            *recipe.action_leaves,
+            *network.names,
+            *(f"state_out.{name}" for name in self.remembered),
+        )
         self.eval()
 
-    def forward(self, obs: Tensor) -> tuple[Tensor, ...]:
-        """Return (action, ...) for raw observations `[batch, *obs_shape]` of the space's dtype."""
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the outputs for observation leaves `[batch, ...]` of the space's dtype, then reward and state."""
+        rest = list(inputs)
+        obs: Tree = build(self.space, [rest.pop(0) for _ in range(self.leaves)])
+        memory: dict[str, Tensor] = {REWARD: rest.pop(0)} if self.rewarded else {}
+        memory.update(zip(self.remembered, rest, strict=True))
         for step in self.steps:
-            obs = step(obs)
-        outputs = self.network(_cast(obs, torch.float32))
-        return (self.action(outputs[0]), *outputs)
+            assert isinstance(step, ObservationNode)
+            obs = step(obs, memory)
+        obs = map_tree(_single, obs)
+        state = [memory[name] for name in self.remembered[self.carried :]]
+        outputs = self.network(obs, state) if self.recurrent else self.network(obs)
+        ready, outputs = outputs[: self.network.given], outputs[self.network.given :]
+        named, after = outputs[: len(self.network.names)], outputs[len(self.network.names) :]
+        actions = self.action.finish(ready) if ready else self.action(named[0])
+        if "previous_actions" in memory:
+            memory["previous_actions"] = _remember(memory["previous_actions"], actions[0], self.action.choices)
+        memory.update(zip(self.remembered[self.carried :], after, strict=True))
+        return (*actions, *named, *(memory[name] for name in self.remembered))
 
 
-class FlattenNode(nn.Module):
-    """`[batch, ...]` to `[batch, elements]`, float32 as RLlib makes it."""
-
-    def forward(self, obs: Tensor) -> Tensor:
-        return _cast(obs.flatten(1), torch.float32)
+def _single(leaf: Tensor) -> Tensor:
+    """RLlib hands floating-point leaves to the network in single precision, and integers as they are."""
+    return leaf.float() if leaf.dtype == torch.float64 else leaf
 
 
-class RescaleNode(nn.Module):
-    """`(x - offset) / divisor`, in float32 from the start as RLlib's preprocessor does it."""
-
-    def __init__(self, step: Rescale) -> None:
-        super().__init__()
-        self.offset, self.divisor = step.offset, step.divisor
-
-    def forward(self, obs: Tensor) -> Tensor:
-        return (_cast(obs, torch.float32) - self.offset) / self.divisor
-
-
-class FilterNode(nn.Module):
-    """RLlib's frozen MeanStdFilter.
-
-    RLlib subtracts in double precision. With single-precision observations the same is reached by subtracting the mean
-    in two parts: the nearest float32, then what that left over (Dekker 1971), where the rest matters at all.
-    """
-
-    offset: Tensor
-    rest: Tensor
-    scale: Tensor
-
-    def __init__(self, frozen: ObservationFilter, dtype: torch.dtype) -> None:
-        super().__init__()
-        self.clip = frozen.clip
-        offset, scale = frozen.offset(), 1.0 / frozen.divisor().astype(np.float64)
-        rest = offset - offset.astype(np.float32)
-        self.has_rest = dtype == torch.float32 and bool(np.max(np.abs(rest) * scale, initial=0.0) > NEGLIGIBLE)
-        self.register_buffer("offset", torch.tensor(offset, dtype=dtype))
-        self.register_buffer("rest", torch.tensor(rest, dtype=dtype))
-        self.register_buffer("scale", torch.tensor(scale, dtype=dtype))
-
-    def forward(self, obs: Tensor) -> Tensor:
-        obs = obs - self.offset
-        if self.has_rest:
-            obs = obs - self.rest
-        obs = obs * self.scale
-        if self.clip is not None:
-            obs = torch.clamp(obs, -self.clip, self.clip)
-        return obs
+def _remember(codes: Tensor, action: Tensor, choices: int) -> Tensor:
+    """Return the one-hot codes of the last actions with the oldest dropped and `action` added at the end."""
+    latest = torch.eq(action.unsqueeze(-1), torch.arange(choices)).float()
+    return torch.cat((codes[:, choices:], latest), dim=-1)
 
 
 class ActionNode(nn.Module):
-    """The distribution's mode, then what RLlib does to it before `env.step`.
+    """The distribution's mode, then what RLlib does to it before `env.step`, for every leaf of the action."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        super().__init__()
+        spaces = recipe.action_leaves
+        self.space = recipe.action_space
+        self.leaves = nn.ModuleList(ActionLeaf(recipe, space) for space in spaces.values())
+        self.widths = [parameter_count(space) for space in spaces.values()]
+        self.user_steps = [step.function for step in recipe.action_steps]
+        self.choices = self.widths[0]
+
+    def forward(self, parameters: Tensor) -> tuple[Tensor, ...]:
+        """Return one tensor per action leaf, given the distribution's parameters (or Q-values) `[batch, n]`."""
+        parts = [parameters] if len(self.widths) == 1 else torch.split(parameters, self.widths, dim=-1)
+        return self.finish([leaf.choose(part) for leaf, part in zip(self.leaves, parts, strict=True)])
+
+    def finish(self, chosen: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Return what goes to the environment, given the leaves the policy chose."""
+        if self.user_steps:
+            tree = build(self.space, chosen)
+            for function in self.user_steps:
+                tree = function(tree)
+            chosen = list(named_leaves(tree, "action").values())
+        return tuple(leaf.finish(one) for leaf, one in zip(self.leaves, chosen, strict=True))
+
+
+class ActionLeaf(nn.Module):
+    """One leaf of the action.
 
     Unsquashing is `low + (a + 1) * (high - low) / 2`, clipped (`unsquash_action`, ray 2.60), here as
     `a * half_range + middle`.
@@ -115,14 +135,14 @@ class ActionNode(nn.Module):
     low: Tensor
     high: Tensor
 
-    def __init__(self, recipe: Recipe) -> None:
+    def __init__(self, recipe: Recipe, space: Any) -> None:
         super().__init__()
-        self.mode, self.transform = recipe.mode, recipe.transform
-        space = recipe.action_space
+        self.mode, self.transform = recipe.mode, leaf_transform(space, recipe.transform)
         self.box = isinstance(space, Box)
-        if isinstance(space, Discrete):
+        self.nvec = space.nvec.ravel().tolist() if isinstance(space, MultiDiscrete) else None
+        if not isinstance(space, Box):
             return
-        self.dtype = _dtype(space)
+        self.dtype = torch.float64 if space.dtype == np.float64 else torch.float32
         self.width = int(np.prod(space.shape))
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
         with np.errstate(invalid="ignore"):  # infinite bounds are never unsquashed
@@ -132,12 +152,20 @@ class ActionNode(nn.Module):
         for name, values in (("half_range", half), ("middle", middle), ("low", low), ("high", high)):
             self.register_buffer(name, torch.tensor(values, dtype=self.dtype))
 
-    def forward(self, parameters: Tensor) -> Tensor:
+    def choose(self, parameters: Tensor) -> Tensor:
+        """Return the distribution's mode."""
+        if self.nvec is not None:
+            parts = torch.split(parameters, self.nvec, dim=-1)
+            return torch.stack([torch.argmax(part, dim=-1) for part in parts], dim=-1)
         if not self.box:
             return torch.argmax(parameters, dim=-1)
         action = torch.split(parameters, [self.width, self.width], dim=-1)[0]
-        if self.mode == "tanh_mean":
-            action = torch.tanh(action)
+        return torch.tanh(action) if self.mode == "tanh_mean" else action
+
+    def finish(self, action: Tensor) -> Tensor:
+        """Return what goes to the environment."""
+        if not self.box:
+            return action
         action = _cast(action, self.dtype)
         if self.transform == "unsquash" and self.is_scaled:
             action = action * self.half_range
@@ -149,12 +177,6 @@ class ActionNode(nn.Module):
         if self.limits is not None:
             return torch.clamp(action, *self.limits)
         return torch.minimum(torch.maximum(action, self.low), self.high)
-
-
-def _node(step: ObservationStep, dtype: torch.dtype) -> nn.Module:
-    if isinstance(step, Flatten):
-        return FlattenNode()
-    return RescaleNode(step) if isinstance(step, Rescale) else FilterNode(step, dtype)
 
 
 def _same_everywhere(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[float, float] | None:
@@ -169,7 +191,3 @@ def _same_everywhere(low: NDArray[np.float64], high: NDArray[np.float64]) -> tup
 def _cast(tensor: Tensor, dtype: torch.dtype) -> Tensor:
     """Return `tensor` as `dtype`, without a node where it is so already."""
     return tensor if tensor.dtype == dtype else tensor.to(dtype)
-
-
-def _dtype(space: Box) -> torch.dtype:
-    return torch.float64 if space.dtype == np.float64 else torch.float32

@@ -22,7 +22,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,8 +97,107 @@ class DiscreteSpec(_Model):
     def size(self) -> int:
         return 1
 
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (low, high), both inclusive and of shape ()."""
+        return np.array(self.start, np.float64), np.array(self.start + self.n - 1, np.float64)
 
-SpaceSpec = Annotated[BoxSpec | DiscreteSpec, Field(discriminator="kind")]
+
+class MultiDiscreteSpec(_Model):
+    """A Gymnasium MultiDiscrete: element i is one of `nvec[i]` integers from `start[i]` on, in row-major order."""
+
+    kind: Literal["multi_discrete"] = "multi_discrete"
+    shape: tuple[int, ...]
+    nvec: tuple[int, ...]
+    start: tuple[int, ...]
+    dtype: str = "int64"
+    elements: tuple[Element, ...] = ()
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (low, high), both inclusive and of the space's shape."""
+        low = np.array(self.start, np.float64).reshape(self.shape)
+        return low, low + np.array(self.nvec, np.float64).reshape(self.shape) - 1
+
+
+class MultiBinarySpec(_Model):
+    """A Gymnasium MultiBinary: every element is 0 or 1."""
+
+    kind: Literal["multi_binary"] = "multi_binary"
+    shape: tuple[int, ...]
+    dtype: str = "int8"
+    elements: tuple[Element, ...] = ()
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (low, high), both inclusive and of the space's shape."""
+        return np.zeros(self.shape), np.ones(self.shape)
+
+
+class DictSpec(_Model):
+    """A Gymnasium Dict; its leaves are tensors of their own, called `obs.<key>` or `action.<key>`."""
+
+    kind: Literal["dict"] = "dict"
+    spaces: dict[str, SpaceSpec]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """A nested space is no array."""
+        return ()
+
+    @property
+    def size(self) -> int:
+        return sum(leaf.size for leaf in leaf_specs(self, "").values())
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """Only leaves name elements."""
+        return ()
+
+
+class TupleSpec(_Model):
+    """A Gymnasium Tuple; its leaves are tensors of their own, called `obs.<index>` or `action.<index>`."""
+
+    kind: Literal["tuple"] = "tuple"
+    spaces: tuple[SpaceSpec, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """A nested space is no array."""
+        return ()
+
+    @property
+    def size(self) -> int:
+        return sum(leaf.size for leaf in leaf_specs(self, "").values())
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """Only leaves name elements."""
+        return ()
+
+
+LeafSpec: TypeAlias = BoxSpec | DiscreteSpec | MultiDiscreteSpec | MultiBinarySpec
+SpaceSpec = Annotated[
+    BoxSpec | DiscreteSpec | MultiDiscreteSpec | MultiBinarySpec | DictSpec | TupleSpec, Field(discriminator="kind")
+]
+DictSpec.model_rebuild()
+TupleSpec.model_rebuild()
+
+
+def leaf_specs(space: SpaceSpec, name: str) -> dict[str, LeafSpec]:
+    """Return every leaf of a space by tensor name, `name` or `name.<path>`: Dict keys sorted, as RLlib has them."""
+    if isinstance(space, DictSpec):
+        inside = {key: space.spaces[key] for key in sorted(space.spaces)}
+    elif isinstance(space, TupleSpec):
+        inside = {str(index): child for index, child in enumerate(space.spaces)}
+    else:
+        return {name: space}
+    return {path: leaf for key, child in inside.items() for path, leaf in leaf_specs(child, f"{name}.{key}").items()}
 
 
 class TensorSpec(_Model):
@@ -110,21 +209,36 @@ class TensorSpec(_Model):
 
 
 class StateSpec(_Model):
-    """A recurrent state: graph input `state_in.<name>`, output `state_out.<name>`; `initial` starts an episode."""
+    """A policy's memory: graph input `state_in.<name>`, output `state_out.<name>`; `initial` starts an episode."""
 
     name: str
     dtype: str
     shape: tuple[int, ...] = Field(description="Without the batch axis")
-    initial: float = 0.0
+    initial: float | tuple[float, ...] = Field(0.0, description="One number, or one per element in row-major order")
+    kind: Literal["recurrent", "frames", "previous_actions", "previous_rewards"] = Field(
+        "recurrent",
+        description="'previous_actions' holds the last actions' one-hot codes, oldest first: whoever acts otherwise "
+        "than the graph's own `action` (exploring) writes that action's code into the end of it",
+    )
+
+    def initial_value(self, batch: int) -> NDArray[Any]:
+        """Return the state at an episode's start, `[batch, *shape]`."""
+        one = np.asarray(self.initial, self.dtype)
+        one = one.reshape(self.shape) if one.ndim else np.full(self.shape, one)
+        return np.repeat(one[None], batch, axis=0)
 
 
 class Distribution(_Model):
     """How `action_dist_inputs` become an exploring action; the deterministic one is the graph's own `action`."""
 
-    kind: Literal["diag_gaussian", "squashed_gaussian", "categorical"]
+    kind: Literal["diag_gaussian", "squashed_gaussian", "categorical", "multi_categorical", "multi"] = Field(
+        description="'multi' has one part for each leaf of a nested action space, in the order of the graph's outputs: "
+        "diag_gaussian for a box, categorical or multi_categorical for the others"
+    )
     transform: Literal["none", "unsquash", "clip"] = Field(
         description="What RLlib does to a sample before env.step: 'unsquash' maps [-1, 1] to the bounds and clips, "
-        "'clip' only clips, 'none' sends it as it is (discrete actions: adds the space's start)"
+        "'clip' only clips, 'none' sends it as it is (discrete actions: adds the space's start). Box leaves that are "
+        "not bounded on all sides are never unsquashed"
     )
 
 
@@ -353,7 +467,8 @@ def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapp
     """Write golden.npz; every array's first axis is the sample."""
     arrays = {f"input/{name}": value for name, value in inputs.items()}
     arrays.update({f"output/{name}": value for name, value in outputs.items()})
-    np.savez_compressed(folder / GOLDEN_FILE, allow_pickle=False, **arrays)
+    # `allow_pickle` would be one more array to numpy before 2.1; load_bundle refuses pickled ones.
+    np.savez_compressed(folder / GOLDEN_FILE, **arrays)  # type: ignore[arg-type]  # for numpy 2's keyword above
 
 
 def write_contract(folder: Path, contract: Contract) -> None:
@@ -382,7 +497,7 @@ def sha256(file: Path) -> str:
     return digest.hexdigest()
 
 
-def iter_elements(space: BoxSpec | DiscreteSpec) -> Iterator[tuple[int, str]]:
+def iter_elements(space: LeafSpec) -> Iterator[tuple[int, str]]:
     """Yield (index, label) for error messages: the element's name where known, else its index."""
     for index in range(space.size):
         named = index < len(space.elements)

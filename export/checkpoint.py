@@ -1,4 +1,4 @@
-"""Restore a policy from an RLlib checkpoint, and run it as RLlib itself would. The one file that imports ray.rllib.
+"""Restore a policy from an RLlib checkpoint, and run it as RLlib itself would. It imports ray.rllib, as old_stack.py does.
 
 Restoring starts nothing: no `ray.init`, no environment, no worker. The module and both connector pipelines come from
 their own folders in the checkpoint; `connectors.py` reads off them what they do. `Checkpoint.reference` is the truth
@@ -28,42 +28,184 @@ from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from torch import Tensor, nn
 
-from rlservo.export.connectors import check_spaces, read_observation_steps, read_transform
+from rlservo.export.connectors import check_spaces, read_action_steps, read_observation_steps
 from rlservo.export.errors import CheckpointError, UnsupportedError
 from rlservo.export.heads import replace_heads
 from rlservo.export.location import CTOR_FILE, STATE_STEMS, CheckpointFiles
-from rlservo.export.recipe import AnyDiscrete, DistributionKind, Mode, Recipe
+from rlservo.export.modes import find_mode
+from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf
+from rlservo.export.samples import Inputs, draw_batches
+from rlservo.export.trees import Tree, build, build_like, is_nested, map_tree, named_leaves, space_leaves, tree_leaves
 from rlservo.export.unpickle import explain, first_line, unpickle
 
 DISTRIBUTIONS: dict[str, DistributionKind] = {
     "TorchDiagGaussian": "diag_gaussian",
     "TorchSquashedGaussian": "squashed_gaussian",
     "TorchCategorical": "categorical",
+    "TorchMultiCategorical": "multi_categorical",
+    "TorchMultiDistribution": "multi",
 }
 QF_PREDS = "qf_preds"  # DQN's key for the Q-values, in ray/rllib/algorithms/dqn/default_dqn_rl_module.py
 
 
 class Network(nn.Module):
-    """RLlib's inference forward pass as a module that can be traced: network input to named tensors."""
+    """RLlib's inference forward pass as a module that can be traced: network input to named tensors.
 
-    def __init__(self, module: Any, names: tuple[str, ...]) -> None:
+    Where the module computes its actions itself, their leaves come first; a recurrent one's next state comes last.
+    """
+
+    def __init__(self, module: Any, names: tuple[str, ...], given: int = 0) -> None:
         super().__init__()
         self.module = module
         self.names = names
+        self.given = given
+        """How many action leaves the module gives ready-made."""
+        self.state = module.get_initial_state() if module.is_stateful() else None
 
-    def forward(self, obs: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, obs: Tree, *state: list[Tensor]) -> tuple[Tensor, ...]:
         """Return one tensor `[batch, ...]` for each of `names`, given the network's input `[batch, ...]`."""
-        return tuple(_output(self.module, name, {Columns.OBS: obs}) for name in self.names)
+        stateful = self.state is not None
+        found: dict[str, Tensor] = {}
+        ready: list[Tensor] = []
+        after: list[Tensor] = []
+        given: dict[str, Any] = {}
+        # A value alone does not say what to do: then the forward pass is run for the actions or the state.
+        for name in self.names if set(self.names) - {"value"} else ("", *self.names):
+            # A user's forward may change its batch, so each call gets its own.
+            batch = {Columns.OBS: map_tree(lambda leaf: leaf.unsqueeze(1) if stateful else leaf, obs)}
+            if stateful:
+                batch[Columns.STATE_IN] = build_like(self.state, state[0])
+            if name == "value":
+                found[name] = self.module.compute_values(batch)
+            elif name == "q_values":
+                given = self.module.compute_q_values(batch)
+                found[name] = given[QF_PREDS]
+            else:
+                given = self.module._forward_inference(batch)
+                if name:
+                    found[name] = given[Columns.ACTION_DIST_INPUTS]
+        if self.given:
+            ready = tree_leaves(given[Columns.ACTIONS])
+        if stateful:
+            after = tree_leaves(given[Columns.STATE_OUT])
+            ready = [leaf.squeeze(1) for leaf in ready]
+            found = {name: leaf.squeeze(1) for name, leaf in found.items()}
+        return (*ready, *found.values(), *after)
 
 
-def _output(module: Any, name: str, batch: dict[str, Any]) -> Tensor:
-    if name == "value":
-        value: Tensor = module.compute_values(batch)
-    elif name == "q_values":
-        value = module.compute_q_values(batch)[QF_PREDS]
-    else:
-        value = module._forward_inference(batch)[Columns.ACTION_DIST_INPUTS]
-    return value
+@dataclass(frozen=True)
+class Pipelines:
+    """RLlib's own way from an observation to an action."""
+
+    module: Any
+    env_to_module: ConnectorPipelineV2
+    module_to_env: ConnectorPipelineV2
+    observation_space: Any
+    action_space: Any
+
+    def to_module(self, episodes: list[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return (the module's batch, what the pipelines tell each other)."""
+        shared: dict[str, Any] = {}
+        with torch.no_grad():
+            batch = self.env_to_module(
+                rl_module=self.module, batch={}, episodes=episodes, explore=False, shared_data=shared
+            )
+        return batch, shared
+
+    def forward(self, batch: dict[str, Any]) -> dict[str, Any]:
+        """Return what the module gives for its batch, which it may change."""
+        with torch.no_grad():
+            given: dict[str, Any] = self.module.forward_inference(_own(batch))
+        return given
+
+    def to_env(self, given: dict[str, Any], episodes: list[Any], shared: dict[str, Any]) -> dict[str, Any]:
+        """Return what comes out for the environment and for the episodes."""
+        with torch.no_grad():
+            sent: dict[str, Any] = self.module_to_env(
+                rl_module=self.module, batch=given, episodes=episodes, explore=False, shared_data=shared
+            )
+        return sent
+
+    def begin(self, obs: Any) -> Any:
+        """Return an episode that has just been reset."""
+        episode = SingleAgentEpisode(observation_space=self.observation_space, action_space=self.action_space)
+        episode.add_env_reset(observation=obs)
+        return episode
+
+
+class RllibLoop:
+    """RLlib acting step after step, as `SingleAgentEnvRunner._sample` does it (ray 2.60): exploration off."""
+
+    def __init__(self, pipelines: Pipelines, recipe: Recipe, network: Network) -> None:
+        self._pipelines = pipelines
+        self._recipe = recipe
+        self._network = network
+        self._episodes: list[Any] = []
+        self._last: list[tuple[Any, dict[str, Any]]] = []
+
+    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+        """Return what RLlib computes for one step of every row, by output name."""
+        rows = _rows(self._recipe.observation_space, inputs, len(restart))
+        rewards = inputs.get("reward", np.zeros(len(restart)))
+        if not self._episodes:
+            self._episodes = [None] * len(rows)
+        for row, obs in enumerate(rows):
+            if restart[row] or self._episodes[row] is None:
+                self._episodes[row] = self._pipelines.begin(obs)
+            else:
+                action, extra = self._last[row]
+                self._episodes[row].add_env_step(
+                    observation=obs, action=action, reward=float(rewards[row]), extra_model_outputs=extra
+                )
+        # RLlib's log-probability of a nested deterministic action does not fit more than one environment (ray 2.60):
+        # there, it acts for one at a time.
+        alone = is_nested(self._recipe.action_space)
+        groups = [[row] for row in range(len(rows))] if alone else [list(range(len(rows)))]
+        self._last = []
+        found = [self._decide([self._episodes[row] for row in group]) for group in groups]
+        return {name: np.concatenate([one[name] for one in found]) for name in found[0]}
+
+    def _decide(self, episodes: list[Any]) -> dict[str, NDArray[Any]]:
+        """Return what RLlib computes for these episodes, and remember what they have to be told with the next step."""
+        batch, shared = self._pipelines.to_module(episodes)
+        given = self._pipelines.forward(batch)
+        outputs = self._outputs(batch, given)
+        sent = self._pipelines.to_env(given, episodes, shared)
+        # The episodes remember the module's own actions; the environment gets those that have been scaled.
+        own = sent.pop(Columns.ACTIONS)
+        action = sent.pop(Columns.ACTIONS_FOR_ENV, own)
+        self._last += [
+            (_pick(own, row), {key: values[row] for key, values in sent.items()}) for row in range(len(episodes))
+        ]
+        named = {name: np.asarray(leaf) for name, leaf in named_leaves(action, "action").items()}
+        return {**named, **outputs}
+
+    def _outputs(self, batch: dict[str, Any], given: dict[str, Any]) -> dict[str, NDArray[Any]]:
+        """Return the network's outputs: those of the forward pass, copied, and those that take a pass of their own."""
+        module, stateful = self._pipelines.module, self._network.state is not None
+        found: dict[str, NDArray[Any]] = {}
+        with torch.no_grad():
+            for name in self._network.names:
+                if name == "value":
+                    tensor = module.compute_values(_own(batch))
+                elif name == "q_values":
+                    tensor = module.compute_q_values(_own(batch))[QF_PREDS]
+                else:
+                    tensor = given[Columns.ACTION_DIST_INPUTS]
+                found[name] = (tensor.squeeze(1) if stateful else tensor).numpy().copy()
+        after = tree_leaves(given[Columns.STATE_OUT]) if stateful else []
+        for leaf, tensor in zip(self._recipe.network_state, after, strict=True):
+            found[f"state_out.{leaf.name}"] = tensor.numpy().copy()
+        return found
+
+
+def _own(batch: dict[str, Any]) -> dict[str, Any]:
+    """Return the same tensors in dicts that a user's forward may change."""
+    return {key: map_tree(lambda leaf: leaf, value) for key, value in batch.items()}
+
+
+def _pick(tree: Tree, row: int) -> Tree:
+    return map_tree(lambda leaf: leaf[row], tree)
 
 
 @dataclass(frozen=True)
@@ -73,35 +215,26 @@ class Checkpoint:
     recipe: Recipe
     network: Network
     module_class: str
-    _module: Any
-    _env_to_module: ConnectorPipelineV2
-    _module_to_env: ConnectorPipelineV2
+    pipelines: Pipelines
 
-    def reference(self, obs: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return what RLlib computes for a batch of raw observations `[batch, *obs_shape]`, by output name.
+    def reference(self, inputs: Inputs) -> dict[str, NDArray[Any]]:
+        """Return what RLlib computes for a batch of raw observations `[batch, ...]` by input name, by output name.
 
-        `action` is what RLlib would pass to `env.step`: exploration off, filter frozen. This repeats the steps of
-        `SingleAgentEnvRunner._sample` (ray 2.60).
+        `action` is what RLlib would pass to `env.step`: exploration off, filter frozen. Every row is an episode's
+        first step.
         """
-        episodes: list[Any] = []
-        for one in obs:
-            episode = SingleAgentEpisode(
-                observation_space=self.recipe.observation_space, action_space=self.recipe.action_space
-            )
-            episode.add_env_reset(observation=one)
-            episodes.append(episode)
-        shared: dict[str, Any] = {}
-        with torch.no_grad():
-            batch = self._env_to_module(
-                rl_module=self._module, batch={}, episodes=episodes, explore=False, shared_data=shared
-            )
-            outputs = {name: _output(self._module, name, dict(batch)).numpy() for name in self.network.names}
-            to_env = self._module.forward_inference(batch)
-            to_env = self._module_to_env(
-                rl_module=self._module, batch=to_env, episodes=episodes, explore=False, shared_data=shared
-            )
-        action = np.asarray(to_env.get(Columns.ACTIONS_FOR_ENV, to_env[Columns.ACTIONS]))
-        return {"action": action, **outputs}
+        rows = len(next(iter(inputs.values())))
+        return self.loop().step(inputs, np.ones(rows, np.bool_))
+
+    def loop(self) -> RllibLoop:
+        """Return RLlib acting step after step, which a policy with a memory is compared with."""
+        return RllibLoop(self.pipelines, self.recipe, self.network)
+
+
+def _rows(space: Any, inputs: Inputs, count: int) -> list[Any]:
+    """Return each observation in the form an environment gives it."""
+    names = list(space_leaves(space, "obs"))
+    return [build(space, [inputs[name][row] for name in names]) for row in range(count)]
 
 
 def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, value: bool = True) -> Checkpoint:
@@ -118,28 +251,21 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
     name = type(module).__name__
     if not isinstance(module, TorchRLModule):
         raise UnsupportedError(f"module {name} is not a torch RLModule: only torch modules are exported")
-    if module.is_stateful():
-        raise UnsupportedError(
-            f"module {name} is recurrent (LSTM or similar), which is not exported yet: its state would have to become "
-            "an input and an output of the graph"
-        )
     module.eval().requires_grad_(False)
     no_value = _check_weights(files, module)
     observation_space = env_to_module.input_observation_space
     action_space: Any = module_to_env.input_action_space or module.action_space
     check_spaces(observation_space, action_space)
     steps = read_observation_steps(env_to_module, files)
-    distribution, mode = _action_rule(module, action_space)
-    transform = read_transform(module_to_env, action_space)
-    recipe = Recipe(observation_space, action_space, steps, mode, transform, distribution)
-    if recipe.filter is not None and recipe.filter.count == 0:
-        notify("the observation filter has seen nothing yet: RLlib divides by 1e-6 and clips, and so does the export")
-    if isinstance(recipe.action_space, Discrete) and recipe.action_space.start != 0:
-        notify(
-            f"the action space starts at {recipe.action_space.start}, but RLlib sends 0..{recipe.action_space.n - 1} "
-            "to env.step: the export does the same"
-        )
-    names = _output_names(module, recipe)
+    transform, action_steps = read_action_steps(module_to_env, action_space)
+    state = _network_state(module)
+    pipelines = Pipelines(module, env_to_module, module_to_env, observation_space, action_space)
+    # What the module gives decides the rule, and asking it takes observations.
+    asked = Recipe(observation_space, action_space, steps, "argmax", transform, None, state, action_steps)
+    given = _forward_once(pipelines, asked)
+    distribution, mode, names = _action_rule(module, given, action_space, notify)
+    recipe = Recipe(observation_space, action_space, steps, mode, transform, distribution, state, action_steps)
+    _tell(recipe, notify)
     if value and isinstance(module, ValueFunctionAPI):
         if no_value:
             notify(f"the checkpoint holds no value head ({no_value}): the export has no output 'value'")
@@ -147,8 +273,23 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
             names = (*names, "value")
     traced = copy.deepcopy(module)
     replace_heads(traced)
-    full_name = f"{type(module).__module__}.{name}"
-    return Checkpoint(recipe, Network(traced, names), full_name, module, env_to_module, module_to_env)
+    network = Network(traced, names, given=len(recipe.action_leaves) if mode == "given" else 0)
+    return Checkpoint(recipe, network, f"{type(module).__module__}.{name}", pipelines)
+
+
+def _tell(recipe: Recipe, notify: Callable[[str], None]) -> None:
+    """Say what a person may not expect."""
+    if recipe.filter is not None and recipe.filter.count == 0:
+        notify("the observation filter has seen nothing yet: RLlib divides by 1e-6 and clips, and so does the export")
+    for name, space in recipe.action_leaves.items():
+        if isinstance(space, Discrete) and space.start != 0:
+            which = "the action space" if name == "action" else name
+            notify(
+                f"{which} starts at {space.start}, but RLlib sends 0..{space.n - 1} to env.step: the export does the "
+                "same"
+            )
+    if recipe.needs_reward:
+        notify("the policy was trained with previous rewards: the graph has an input 'reward', 0 at an episode's start")
 
 
 def _restore(kind: Any, folder: Path) -> Any:
@@ -188,55 +329,62 @@ def _check_weights(files: CheckpointFiles, module: Any) -> str:
     return f"{len(missing)} weights are missing" if missing else ""
 
 
-def _action_rule(module: Any, action_space: Box | AnyDiscrete) -> tuple[DistributionKind | None, Mode]:
-    """Return the distribution's kind and how its mode is computed, found out by asking the class."""
-    if _is_value_based(module):
-        return None, "argmax"
-    kind = module.get_inference_action_dist_cls()
-    name = getattr(kind, "__name__", str(kind))
-    if name not in DISTRIBUTIONS:
-        raise UnsupportedError(
-            f"the action distribution {name} is not exported yet: known are {', '.join(DISTRIBUTIONS)}"
-        )
-    if isinstance(action_space, Discrete):
-        return DISTRIBUTIONS[name], "argmax"
-    # RLlib 2.60 sends SAC's bare mean where other versions send its tanh: the class in the checkpoint decides.
-    probe = torch.linspace(-2.0, 2.0, 2 * int(np.prod(action_space.shape))).reshape(1, -1)
-    mode, mean = kind.from_logits(probe).to_deterministic().sample(), probe.chunk(2, dim=-1)[0]
-    if torch.equal(mode, mean):
-        return DISTRIBUTIONS[name], "mean"
-    if torch.allclose(mode, torch.tanh(mean), atol=1e-6):
-        return DISTRIBUTIONS[name], "tanh_mean"
-    raise UnsupportedError(
-        f"the deterministic action of {name} is neither its mean nor the mean's tanh: not exported yet"
+def _network_state(module: Any) -> tuple[StateLeaf, ...]:
+    """Return a recurrent module's state by name; a stateless one has none."""
+    if not module.is_stateful():
+        return ()
+    named = named_leaves(module.get_initial_state(), "")
+    return tuple(
+        StateLeaf(name.removeprefix("."), np.asarray(torch.as_tensor(leaf).detach().cpu().numpy()))
+        for name, leaf in named.items()
     )
 
 
-def _is_value_based(module: Any) -> bool:
-    """Return whether actions are picked by Q-value (DQN); SAC's module has those, too, but gives a distribution."""
-    return isinstance(module, QNetAPI) and Columns.ACTION_DIST_INPUTS not in _forward_once(module)
-
-
-def _output_names(module: Any, recipe: Recipe) -> tuple[str, ...]:
-    if recipe.distribution is None:
-        return ("q_values",)
-    given = _forward_once(module)
-    if Columns.ACTIONS in given or Columns.ACTION_DIST_INPUTS not in given:
+def _action_rule(
+    module: Any, given: dict[str, Any], action_space: Any, notify: Callable[[str], None]
+) -> tuple[DistributionKind | None, Mode, tuple[str, ...]]:
+    """Return the distribution's kind, how its mode is computed and the outputs' names, by asking the class."""
+    name = type(module).__name__
+    if isinstance(module, QNetAPI) and Columns.ACTION_DIST_INPUTS not in given:
+        return None, "argmax", ("q_values",)  # DQN; SAC's module has Q-values, too, but gives a distribution
+    if Columns.ACTIONS in given:
+        notify(f"module {name} computes its actions itself: the export does the same, and cannot explore")
+        return None, "given", ()
+    if Columns.ACTION_DIST_INPUTS not in given:
         raise UnsupportedError(
-            f"module {type(module).__name__} computes its actions itself (its inference forward gives "
-            f"{', '.join(sorted(given))}): only modules that give '{Columns.ACTION_DIST_INPUTS}' are exported"
+            f"module {name} gives neither '{Columns.ACTIONS}' nor '{Columns.ACTION_DIST_INPUTS}': its inference "
+            f"forward gives {', '.join(sorted(given))}"
         )
-    return ("action_dist_inputs",)
+    kind = module.get_inference_action_dist_cls()
+    mode = find_mode(
+        lambda probe: kind.from_logits(probe).to_deterministic().sample(), kind.__name__, action_space
+    )
+    distribution = _distribution_kind(kind)
+    if distribution is None:
+        notify(f"the action distribution {kind.__name__} is not one of RLlib's: the export cannot explore with it")
+    return distribution, mode, ("action_dist_inputs",)
 
 
-def _forward_once(module: Any) -> dict[str, Any]:
-    """Return the inference forward's output for two observations of zeros."""
-    zeros = torch.zeros((2, *module.observation_space.shape))
+def _distribution_kind(kind: Any) -> DistributionKind | None:
+    """Return which of RLlib's distributions a class is; None for the user's own, whose samples are not known."""
+    if not kind.__module__.startswith("ray.rllib.core.distribution"):
+        return None
+    # RLlib binds a space to MultiCategorical and MultiDistribution by a class of one more level.
+    named = kind.__mro__[1] if kind.__name__.endswith("Partial") else kind
+    return DISTRIBUTIONS.get(named.__name__)
+
+
+def _forward_once(pipelines: Pipelines, recipe: Recipe) -> dict[str, Any]:
+    """Return the inference forward's output for two likely observations."""
+    batch = next(batch for batch in draw_batches(recipe, seed=0) if len(batch) == 2)
+    episodes = [pipelines.begin(obs) for obs in _rows(recipe.observation_space, batch.inputs, 2)]
+    name = type(pipelines.module).__name__
     try:
-        with torch.no_grad():
-            given: dict[str, Any] = module.forward_inference({Columns.OBS: zeros})
+        given = pipelines.forward(pipelines.to_module(episodes)[0])
     except Exception as error:  # the user's own forward may raise anything
         raise UnsupportedError(
-            f"module {type(module).__name__} does not run on a plain batch of observations: {first_line(error)}"
+            f"module {name} does not run on what the pipeline gives it: {first_line(error)}"
         ) from error
+    if pipelines.module.is_stateful() and Columns.STATE_OUT not in given:
+        raise UnsupportedError(f"module {name} has a state, but its inference forward gives no '{Columns.STATE_OUT}'")
     return given

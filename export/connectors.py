@@ -1,7 +1,8 @@
 """Read off RLlib's connector pipelines what they do to an observation and to an action.
 
 A piece that is not known is refused by its class name, because leaving it out would change the policy. The pieces are
-known by name and by coming from RLlib itself; this file imports nothing of RLlib.
+known by name and by coming from RLlib itself; this file imports nothing of RLlib. A piece of the user's own is taken
+where it offers `torch_forward`, a function of torch tensors `[batch, ...]` that does the same as the piece.
 """
 
 from __future__ import annotations
@@ -9,39 +10,62 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
 
 from rlservo.export.errors import CheckpointError, UnsupportedError
 from rlservo.export.location import CheckpointFiles
-from rlservo.export.recipe import AnyDiscrete, Flatten, ObservationFilter, ObservationStep, Transform
+from rlservo.export.recipe import (
+    Flatten,
+    FrameStack,
+    ObservationFilter,
+    ObservationStep,
+    Previous,
+    Transform,
+    UserStep,
+)
+from rlservo.export.trees import space_leaves
 
-# Pieces that move data about without changing a number of a stateless single-agent policy.
+# Pieces that move data about without changing a number.
 PLUMBING = frozenset({
     "AddObservationsFromEpisodesToBatch",
     "AddTimeDimToBatchAndZeroPad",
     "AddStatesFromEpisodesToBatch",
+    "AgentToModuleMapping",
     "BatchIndividualItems",
     "NumpyToTensor",
+    "WriteObservationsToEpisodes",
     "GetActions",
     "TensorToNumpy",
     "UnBatchToIndividualItems",
+    "ModuleToAgentUnmapping",
     "RemoveSingleTsTimeRankFromBatch",
     "ListifyDataForVectorEnv",
 })  # fmt: skip
+TAKES_OBSERVATION = frozenset({"AddObservationsFromEpisodesToBatch", "FrameStacking"})
+"""Pieces that put the observation into the batch: what a later one changes in the episode comes too late."""
+
+HOOK = "torch_forward"
+DTYPES = ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
 
 
 def check_spaces(observation_space: Any, action_space: Any) -> None:
-    """Raise UnsupportedError unless both spaces are of a kind that is exported."""
-    if not isinstance(observation_space, Box):
-        raise UnsupportedError(
-            f"observation space {observation_space} is not exported yet: only Box is (others need one-hot or "
-            "flattening in the graph)"
-        )
-    if not isinstance(action_space, Box | Discrete):
-        raise UnsupportedError(f"action space {action_space} is not exported yet: only Box and Discrete are")
-    for space in (observation_space, action_space):
+    """Raise UnsupportedError unless every leaf of both spaces is of a kind that is exported."""
+    for name, space in space_leaves(observation_space, "obs").items():
+        if not isinstance(space, Box | Discrete | MultiDiscrete | MultiBinary):
+            raise UnsupportedError(f"{name}: the observation space {space} is not exported: it has no fixed shape")
+        if isinstance(space, Box) and str(space.dtype) not in DTYPES:
+            raise UnsupportedError(
+                f"{name}: {space} is not exported: torch has no {space.dtype} tensors to compute with"
+            )
+    for name, space in space_leaves(action_space, "action").items():
+        if not isinstance(space, Box | Discrete | MultiDiscrete):
+            raise UnsupportedError(
+                f"{name}: the action space {space} is not exported: RLlib has no action distribution for it"
+            )
         if isinstance(space, Box) and space.dtype not in (np.float32, np.float64):
-            raise UnsupportedError(f"{space} is not exported yet: only float32 and float64 Boxes are")
+            raise UnsupportedError(f"{name}: the action space {space} is not exported: only float Boxes are")
+        if isinstance(space, MultiDiscrete) and space.nvec.ndim != 1:
+            raise UnsupportedError(f"{name}: the action space {space} is not exported: only one-dimensional ones are")
 
 
 def read_observation_steps(env_to_module: Any, files: CheckpointFiles) -> tuple[ObservationStep, ...]:
@@ -49,48 +73,83 @@ def read_observation_steps(env_to_module: Any, files: CheckpointFiles) -> tuple[
 
     Raises UnsupportedError for a piece that is not known, CheckpointError when a filter's statistics are missing.
     """
-    found = [_observation_step(piece, files) for piece in env_to_module.connectors]
-    steps = tuple(step for step in found if step is not None)
-    if sum(isinstance(step, ObservationFilter) for step in steps) > 1:
-        raise UnsupportedError("the pipeline has two MeanStdFilter pieces, of which RLlib's checkpoint keeps only one")
-    return steps
+    steps: list[ObservationStep] = []
+    taken_by = ""
+    for piece in env_to_module.connectors:
+        step = _observation_step(piece, files)
+        name = type(piece).__name__
+        if step is not None and taken_by:
+            raise UnsupportedError(
+                f"the env-to-module connector {name} comes after {taken_by}, which has handed the observation on "
+                "already: what RLlib does then depends on the step before, which is not exported"
+            )
+        if name in TAKES_OBSERVATION and _is_rllibs(type(piece)):
+            taken_by = name
+        if step is not None:
+            steps.append(step)
+    for kind in (ObservationFilter, FrameStack, Previous):
+        if sum(isinstance(step, kind) for step in steps) > 1:
+            raise UnsupportedError(
+                f"the pipeline has two {kind.__name__} pieces of one class, of which RLlib's checkpoint keeps only one"
+            )
+    return tuple(steps)
 
 
-def read_transform(module_to_env: Any, action_space: Box | AnyDiscrete) -> Transform:
+def read_action_steps(module_to_env: Any, action_space: Any) -> tuple[Transform, tuple[UserStep, ...]]:
     """Return what the module-to-env pipeline does to an action (`unsquash_action`, `clip_action` in ray 2.60)."""
     transform: Transform = "none"
+    steps: list[UserStep] = []
     for piece in module_to_env.connectors:
         kind = type(piece)
         if kind.__name__ == "NormalizeAndClipActions" and _is_rllibs(kind):
-            if isinstance(action_space, Box):
-                bounded = bool(action_space.bounded_below.all() and action_space.bounded_above.all())
-                if piece.normalize_actions:
-                    transform = "unsquash" if bounded else "none"
-                elif piece.clip_actions:
-                    transform = "clip"
+            if piece.normalize_actions:
+                transform = "unsquash"
+            elif piece.clip_actions:
+                transform = "clip"
         elif kind.__name__ not in PLUMBING or not _is_rllibs(kind):
-            raise UnsupportedError(
-                f"the module-to-env connector {kind.__name__} ({kind.__module__}) is not exported yet: "
-                "without it the environment would get other actions"
-            )
-    return transform
+            if transform != "none":
+                raise UnsupportedError(
+                    f"the module-to-env connector {kind.__name__} ({kind.__module__}) comes after the actions have "
+                    "been scaled, which is not exported"
+                )
+            steps.append(_user_step(piece, "module-to-env", "the environment would get other actions"))
+    leaves = space_leaves(action_space, "action").values()
+    bounded = (bool((leaf.bounded_below & leaf.bounded_above).all()) for leaf in leaves if isinstance(leaf, Box))
+    if transform == "unsquash" and not any(bounded):
+        transform = "none"
+    if not any(isinstance(leaf, Box) for leaf in leaves):
+        transform = "none"
+    return transform, tuple(steps)
 
 
 def _observation_step(piece: Any, files: CheckpointFiles) -> ObservationStep | None:
     """Return what an env-to-module piece does to an observation (None: nothing); freeze it while at it."""
     kind = type(piece)
-    if kind.__name__ == "MeanStdFilter" and _is_rllibs(kind):
+    if not _is_rllibs(kind):
+        return _user_step(piece, "env-to-module", "the network would see other numbers")
+    space = piece.input_observation_space
+    if kind.__name__ == "MeanStdFilter":
         if not (files.env_to_module / kind.__name__).is_dir():
             raise CheckpointError(
                 f"{files.env_to_module / kind.__name__} is missing: the observation filter's statistics"
             )
         piece._update_stats = False  # a restored filter goes on learning from whatever it is shown
-        return _filter(piece)
-    if kind.__name__ == "FlattenObservations" and _is_rllibs(kind):
-        return Flatten()
-    if kind.__name__ == "NumpyToTensor" and _is_rllibs(kind):
+        return None if isinstance(space, Discrete | MultiDiscrete) else _filter(piece, space)
+    if kind.__name__ == "FlattenObservations":
+        return _flatten(piece, space)
+    if kind.__name__ == "FrameStacking":
+        return FrameStack(int(piece.num_frames), tuple(space.shape), str(space.dtype))
+    if kind.__name__ == "PrevActionsPrevRewards":
+        choices = piece.input_action_space
+        if not isinstance(choices, Discrete):
+            raise UnsupportedError(
+                f"{kind.__name__} on the action space {choices} is not exported: RLlib's is Discrete"
+            )
+        keys = (piece.ORIG_OBS_KEY, piece.PREV_ACTIONS_KEY, piece.PREV_REWARDS_KEY)
+        return Previous(int(piece.n_prev_actions), int(choices.n), int(piece.n_prev_rewards), keys)
+    if kind.__name__ == "NumpyToTensor":
         piece._device = None  # a checkpoint from a GPU is read on a CPU
-    if kind.__name__ in PLUMBING and _is_rllibs(kind):
+    if kind.__name__ in PLUMBING:
         return None
     raise UnsupportedError(
         f"the env-to-module connector {kind.__name__} ({kind.__module__}) is not exported yet: "
@@ -98,7 +157,37 @@ def _observation_step(piece: Any, files: CheckpointFiles) -> ObservationStep | N
     )
 
 
-def _filter(piece: Any) -> ObservationFilter:
+def _flatten(piece: Any, space: Any) -> Flatten:
+    for name, leaf in space_leaves(space, "obs").items():
+        starts = np.asarray(leaf.start) if isinstance(leaf, Discrete | MultiDiscrete) else np.zeros(1)
+        if (starts > 0).any():
+            raise UnsupportedError(
+                f"{name}: RLlib's own FlattenObservations cannot one-hot {leaf}, whose values do not start at 0"
+            )
+        if isinstance(leaf, MultiDiscrete) and leaf.nvec.ndim != 1:
+            raise UnsupportedError(f"{name}: RLlib's own FlattenObservations cannot one-hot {leaf}, which is a grid")
+    without = tuple(key for key in (piece._keys_to_remove or []) if isinstance(space, Dict))
+    # A Box needs no more said, and the contract is shorter for it.
+    return Flatten() if isinstance(space, Box) else Flatten(space, without)
+
+
+def _user_step(piece: Any, pipeline: str, consequence: str) -> UserStep:
+    kind = type(piece)
+    function = getattr(piece, HOOK, None)
+    if callable(function):
+        return UserStep(f"{kind.__module__}.{kind.__name__}", function)
+    raise UnsupportedError(
+        f"the {pipeline} connector {kind.__name__} ({kind.__module__}) is not exported: it is code of your own, and "
+        f"without it {consequence}. If it keeps no state, give it a method '{HOOK}(self, data)' that does the same to "
+        "torch tensors with a leading batch axis"
+    )
+
+
+def _filter(piece: Any, space: Any) -> ObservationFilter:
+    if isinstance(space, Box) and space.dtype.kind == "u":
+        raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib's result has no sign there and wraps")
+    if not isinstance(space, Box | MultiBinary):
+        raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib filters single arrays")
     if set(piece.get_state()) != {None}:
         raise UnsupportedError("MeanStdFilter is set up for several agents, which is not exported yet")
     restored = piece._filters[None]

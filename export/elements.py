@@ -48,8 +48,8 @@ def read_elements(
     except (Exception, SystemExit) as error:  # importing and asking run the user's own code
         notify(f"environment {env_id} cannot be asked what its elements are called: {first_line(error)}")
         return ElementNames()
-    wanted = {"observation": math.prod(recipe.observation_space.shape)}
-    wanted["action"] = math.prod(recipe.action_space.shape) if isinstance(recipe.action_space, Box) else 0
+    spaces = {"observation": recipe.observation_space, "action": recipe.action_space}
+    wanted = {which: math.prod(space.shape) if isinstance(space, Box) else 0 for which, space in spaces.items()}
     named = {"observation": observation, "action": action}
     for which, elements in named.items():
         if elements and len(elements) != wanted[which]:

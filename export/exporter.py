@@ -38,9 +38,10 @@ from rlservo.export.facts import CheckpointFacts, read_facts
 from rlservo.export.location import CheckpointFiles, locate_checkpoint
 from rlservo.export.naming import check_names, choose_target, default_name
 from rlservo.export.old_location import OldStackFiles
-from rlservo.export.parity import Outputs, Recorded, prove, record, ties
-from rlservo.export.samples import BATCH_SIZES, draw_batches
-from rlservo.export.spaces import space_spec
+from rlservo.export.parity import GraphLoop, Outputs, Recorded, Runner, prove, record, replay, ties
+from rlservo.export.recipe import Recipe
+from rlservo.export.samples import BATCH_SIZES, Inputs, draw_batches
+from rlservo.export.spaces import space_spec, state_spec
 from rlservo.export.steps import baked_steps
 from rlservo.export.unpickle import user_code
 
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from rlservo.export.restore import Restored
 
 GOLDEN_SAMPLES = {"likely": 48, "wide": 8, "extreme": 8}
+GOLDEN_BYTES = 2_000_000  # of images a few observations are as much as a bundle should carry
 SEED = 20240
 LOADING_RUNS_CODE = "loading {path}: checkpoints are pickles and run code when loaded; export only those you trust"
 
@@ -91,7 +93,7 @@ def export_checkpoint(
         target = choose_target(Path(out), name, version)
         restored = _load(files, notify, value)
         elements = read_elements(facts.env_id, facts.env_config, restored.recipe, notify)
-        with _temporary_folder(target) as folder:
+        with _temporary_folder(target) as folder, _one_thread():
             labels = [element.name for element in elements.action]
             parity, golden = _write_graphs(folder, restored, labels, files.api_stack)
             recipe = restored.recipe
@@ -100,9 +102,10 @@ def export_checkpoint(
                 version=target.name,
                 description=description,
                 observation_space=space_spec(recipe.observation_space, elements.observation),
-                action_space=space_spec(recipe.action_space, elements.action),
-                inputs=(_tensor("obs", golden.inputs),),
+                action_space=space_spec(recipe.action_space, elements.action, action=True),
+                inputs=tuple(_tensor(name, values) for name, values in golden.inputs.items()),
                 outputs=tuple(_tensor(output, values) for output, values in golden.outputs.items()),
+                state=tuple(state_spec(leaf) for leaf in recipe.state),
                 distribution=(
                     Distribution(kind=recipe.distribution, transform=recipe.transform) if recipe.distribution else None
                 ),
@@ -142,42 +145,81 @@ def _temporary_folder(target: Path) -> Iterator[Path]:
                 parent.rmdir()
 
 
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let torch compute on one thread: for networks of this size a second one costs more than it brings."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 @dataclass(frozen=True)
 class _Golden:
-    inputs: NDArray[Any]
+    inputs: Inputs
     outputs: Outputs
 
 
-def _write_graphs(folder: Path, restored: Restored, labels: list[str], api_stack: str) -> tuple[Parity, _Golden]:
+def _write_graphs(
+    folder: Path, restored: Restored, labels: list[str], api_stack: str
+) -> tuple[Parity, _Golden]:
     """Write both formats, prove them, and return the proof and the golden vectors."""
     from rlservo.export.actor import PolicyGraph
     from rlservo.export.onnx import run_onnx, write_onnx
     from rlservo.export.torchscript import run_torchscript, write_torchscript
 
-    graph = PolicyGraph(restored.recipe, restored.network)
-    batches = draw_batches(restored.recipe, SEED)
-    recorded = record(restored.reference, batches)
-    example = next(batch.obs for batch in batches if len(batch.obs) == BATCH_SIZES[1])
+    recipe = restored.recipe
+    graph = PolicyGraph(recipe, restored.network)
+    batches = draw_batches(recipe, SEED)
+    recorded = record(restored.reference, batches, restored.loop)
+    pair = next(batch for batch in batches if len(batch) == BATCH_SIZES[1])
+    example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(len(pair), np.bool_))
     write_torchscript(graph, example, folder / TORCHSCRIPT_FILE)
     write_onnx(graph, example, folder / ONNX_FILE)
     onnx = run_onnx(folder / ONNX_FILE)
-    formats = {"onnx": onnx, "torchscript": run_torchscript(folder / TORCHSCRIPT_FILE, graph.output_names)}
-    parity = prove(restored.recipe, recorded, formats, labels, api_stack)
-    inputs = _golden_inputs(recorded, discrete=not isinstance(restored.recipe.action_space, Box))
+    script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
+    parity = prove(recipe, recorded, {"onnx": onnx, "torchscript": script}, labels, api_stack)
+    inputs = _golden_inputs(recipe, recorded, onnx)
     outputs = onnx(inputs)
-    return parity, _Golden(inputs, {name: outputs[name] for name in graph.output_names})
+    ordered = {name: inputs[name] for name in graph.input_names}
+    return parity, _Golden(ordered, {name: outputs[name] for name in graph.output_names})
 
 
-def _golden_inputs(recorded: list[Recorded], discrete: bool) -> NDArray[Any]:
-    """Return observations of every kind; those where two choices tie stay out, as another machine may choose either."""
-    chosen = []
+def _golden_inputs(recipe: Recipe, recorded: list[Recorded], run: Runner) -> Inputs:
+    """Return inputs of every kind; those where two choices tie stay out, as another machine may choose either.
+
+    A policy with a memory gives steps of its sequences, each with the state it met there.
+    """
+    pools: dict[str, list[Inputs]] = {kind: [] for kind in GOLDEN_SAMPLES}
+    discrete = any(not isinstance(space, Box) for space in recipe.action_leaves.values())
+    everything: list[Inputs] = []
+    for one, (inputs, _) in zip(recorded, replay(recorded, run, recipe.state), strict=True):
+        clear = ~ties(recipe, one.outputs) if discrete else np.ones(len(one.batch), np.bool_)
+        pools[one.batch.kind].append({name: values[clear] for name, values in inputs.items()})
+        everything.append(inputs)
+    size = sum(values[0].nbytes for values in everything[0].values())
+    chosen: list[Inputs] = []
     for kind, count in GOLDEN_SAMPLES.items():
-        one = max((one for one in recorded if one.batch.kind == kind), key=lambda one: len(one.batch.obs))
-        clear = ~ties(one.outputs) if discrete else np.ones(len(one.batch.obs), np.bool_)
-        chosen.append(one.batch.obs[clear][:count])
-    golden = np.concatenate(chosen)
+        if pools[kind]:
+            chosen.append(_some(_joined(pools[kind]), max(2, min(count, GOLDEN_BYTES // (3 * max(1, size))))))
+    golden = _joined(chosen)
     # A policy that never has a clear favourite still needs vectors; its runtime excuses ties as the gate does.
-    return golden if len(golden) else recorded[0].batch.obs[: sum(GOLDEN_SAMPLES.values())]
+    return golden if len(next(iter(golden.values()))) else _some(_joined(everything), sum(GOLDEN_SAMPLES.values()))
+
+
+def _joined(parts: list[Inputs]) -> Inputs:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _some(inputs: Inputs, count: int) -> Inputs:
+    """Return `count` rows, evenly spread."""
+    rows = len(next(iter(inputs.values())))
+    picked = np.unique(np.linspace(0, rows - 1, min(count, rows)).astype(int)) if rows else np.zeros(0, int)
+    return {name: values[picked] for name, values in inputs.items()}
 
 
 def _tensor(name: str, values: NDArray[Any]) -> TensorSpec:
@@ -219,10 +261,10 @@ def _write_rest(folder: Path, contract: Contract, golden: _Golden) -> None:
     from rlservo.export.onnx import CONTRACT_KEY, add_metadata, run_onnx
 
     add_metadata(folder / ONNX_FILE, {CONTRACT_KEY: contract_json(contract)})
-    write_golden(folder, {"obs": golden.inputs}, golden.outputs)
+    write_golden(folder, golden.inputs, golden.outputs)
     write_contract(folder, contract)
     inputs, outputs = load_bundle(folder).golden()
-    replayed = run_onnx(folder / ONNX_FILE)(inputs["obs"])
+    replayed = run_onnx(folder / ONNX_FILE)(inputs)
     for name, values in outputs.items():
         if not np.array_equal(values, replayed[name], equal_nan=True):
             raise ParityError(f"the finished file's '{name}' is not what was proven: is the disk full or failing?")

@@ -13,7 +13,8 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from rlservo.export.errors import CheckpointError, UnsupportedError
-from rlservo.export.recipe import AnyDiscrete, ObservationFilter, ObservationStep, Rescale, Transform
+from rlservo.export.recipe import ObservationFilter, ObservationStep, Preprocess, Transform, leaf_transform
+from rlservo.export.trees import space_leaves
 
 # Agent connectors that change no number of a stateless policy's observation, and action connectors likewise.
 AGENT_PLUMBING = frozenset({"ClipRewardAgentConnector", "StateBufferConnector", "ViewRequirementAgentConnector"})
@@ -25,9 +26,9 @@ KNOWN = {
     "agent": AGENT_PLUMBING | FILTERS | {PREPROCESSOR},
     "action": ACTION_PLUMBING | {UNSQUASH, CLIP},
 }
-
-# ray/rllib/models/preprocessors.py (ray 2.60) takes every Box of 128 numbers for an Atari console's memory.
-ATARI_RAM = Rescale(offset=128.0, divisor=128.0)
+PREPROCESSORS = frozenset({
+    "OneHotPreprocessor", "DictFlatteningPreprocessor", "TupleFlatteningPreprocessor", "AtariRamPreprocessor",
+})  # fmt: skip
 
 
 def check_connectors(state: Mapping[str, Any]) -> None:
@@ -70,8 +71,8 @@ def read_old_steps(agent_connectors: Any) -> tuple[ObservationStep, ...]:
     return tuple(steps)
 
 
-def read_old_transform(action_connectors: Any, action_space: Box | AnyDiscrete) -> Transform:
-    """Return what the action connectors do to an action.
+def read_old_transform(action_connectors: Any, action_space: Any) -> Transform:
+    """Return what the action connectors do to a Box action (to others they do nothing).
 
     Unlike the new stack's one connector, here `clip_actions` also clips where `normalize_actions` finds a bound
     missing and leaves the action as it is (ray/rllib/connectors/action/, ray 2.60).
@@ -79,12 +80,16 @@ def read_old_transform(action_connectors: Any, action_space: Box | AnyDiscrete) 
     names = [type(piece).__name__ for piece in action_connectors.connectors]
     if UNSQUASH in names and CLIP in names[: names.index(UNSQUASH)]:
         raise UnsupportedError(f"{CLIP} comes before {UNSQUASH}: only RLlib's own order, the other one, is exported")
-    if not isinstance(action_space, Box):
-        return "none"
-    bounded = bool(action_space.bounded_below.all() and action_space.bounded_above.all())
-    if UNSQUASH in names and bounded:
+    boxes = [leaf for leaf in space_leaves(action_space, "action").values() if isinstance(leaf, Box)]
+    unsquashed = [leaf_transform(leaf, "unsquash") == "unsquash" for leaf in boxes] if UNSQUASH in names else []
+    if CLIP in names and any(unsquashed) and not all(unsquashed):
+        raise UnsupportedError(
+            f"with clip_actions, {action_space} has parts that are unsquashed and parts that are only clipped: not "
+            "exported; switch clip_actions off, or bound every part"
+        )
+    if any(unsquashed):
         return "unsquash"
-    return "clip" if CLIP in names else "none"
+    return "clip" if CLIP in names and boxes else "none"
 
 
 def _preprocessing(preprocessor: Any) -> list[ObservationStep]:
@@ -93,12 +98,14 @@ def _preprocessing(preprocessor: Any) -> list[ObservationStep]:
     preprocessor.check_shape = _accept
     if name == "NoPreprocessor":
         return []
-    if name == "AtariRamPreprocessor":
-        return [ATARI_RAM]
-    raise UnsupportedError(
-        f"the preprocessor {name} for observations {preprocessor._obs_space} is not exported yet: only plain Box "
-        "observations are"
-    )
+    if name not in PREPROCESSORS:
+        raise UnsupportedError(
+            f"the preprocessor {name} for observations {preprocessor._obs_space} is not exported: it resizes images or "
+            "pads lists, outside torch"
+        )
+    for inner in getattr(preprocessor, "preprocessors", ()):
+        _preprocessing(inner)  # refuses what it has to, and switches off the checks
+    return [Preprocess(preprocessor._obs_space)]
 
 
 def _accept(_observation: Any) -> None:

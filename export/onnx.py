@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from numpy.typing import NDArray
 
 from rlservo.export.actor import PolicyGraph
 from rlservo.export.errors import UnsupportedError
 from rlservo.export.parity import Runner
+from rlservo.export.samples import Inputs
 from rlservo.export.unpickle import first_line
 
 TORCHSCRIPT_OPSET = 17
@@ -35,10 +35,10 @@ IR_VERSION = 8
 CONTRACT_KEY = "rlservo.contract"
 
 
-def write_onnx(graph: PolicyGraph, example: NDArray[Any], file: Path) -> None:
-    """Write `graph` to `file`, weights inside, input `obs` and the graph's outputs with a dynamic batch.
+def write_onnx(graph: PolicyGraph, example: Inputs, file: Path) -> None:
+    """Write `graph` to `file`, weights inside, the graph's inputs and outputs by name, with a dynamic batch.
 
-    `example` is any two observations. Raises UnsupportedError when an operation of the network has no ONNX form.
+    `example` is two rows of every input. Raises UnsupportedError when an operation of the network has no ONNX form.
     """
     try:
         _export(graph, example, file, dynamo=False)
@@ -54,16 +54,21 @@ def write_onnx(graph: PolicyGraph, example: NDArray[Any], file: Path) -> None:
     onnx.save(model, str(file))
 
 
-def _export(graph: PolicyGraph, example: NDArray[Any], file: Path, *, dynamo: bool) -> None:
-    names = ["obs", *graph.output_names]
+def _export(graph: PolicyGraph, example: Inputs, file: Path, *, dynamo: bool) -> None:
+    inputs, outputs = list(graph.input_names), list(graph.output_names)
     how: dict[str, Any] = {"dynamo": False, "opset_version": TORCHSCRIPT_OPSET}
-    how["dynamic_axes"] = {name: {0: "batch"} for name in names}
+    how["dynamic_axes"] = {name: {0: "batch"} for name in (*inputs, *outputs)}
     if dynamo:
         how = {"dynamo": True, "opset_version": DYNAMO_OPSET, "external_data": False, "verbose": False}
-        how["dynamic_shapes"] = {"obs": {0: torch.export.Dim("batch")}}
+        how["dynamic_shapes"] = {"inputs": tuple({0: torch.export.Dim("batch")} for _ in inputs)}
     with _quiet():
         torch.onnx.export(
-            graph, (torch.from_numpy(example),), str(file), input_names=names[:1], output_names=names[1:], **how
+            graph,
+            tuple(torch.from_numpy(example[name]) for name in inputs),
+            str(file),
+            input_names=inputs,
+            output_names=outputs,
+            **how,
         )
 
 
@@ -112,14 +117,19 @@ def add_metadata(file: Path, properties: Mapping[str, str]) -> None:
 
 def run_onnx(file: Path) -> Runner:
     """Return a function that runs the file in onnxruntime on one thread, as a server does."""
+    # onnxruntime's Linux wheels report use from the moment they are imported unless this is set. An exporter calls
+    # nobody; whoever wants it may set the variable to 0.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # errors arrive as exceptions; it would print them as well
     session = onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
 
-    def run(obs: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        values = session.run(names, {"obs": obs})
+    def run(inputs: Inputs) -> dict[str, NDArray[Any]]:
+        values = session.run(names, inputs)
         return {name: np.asarray(value) for name, value in zip(names, values, strict=True)}
 
     return run

@@ -1,6 +1,7 @@
 """The gate: an exported policy gives RLlib's own numbers, or it is not written.
 
-It compares functions from observations to named outputs and does not know what is behind them.
+It compares functions from observations to named outputs and does not know what is behind them. A policy with a memory
+is compared over whole sequences, each side fed with its own state.
 
 A difference passes when it is at most `RTOL * max(|reference|, scale) + ATOL`. The scale is half the range of a
 bounded action element; elsewhere the largest number in the same row of the output, at least 1, because the rounding
@@ -11,21 +12,24 @@ same, unless RLlib's own scores for the two choices are that close.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, MultiDiscrete
 from numpy.typing import NDArray
 
 from rlservo.export.bundle import FormatParity, Parity
-from rlservo.export.errors import ParityError
-from rlservo.export.recipe import Recipe
-from rlservo.export.samples import BATCH_SIZES, Batch
+from rlservo.export.errors import ParityError, UnsupportedError
+from rlservo.export.recipe import Recipe, StateLeaf, parameter_count
+from rlservo.export.samples import BATCH_SIZES, Batch, Inputs
+from rlservo.export.unpickle import first_line
 
 RTOL = 1e-5
 ATOL = 1e-6
+MASKED = 1e30
+"""A score beyond this stands for 'not allowed' (RLlib's action masks add -3.4e38); it measures nothing."""
 REFERENCES: dict[str, str] = {
     "new": "RLlib's own env-to-module connectors, inference forward and module-to-env connectors, restored from the "
     "checkpoint, observation filter frozen, exploration off",
@@ -35,8 +39,41 @@ REFERENCES: dict[str, str] = {
 """What an export is compared with, by API stack."""
 
 Outputs: TypeAlias = dict[str, NDArray[Any]]
-Runner: TypeAlias = Callable[[NDArray[Any]], Outputs]
-"""Raw observations `[batch, *obs_shape]` to every output by name."""
+Runner: TypeAlias = Callable[[Inputs], Outputs]
+"""Every input of the graph by name to every output by name."""
+
+
+class Loop(Protocol):
+    """Something that acts step after step and remembers."""
+
+    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
+        """Return the outputs for one step of every row; rows in `restart` begin an episode with it."""
+        ...
+
+
+class GraphLoop:
+    """An exported graph fed with its own state."""
+
+    def __init__(self, run: Runner, state: Sequence[StateLeaf]) -> None:
+        self._run = run
+        self._state = {f"state_in.{leaf.name}": leaf.initial for leaf in state}
+        self._now: Inputs = {}
+
+    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
+        """Return the graph's outputs, its next state among them."""
+        outputs = self._run(self.complete(inputs, restart))
+        self._now = {name: outputs[name.replace("state_in.", "state_out.", 1)] for name in self._state}
+        return outputs
+
+    def complete(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Inputs:
+        """Return the inputs with the state they meet."""
+        rows = len(restart)
+        full = dict(inputs)
+        for name, initial in self._state.items():
+            start = np.repeat(initial[None], rows, axis=0)
+            now = self._now.get(name, start)
+            full[name] = np.where(restart.reshape((rows, *[1] * initial.ndim)), start, now).astype(initial.dtype)
+        return full
 
 
 @dataclass(frozen=True)
@@ -47,9 +84,43 @@ class Recorded:
     outputs: Outputs
 
 
-def record(reference: Runner, batches: Sequence[Batch]) -> list[Recorded]:
-    """Run RLlib on every batch. The observations are copied: a connector may write into what it is given."""
-    return [Recorded(batch, reference(batch.obs.copy())) for batch in batches]
+def record(reference: Runner, batches: Sequence[Batch], loop: Callable[[], Loop] | None = None) -> list[Recorded]:
+    """Run RLlib on every batch; sequences need `loop`, which starts RLlib's own.
+
+    The observations are copied: a connector may write into what it is given. Raises UnsupportedError when RLlib's own
+    pipeline fails on an observation of the policy's own space.
+    """
+    recorded: list[Recorded] = []
+    running: Loop | None = None
+    for batch in batches:
+        inputs = _copied(batch.inputs)
+        try:
+            if batch.restart is None:
+                outputs = reference(inputs)
+            else:
+                assert loop is not None, "a policy with a memory needs a reference that remembers"
+                if running is None or len(recorded[-1].batch) != len(batch):
+                    running = loop()
+                outputs = running.step(inputs, batch.restart)
+        except Exception as error:  # RLlib's own connectors and the user's raise anything
+            raise UnsupportedError(
+                f"RLlib's own pipeline fails on an observation of the policy's space: {first_line(error)}"
+            ) from error
+        recorded.append(Recorded(batch, outputs))
+    return recorded
+
+
+def replay(recorded: Sequence[Recorded], run: Runner, state: Sequence[StateLeaf]) -> Iterator[tuple[Inputs, Outputs]]:
+    """Run an exported graph over what was recorded; yield its full inputs and its outputs for each batch."""
+    loop, size = GraphLoop(run, state), 0
+    for one in recorded:
+        inputs, restart = _copied(one.batch.inputs), one.batch.restart
+        if restart is None:
+            yield inputs, run(inputs)
+            continue
+        if len(restart) != size:
+            loop, size = GraphLoop(run, state), len(restart)
+        yield loop.complete(inputs, restart), loop.step(inputs, restart)
 
 
 def prove(
@@ -61,13 +132,13 @@ def prove(
 ) -> Parity:
     """Compare every format with what was recorded and return the largest differences.
 
-    `labels` name the action's elements for the message, `api_stack` is whose pipeline was recorded. Raises ParityError
-    at the first output that differs, saying which element of which sample by how much.
+    `labels` name the action's elements for the message. Raises ParityError at the first output that differs, saying
+    which element of which sample by how much.
     """
     results = {name: _prove_format(name, recipe, recorded, run, labels) for name, run in formats.items()}
     return Parity(
         reference=REFERENCES[api_stack],
-        samples=sum(len(one.batch.obs) for one in recorded),
+        samples=sum(len(one.batch) for one in recorded),
         batch_sizes=BATCH_SIZES,
         rtol=RTOL,
         atol=ATOL,
@@ -80,31 +151,36 @@ def _prove_format(
 ) -> FormatParity:
     max_abs = max_rel = 0.0
     largest_value = max((_largest(one.outputs["value"]) for one in recorded if "value" in one.outputs), default=1.0)
-    for one in recorded:
-        where = f"{name}, a batch of {len(one.batch.obs)} {one.batch.kind} observations"
+    actions = recipe.action_leaves
+    running = replay(recorded, run, recipe.state)
+    for number, one in enumerate(recorded):
+        where = f"{name}, a batch of {len(one.batch)} {one.batch.kind} observations"
+        if one.batch.restart is not None:
+            where += f" (step {number} of the sequences)"
         try:
-            got = run(one.batch.obs.copy())
+            got = next(running)[1]
         except Exception as error:  # a shape baked into the graph ends in onnxruntime's or torch's own exceptions
             raise ParityError(f"{where}: the exported graph does not run: {str(error).splitlines()[0]}") from error
         for output, expected in one.outputs.items():
-            _check_form(where, output, got.get(output), expected, recipe)
-            if output == "action" and isinstance(recipe.action_space, Discrete):
-                _check_choices(where, got[output], one)
+            space = actions.get(output)
+            _check_form(where, output, got.get(output), expected, space)
+            if space is not None and not isinstance(space, Box):
+                _check_choices(where, output, got[output], one, recipe)
                 continue
             least = largest_value if output == "value" else 1.0
-            difference, scale = _compare(where, output, got[output], expected, recipe, one, labels, least)
+            difference, scale = _compare(where, output, got[output], expected, space, one, labels, least)
             max_abs = max(max_abs, float(difference.max(initial=0.0)))
             max_rel = max(max_rel, float((difference / scale).max(initial=0.0)))
     return FormatParity(max_abs=max_abs, max_rel=max_rel)
 
 
-def _check_form(where: str, output: str, got: NDArray[Any] | None, expected: NDArray[Any], recipe: Recipe) -> None:
+def _check_form(where: str, output: str, got: NDArray[Any] | None, expected: NDArray[Any], space: Any) -> None:
     if got is None:
         raise ParityError(f"{where}: the exported graph has no output '{output}'")
     if got.shape != expected.shape:
         raise ParityError(f"{where}: output '{output}' has shape {got.shape}, RLlib's has {expected.shape}")
-    if output == "action":
-        dtype = np.dtype(recipe.action_space.dtype) if isinstance(recipe.action_space, Box) else np.dtype(np.int64)
+    if space is not None:
+        dtype = np.dtype(space.dtype) if isinstance(space, Box) else np.dtype(np.int64)
         if got.dtype != dtype:
             raise ParityError(f"{where}: the action is {got.dtype}, the action space wants {dtype}")
 
@@ -114,7 +190,7 @@ def _compare(
     output: str,
     got: NDArray[Any],
     expected: NDArray[Any],
-    recipe: Recipe,
+    space: Any,
     one: Recorded,
     labels: Sequence[str],
     least_scale: float,
@@ -124,7 +200,7 @@ def _compare(
     with np.errstate(invalid="ignore"):
         same = (a == b) | (np.isnan(a) & np.isnan(b))  # overflow in both is no difference
         difference = np.where(same, 0.0, np.abs(a - b))
-    scale = np.maximum(np.where(np.isfinite(b), np.abs(b), 1.0), _scale(output, b, recipe, least_scale))
+    scale = np.maximum(np.where(np.isfinite(b), np.abs(b), 1.0), _scale(b, space, least_scale))
     allowed = RTOL * scale + ATOL
     bad = ~(difference <= allowed)
     if bad.any():
@@ -137,18 +213,18 @@ def _compare(
             f"{len(b)} samples differ",
             {
                 "output": output, "element": element, "sample": row, "exported": float(a[index]),
-                "reference": float(b[index]), "observation": one.batch.obs[row].tolist(),
+                "reference": float(b[index]), "observation": _row(one.batch, row),
             },
         )  # fmt: skip
     return difference, scale
 
 
-def _scale(output: str, expected: NDArray[np.float64], recipe: Recipe, least: float) -> NDArray[np.float64]:
+def _scale(expected: NDArray[np.float64], space: Any, least: float) -> NDArray[np.float64]:
     """Return the size of number that rounding is measured against, broadcastable to `expected`."""
-    space = recipe.action_space
-    if output == "action" and isinstance(space, Box) and bool((space.bounded_below & space.bounded_above).all()):
+    if isinstance(space, Box) and bool((space.bounded_below & space.bounded_above).all()):
         return (space.high.astype(np.float64) - space.low.astype(np.float64))[None] / 2
-    finite = np.where(np.isfinite(expected), np.abs(expected), 0.0)
+    measured = np.isfinite(expected) & (np.abs(np.nan_to_num(expected)) < MASKED)
+    finite = np.where(measured, np.abs(expected), 0.0)
     axes = tuple(range(1, expected.ndim))
     return np.maximum(finite.max(axis=axes, keepdims=True) if axes else finite, least)
 
@@ -158,33 +234,75 @@ def _largest(values: NDArray[Any]) -> float:
     return max(1.0, float(np.abs(finite).max(initial=0.0)))
 
 
-def _check_choices(where: str, got: NDArray[Any], one: Recorded) -> None:
-    """Compare discrete actions; a tie in RLlib's scores excuses a difference."""
-    expected = one.outputs["action"]
-    excused = ties(one.outputs)
-    scores = _scores(one.outputs)
-    for row in np.flatnonzero(got != expected):
-        chosen, wanted = int(got[row]), int(expected[row])
-        tied = 0 <= chosen < scores.shape[1] and excused[row]
-        if not tied or abs(scores[row, chosen] - scores[row, wanted]) > _tie_width(scores)[row]:
-            raise ParityError(
-                f"{where}: output 'action', sample {row}: the export chooses {chosen}, RLlib {wanted}",
-                {"output": "action", "sample": int(row), "exported": chosen, "reference": wanted},
-            )
+def _row(batch: Batch, row: int) -> Any:
+    rows = {name: values[row].tolist() for name, values in batch.inputs.items()}
+    return rows["obs"] if set(rows) == {"obs"} else rows
 
 
-def ties(outputs: Outputs) -> NDArray[np.bool_]:
-    """Return for each sample whether its two best discrete choices score the same within tolerance."""
-    scores = _scores(outputs)
+def _check_choices(where: str, output: str, got: NDArray[Any], one: Recorded, recipe: Recipe) -> None:
+    """Compare discrete actions; a tie in RLlib's scores excuses a difference, and so do scores that are no numbers."""
+    columns = _columns(one.outputs[output])
+    scored = choice_scores(recipe, one.outputs).get(output) or [np.full((len(c), 1), np.inf) for c in columns]
+    for part, (exported, wanted, scores) in enumerate(zip(_columns(got), columns, scored, strict=True)):
+        excused, width = _tied(scores), _tie_width(scores)
+        for row in np.flatnonzero(exported != wanted):
+            chosen, right = int(exported[row]), int(wanted[row])
+            if np.isnan(scores[row]).any():
+                continue
+            tied = 0 <= chosen < scores.shape[1] and excused[row]
+            if not tied or abs(scores[row, chosen] - scores[row, right]) > width[row]:
+                element = f", element {part}" if len(columns) > 1 else ""
+                raise ParityError(
+                    f"{where}: output '{output}'{element}, sample {row}: the export chooses {chosen}, RLlib {right}",
+                    {"output": output, "sample": int(row), "exported": chosen, "reference": right},
+                )
+
+
+def ties(recipe: Recipe, outputs: Outputs) -> NDArray[np.bool_]:
+    """Return for each sample whether any discrete choice has two best scores that are the same within tolerance."""
+    rows = len(next(iter(outputs.values())))
+    tied = np.zeros(rows, np.bool_)
+    for parts in choice_scores(recipe, outputs).values():
+        for scores in parts:
+            tied |= _tied(scores) | np.isnan(scores).any(axis=1)
+    return tied
+
+
+def choice_scores(recipe: Recipe, outputs: Outputs) -> dict[str, list[NDArray[np.float64]]]:
+    """Return the scores `[batch, choices]` of every discrete choice, by action leaf and element.
+
+    A module that computes its actions itself gives none.
+    """
+    if recipe.mode == "given":
+        return {}
+    scores = outputs["q_values" if "q_values" in outputs else "action_dist_inputs"].astype(np.float64)
+    found: dict[str, list[NDArray[np.float64]]] = {}
+    begin = 0
+    for name, space in recipe.action_leaves.items():
+        part = scores[:, begin : begin + parameter_count(space)]
+        begin += parameter_count(space)
+        if isinstance(space, MultiDiscrete):
+            found[name] = np.split(part, np.cumsum(space.nvec.ravel())[:-1], axis=1)
+        elif not isinstance(space, Box):
+            found[name] = [part]
+    return found
+
+
+def _columns(choices: NDArray[Any]) -> list[NDArray[Any]]:
+    return [choices] if choices.ndim == 1 else list(choices.reshape(len(choices), -1).T)
+
+
+def _tied(scores: NDArray[np.float64]) -> NDArray[np.bool_]:
     if scores.shape[1] < 2:
         return np.zeros(len(scores), np.bool_)
     best = np.sort(scores, axis=1)[:, -2:]
     return np.asarray(best[:, 1] - best[:, 0] <= _tie_width(scores))
 
 
-def _scores(outputs: Outputs) -> NDArray[np.float64]:
-    return outputs["q_values" if "q_values" in outputs else "action_dist_inputs"].astype(np.float64)
-
-
 def _tie_width(scores: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(RTOL * np.maximum(np.abs(scores).max(axis=1), 1.0) + ATOL)
+    measured = np.where(np.abs(np.nan_to_num(scores)) < MASKED, np.abs(np.nan_to_num(scores)), 0.0)
+    return np.asarray(RTOL * np.maximum(measured.max(axis=1), 1.0) + ATOL)
+
+
+def _copied(inputs: Inputs) -> Inputs:
+    return {name: values.copy() for name, values in inputs.items()}

@@ -6,12 +6,16 @@ file knows neither of them: numpy and Gymnasium spaces only.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from numpy.typing import NDArray
+
+from rlservo.export.trees import space_leaves
 
 # ray/rllib/utils/numpy.py (ray 2.60): keeps the filter from dividing by zero.
 SMALL_NUMBER = 1e-6
@@ -48,41 +52,144 @@ class ObservationFilter:
 
 @dataclass(frozen=True)
 class Flatten:
-    """RLlib's FlattenObservations on a Box: one row, as float32."""
+    """RLlib's FlattenObservations: one float32 row, discrete parts one-hot, Dict keys in sorted order.
+
+    `space` is what comes in; None is a single Box. `without` are top-level keys that are left out.
+    """
+
+    space: Any = None
+    without: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
-class Rescale:
-    """`(x - offset) / divisor` in float32, the same for every element: an old-stack preprocessor."""
+class FrameStack:
+    """RLlib's FrameStacking: the last `frames` observations `[..., 1]` side by side on the third axis, zeros before."""
 
-    offset: float
-    divisor: float
+    frames: int
+    shape: tuple[int, ...]
+    dtype: str
 
 
-ObservationStep: TypeAlias = ObservationFilter | Flatten | Rescale
+@dataclass(frozen=True)
+class Previous:
+    """RLlib's PrevActionsPrevRewards: a dict of the observation, the last actions' one-hot codes and last rewards."""
 
-Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax"]
-"""How the deterministic action comes out of the distribution's parameters (or, for argmax, of Q-values)."""
+    actions: int
+    choices: int
+    """How many actions there are to choose from: the width of a one-hot code."""
+    rewards: int
+    keys: tuple[str, str, str] = ("_orig_obs", "prev_n_actions", "prev_n_rewards")
+
+
+@dataclass(frozen=True)
+class UserStep:
+    """A stateless connector of the user's own, as a function of torch tensors `[batch, ...]` in the space's form."""
+
+    name: str
+    function: Callable[[Any], Any] = field(compare=False)
+
+
+@dataclass(frozen=True)
+class Preprocess:
+    """The old API stack's preprocessor: one float32 row of the space's leaves, Dict keys in sorted order.
+
+    Discrete leaves are one-hot from their start on. A Box of 128 numbers is taken for an Atari console's memory:
+    `(x - 128) / 128` (ray/rllib/models/preprocessors.py, ray 2.60).
+    """
+
+    space: Any
+
+
+ObservationStep: TypeAlias = ObservationFilter | Flatten | FrameStack | Previous | UserStep | Preprocess
+
+Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax", "given"]
+"""How the deterministic action comes out of the distribution's parameters (argmax: or of Q-values; given: not at all)."""
 
 Transform: TypeAlias = Literal["none", "unsquash", "clip"]
-"""What RLlib does to that action before `env.step`."""
+"""What RLlib does to that action before `env.step`; Box leaves that are not bounded all round are not unsquashed."""
 
-DistributionKind: TypeAlias = Literal["diag_gaussian", "squashed_gaussian", "categorical"]
+DistributionKind: TypeAlias = Literal["diag_gaussian", "squashed_gaussian", "categorical", "multi_categorical", "multi"]
+
+
+@dataclass(frozen=True)
+class StateLeaf:
+    """One array a policy carries from step to step, and what it is at an episode's start."""
+
+    name: str
+    initial: NDArray[Any]
+    kind: Literal["recurrent", "frames", "previous_actions", "previous_rewards"] = "recurrent"
 
 
 @dataclass(frozen=True)
 class Recipe:
     """Everything between a raw observation and `env.step`, except the network."""
 
-    observation_space: Box
-    action_space: Box | AnyDiscrete
+    observation_space: Any
+    """A Box, Discrete, MultiDiscrete or MultiBinary, or a Dict or Tuple of such, nested at will."""
+    action_space: Any
+    """A Box, Discrete or MultiDiscrete, or a Dict or Tuple of such."""
     steps: tuple[ObservationStep, ...]
     mode: Mode
+    """Of the Box leaves (discrete ones are always argmax); of the whole action where it is only one leaf."""
     transform: Transform
     distribution: DistributionKind | None
     """None where the module picks its action itself and offers no distribution (DQN)."""
+    network_state: tuple[StateLeaf, ...] = ()
+    """A recurrent network's state, in the order the network takes and gives it."""
+    action_steps: tuple[UserStep, ...] = ()
+    """The user's own connectors between the distribution's mode and unsquashing."""
 
     @property
     def filter(self) -> ObservationFilter | None:
         """The observation filter, if there is one."""
         return next((step for step in self.steps if isinstance(step, ObservationFilter)), None)
+
+    @property
+    def observation_leaves(self) -> dict[str, Any]:
+        """The observation's leaf spaces by the graph's input names."""
+        return space_leaves(self.observation_space, "obs")
+
+    @property
+    def action_leaves(self) -> dict[str, Any]:
+        """The action's leaf spaces by the graph's output names."""
+        return space_leaves(self.action_space, "action")
+
+    @property
+    def state(self) -> tuple[StateLeaf, ...]:
+        """All that is carried from step to step: of the observation steps first, then of the network."""
+        carried: list[StateLeaf] = []
+        for step in self.steps:
+            if isinstance(step, FrameStack):
+                past = (*step.shape[:2], (step.frames - 1) * step.shape[2], *step.shape[3:])
+                carried.append(StateLeaf("frames", np.zeros(past, step.dtype), "frames"))
+            elif isinstance(step, Previous):
+                if step.actions:
+                    codes = np.zeros(step.actions * step.choices, np.float32)
+                    carried.append(StateLeaf("previous_actions", codes, "previous_actions"))
+                if step.rewards > 1:
+                    earlier = np.zeros(step.rewards - 1, np.float32)
+                    carried.append(StateLeaf("previous_rewards", earlier, "previous_rewards"))
+        return (*carried, *self.network_state)
+
+    @property
+    def needs_reward(self) -> bool:
+        """Whether the graph has an input `reward`: the reward that the last action brought, 0 at an episode's start."""
+        return any(isinstance(step, Previous) and step.rewards > 0 for step in self.steps)
+
+
+def parameter_count(space: Any) -> int:
+    """Return how many distribution parameters one action leaf has."""
+    if isinstance(space, Box):
+        return 2 * math.prod(space.shape)
+    if isinstance(space, MultiDiscrete):
+        return int(space.nvec.sum())
+    return int(space.n)
+
+
+def leaf_transform(space: Any, transform: Transform) -> Transform:
+    """Return what happens to one action leaf: only a Box is touched, and unsquashed only if bounded on all sides."""
+    if not isinstance(space, Box):
+        return "none"
+    if transform == "unsquash" and not bool((space.bounded_below & space.bounded_above).all()):
+        return "none"
+    return transform

@@ -10,7 +10,10 @@ from torch import Tensor, nn
 
 from rlservo.export.location import CheckpointFiles
 from rlservo.export.old_location import OldStackFiles
+from rlservo.export.parity import Loop
 from rlservo.export.recipe import Recipe
+from rlservo.export.samples import Inputs
+from rlservo.export.trees import Tree
 
 
 class RestoredNetwork(Protocol):
@@ -18,8 +21,9 @@ class RestoredNetwork(Protocol):
 
     module: nn.Module
     names: tuple[str, ...]
+    given: int
 
-    def __call__(self, obs: Tensor) -> tuple[Tensor, ...]: ...
+    def __call__(self, obs: Tree, *state: list[Tensor]) -> tuple[Tensor, ...]: ...
 
 
 class Restored(Protocol):
@@ -34,8 +38,12 @@ class Restored(Protocol):
     @property
     def module_class(self) -> str: ...
 
-    def reference(self, obs: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return what RLlib itself computes for raw observations `[batch, *obs_shape]`, by output name."""
+    def reference(self, inputs: Inputs) -> dict[str, NDArray[Any]]:
+        """Return what RLlib itself computes for raw observations `[batch, ...]` by input name, by output name."""
+        ...
+
+    def loop(self) -> Loop:
+        """Return RLlib acting step after step."""
         ...
 
 

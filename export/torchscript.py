@@ -7,6 +7,7 @@ torch.export. It knows nothing of RLlib and does not judge the numbers.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,12 @@ from torch.jit._trace import TracerWarning
 from rlservo.export.actor import PolicyGraph
 from rlservo.export.errors import UnsupportedError
 from rlservo.export.parity import Runner
+from rlservo.export.samples import Inputs
 from rlservo.export.unpickle import first_line
 
 
-def write_torchscript(graph: PolicyGraph, example: NDArray[Any], file: Path) -> None:
-    """Write `graph` to `file`: one input, a tuple of the graph's outputs; freezing drops what inference does not use.
+def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> None:
+    """Write `graph` to `file`: its inputs in order, a tuple of its outputs; freezing drops what inference does not use.
 
     Raises UnsupportedError when the network cannot be traced.
     """
@@ -32,23 +34,23 @@ def write_torchscript(graph: PolicyGraph, example: NDArray[Any], file: Path) -> 
         try:
             with torch.no_grad():
                 traced = torch.jit.trace(  # type: ignore[no-untyped-call]  # torch annotates it only in part
-                    graph, (torch.from_numpy(example),), check_trace=False
+                    graph, tuple(torch.from_numpy(example[name]) for name in graph.input_names), check_trace=False
                 )
                 torch.jit.freeze(traced).save(str(file))
         except Exception as error:  # the network's own forward may raise anything
             raise UnsupportedError(f"the network cannot be traced: {first_line(error)}") from error
 
 
-def run_torchscript(file: Path, names: tuple[str, ...]) -> Runner:
-    """Return a function from raw observations `[batch, *obs_shape]` to the outputs, which are called `names`."""
+def run_torchscript(file: Path, inputs: Sequence[str], outputs: Sequence[str]) -> Runner:
+    """Return a function that runs the file, whose inputs and outputs are called so, in this order."""
     with warnings.catch_warnings():
         _ignore_deprecation()
         script = torch.jit.load(str(file))  # type: ignore[no-untyped-call]  # torch annotates it only in part
 
-    def run(obs: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    def run(given: Inputs) -> dict[str, NDArray[Any]]:
         with torch.no_grad():
-            values = script(torch.from_numpy(obs))
-        return {name: value.numpy() for name, value in zip(names, values, strict=True)}
+            values = script(*(torch.from_numpy(given[name]) for name in inputs))
+        return {name: value.numpy() for name, value in zip(outputs, values, strict=True)}
 
     return run
 

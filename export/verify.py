@@ -16,17 +16,17 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.bundle import Bundle, Contract, Evaluation, Parity, load_bundle, write_contract
+from rlservo.export.bundle import Bundle, Contract, Evaluation, Parity, leaf_specs, load_bundle, write_contract
 from rlservo.export.errors import BundleError, UsageError
 from rlservo.export.exporter import LOADING_RUNS_CODE
 from rlservo.export.location import locate_checkpoint
-from rlservo.export.parity import prove, record
+from rlservo.export.parity import GraphLoop, Loop, prove, record
+from rlservo.export.recipe import Recipe
 from rlservo.export.samples import draw_batches
+from rlservo.export.trees import build, named_leaves, space_leaves
 from rlservo.export.unpickle import first_line, user_code
 
 SEED = 20241  # not the export's: other observations
-
-Act = Callable[[NDArray[Any]], NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -72,13 +72,13 @@ def verify_bundle(
         _check_spaces(loaded.contract, restored.recipe)
         formats = _formats(loaded)
         labels = [element.name for element in loaded.contract.action_space.elements]
-        recorded = record(restored.reference, draw_batches(restored.recipe, SEED))
+        recorded = record(restored.reference, draw_batches(restored.recipe, SEED), restored.loop)
         parity = prove(restored.recipe, recorded, formats, labels, files.api_stack)
         evaluation = None
         if env_id is not None:
-            run = formats["onnx"]
-            drivers: tuple[Act, Act] = (lambda obs: run(obs)["action"], lambda obs: restored.reference(obs)["action"])
-            evaluation = _evaluate(loaded.contract, env_id, drivers, episodes, first_seed)
+            run, recipe = formats["onnx"], restored.recipe
+            drivers = (lambda: GraphLoop(run, recipe.state), restored.loop)
+            evaluation = _evaluate(loaded.contract, recipe, env_id, drivers, episodes, first_seed)
             contract = loaded.contract.model_copy(update={"evaluations": (*loaded.contract.evaluations, evaluation)})
             write_contract(loaded.path, contract)
     return VerifyResult(parity, evaluation, same)
@@ -88,26 +88,42 @@ def _formats(bundle: Bundle) -> dict[str, Any]:
     from rlservo.export.onnx import run_onnx
     from rlservo.export.torchscript import run_torchscript
 
-    names = tuple(output.name for output in bundle.contract.outputs)
+    inputs = [tensor.name for tensor in bundle.contract.inputs]
+    outputs = [tensor.name for tensor in bundle.contract.outputs]
     try:
-        return {"onnx": run_onnx(bundle.onnx), "torchscript": run_torchscript(bundle.torchscript, names)}
+        return {"onnx": run_onnx(bundle.onnx), "torchscript": run_torchscript(bundle.torchscript, inputs, outputs)}
     except Exception as error:  # onnxruntime's and torch's own exceptions share no base but Exception
         raise BundleError(f"{bundle.path}: its graphs cannot be loaded: {first_line(error)}") from error
 
 
-def _check_spaces(contract: Contract, recipe: Any) -> None:
-    for which, spec, space in (
-        ("observation", contract.observation_space, recipe.observation_space),
-        ("action", contract.action_space, recipe.action_space),
+def _check_spaces(contract: Contract, recipe: Recipe) -> None:
+    for which, root, spec, leaves in (
+        ("observation", "obs", contract.observation_space, recipe.observation_leaves),
+        ("action", "action", contract.action_space, recipe.action_leaves),
     ):
-        if tuple(spec.shape) != tuple(space.shape):
+        ours = {name: tuple(leaf.shape) for name, leaf in leaf_specs(spec, root).items()}
+        theirs = {name: tuple(leaf.shape) for name, leaf in leaves.items()}
+        if ours != theirs:
             raise UsageError(
-                f"policy '{contract.name}' has {which}s of shape {tuple(spec.shape)}, the checkpoint's have "
-                f"{tuple(space.shape)}: they do not belong together"
+                f"policy '{contract.name}' has {which}s of shape {_shapes(ours)}, the checkpoint's have "
+                f"{_shapes(theirs)}: they do not belong together"
             )
 
 
-def _evaluate(contract: Contract, env_id: str, drivers: tuple[Act, Act], episodes: int, first_seed: int) -> Evaluation:
+def _shapes(leaves: dict[str, tuple[int, ...]]) -> str:
+    if len(leaves) == 1:
+        return str(next(iter(leaves.values())))
+    return ", ".join(f"{name} {shape}" for name, shape in leaves.items())
+
+
+def _evaluate(
+    contract: Contract,
+    recipe: Recipe,
+    env_id: str,
+    drivers: tuple[Callable[[], Loop], Callable[[], Loop]],
+    episodes: int,
+    first_seed: int,
+) -> Evaluation:
     try:
         # Gymnasium's checker warns about the environment's style, which is not what is measured here.
         env: gymnasium.Env[Any, Any] = gymnasium.make(
@@ -116,14 +132,18 @@ def _evaluate(contract: Contract, env_id: str, drivers: tuple[Act, Act], episode
     except Exception as error:  # the environment's own constructor may raise anything
         raise UsageError(f"environment {env_id} cannot be made: {first_line(error)}") from error
     try:
-        if env.observation_space.shape != contract.observation_space.shape:
+        theirs = {name: tuple(leaf.shape) for name, leaf in space_leaves(env.observation_space, "obs").items()}
+        ours = {name: tuple(leaf.shape) for name, leaf in recipe.observation_leaves.items()}
+        if theirs != ours:
             raise UsageError(
-                f"environment {env_id} gives observations of shape {env.observation_space.shape}, policy "
-                f"'{contract.name}' expects {contract.observation_space.shape}"
+                f"environment {env_id} gives observations of shape {_shapes(theirs)}, policy "
+                f"'{contract.name}' expects {_shapes(ours)}"
             )
-        runs = [[_episode(env, act, contract, first_seed + number) for number in range(episodes)] for act in drivers]
+        runs = [
+            [_episode(env, start(), recipe, first_seed + number) for number in range(episodes)] for start in drivers
+        ]
     finally:
-        env.close()  # type: ignore[no-untyped-call]  # gymnasium 1.2 leaves it unannotated
+        env.close()
     returns = [float(np.mean([one.reward for one in run])) for run in runs]
     success = [_success_rate(run) for run in runs]
     return Evaluation(
@@ -144,17 +164,26 @@ class _Episode:
     success: bool | None  # None where the environment does not tell
 
 
-def _episode(env: gymnasium.Env[Any, Any], act: Act, contract: Contract, seed: int) -> _Episode:
-    dtype = np.dtype(contract.observation_space.dtype)
-    discrete = contract.action_space.kind == "discrete"
+def _episode(env: gymnasium.Env[Any, Any], loop: Loop, recipe: Recipe, seed: int) -> _Episode:
     obs, info = env.reset(seed=seed)
-    total, done = 0.0, False
+    total, reward, first, done = 0.0, 0.0, True, False
+    spaces = recipe.observation_leaves
     while not done:
-        action = act(np.asarray(obs, dtype)[None])[0]
-        obs, reward, terminated, truncated, info = env.step(int(action) if discrete else action)
-        total += float(reward)
+        inputs = {name: np.asarray(leaf, spaces[name].dtype)[None] for name, leaf in named_leaves(obs, "obs").items()}
+        if recipe.needs_reward:
+            inputs["reward"] = np.array([reward], np.float32)
+        outputs = loop.step(inputs, np.array([first]))
+        action = build(recipe.action_space, [_sent(outputs[name][0]) for name in recipe.action_leaves])
+        obs, reward, terminated, truncated, info = env.step(action)
+        reward, first = float(reward), False
+        total += reward
         done = terminated or truncated
     return _Episode(total, _succeeded(info))
+
+
+def _sent(leaf: NDArray[Any]) -> Any:
+    """A Discrete action is a number to most environments, and an array to some."""
+    return leaf.item() if leaf.ndim == 0 else leaf
 
 
 def _succeeded(info: dict[str, Any]) -> bool | None:

@@ -5,7 +5,7 @@ From a checkout: `serve run deploy/serve.yaml`, or `serve run rlservo.serve_app.
 comes here through `cluster.py`. A replica imports neither torch nor ray.rllib.
 """
 
-from __future__ import annotations
+# No `from __future__ import annotations` here: Serve reads the type of build's argument to know what to make of `args`.
 
 import asyncio
 from pathlib import Path

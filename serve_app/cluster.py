@@ -14,10 +14,13 @@ import os
 import signal
 import sys
 import threading
+import time
+from pathlib import Path
 from typing import Any
 
-from rlservo.serve_app.processes import end_marked
+from rlservo.serve_app.processes import end_marked, remove_folder
 
+ORDERLY_END_S = 25.0  # [s] less than the launcher waits
 OBJECT_STORE_BYTES = 80 << 20  # Ray's least is 75 MiB; requests do not go through it
 
 
@@ -27,7 +30,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     stop = threading.Event()
     started = threading.Event()
-    threading.Thread(target=_watch_input, args=(stop, started, plan["mark"]), daemon=True).start()
+    threading.Thread(target=_watch_input, args=(stop, started, plan), daemon=True).start()
     import ray
 
     from rlservo.serve_app import app
@@ -61,6 +64,7 @@ def main() -> int:
     stop.wait()
     app.stop()
     ray.shutdown()
+    _leave_nothing(plan)
     return 0
 
 
@@ -79,14 +83,21 @@ def _leave_out_monitors() -> None:
         )
 
 
-def _watch_input(stop: threading.Event, started: threading.Event, mark: str) -> None:
+def _watch_input(stop: threading.Event, started: threading.Event, plan: dict[str, Any]) -> None:
     while os.read(0, 4096):
         pass
     stop.set()
-    if not started.is_set():
-        # Nothing has been served yet, so there is nothing to drain; a half-started cluster has no orderly end.
-        end_marked(mark)
-        os._exit(0)
+    if started.is_set():
+        time.sleep(ORDERLY_END_S)  # a daemon thread: an end in time ends this sleep, too
+    # Otherwise nothing has been served yet, so there is nothing to drain; a half-started cluster has no orderly end.
+    _leave_nothing(plan)
+    os._exit(0)
+
+
+def _leave_nothing(plan: dict[str, Any]) -> None:
+    """End what is left and remove the folder. The launcher does the same, unless it was killed."""
+    end_marked(plan["mark"], os.getsid(0))
+    remove_folder(Path(plan["folder"]))
 
 
 def _report(plan: dict[str, Any], message: dict[str, Any]) -> None:

@@ -7,13 +7,13 @@ nothing of the web, ray, torch or gymnasium. The server is a thin edge over it (
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 from typing_extensions import Self
 
@@ -30,6 +30,9 @@ from rlservo.export.errors import ActionError, BundleError, GoldenMismatchError,
 from rlservo.serve_app.acting import Observation
 from rlservo.serve_app.exploring import distribution_size, sample_action
 from rlservo.serve_app.observation import ObservationReader
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 logger = logging.getLogger(__name__)
 
@@ -221,6 +224,11 @@ def _check_contract(bundle: Bundle) -> None:
 
 
 def _open_session(bundle: Bundle, threads: int) -> onnxruntime.InferenceSession:
+    # onnxruntime 1.31's Linux wheels report use to Microsoft from the moment they are imported unless this is set
+    # (its Privacy.md). What runs a robot calls nobody; whoever wants it may set the variable to 0.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1

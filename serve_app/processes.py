@@ -1,7 +1,9 @@
 """What a launcher must know of the machine: free ports, who holds one, and how to leave no process behind.
 
-Every process of a launch inherits one environment variable with the launch's own mark, so that whatever is left of it
-can be found and ended whatever became of its parents. Reads /proc (Linux). It knows nothing of ray or policies.
+Every process of a launch inherits one environment variable with the launch's own mark, and the session of the launch's
+first process, so that whatever is left of it can be found and ended whatever became of its parents. It takes both:
+Ray's workers write their title over the memory that held their environment, and whoever wants to may leave a session.
+Reads /proc (Linux). It knows nothing of ray or policies.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shutil
 import signal
 import socket
 import time
@@ -18,6 +21,7 @@ from rlservo.export.errors import UsageError
 
 MARK = "RLSERVO_LAUNCH"
 PROC = Path("/proc")
+QUIET_S = 0.3  # without a sign of a marked process, before the last of them counts as gone
 
 
 def check_port(host: str, port: int) -> None:
@@ -82,8 +86,8 @@ def free_ports(count: int) -> list[int]:
         return [int(each.getsockname()[1]) for each in sockets]
 
 
-def marked(mark: str) -> list[int]:
-    """Return the living processes, other than this one, that carry the launch's mark."""
+def marked(mark: str, session: int | None = None) -> list[int]:
+    """Return the living processes, other than this one, that carry the launch's mark or belong to its session."""
     wanted = f"{MARK}={mark}".encode()
     found = []
     for pid in _pids():
@@ -91,20 +95,46 @@ def marked(mark: str) -> list[int]:
             continue
         with contextlib.suppress(OSError):
             # A zombie's environment reads as empty: it is gone but for its parent's notice.
-            if wanted in (PROC / str(pid) / "environ").read_bytes().split(b"\0"):
+            has_mark = wanted in (PROC / str(pid) / "environ").read_bytes().split(b"\0")
+            if has_mark or (session is not None and _session_of_living(pid) == session):
                 found.append(pid)
     return found
 
 
-def end_marked(mark: str, *, timeout_s: float = 10.0) -> list[int]:
-    """Kill every process that carries the mark, and those they start meanwhile; return what would not go."""
+def _session_of_living(pid: int) -> int | None:
+    """Return the process's session id, None for a zombie."""
+    # After the command in parentheses, which may hold anything: state, parent, group, session.
+    state, _, _, session, *_ = (PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
+    return None if state == "Z" else int(session)
+
+
+def end_marked(mark: str, session: int | None = None, *, timeout_s: float = 10.0) -> list[int]:
+    """Kill every process of the launch (see `marked`), and those they start meanwhile; return what would not go."""
     deadline = time.monotonic() + timeout_s
-    while (left := marked(mark)) and time.monotonic() < deadline:
+    quiet_since: float | None = None
+    while time.monotonic() < deadline:
+        left = marked(mark, session)
         for pid in left:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.kill(pid, signal.SIGKILL)
+        # One empty look proves nothing: in the middle of an exec a process shows no environment at all.
+        if left:
+            quiet_since = None
+        elif quiet_since is None:
+            quiet_since = time.monotonic()
+        elif time.monotonic() - quiet_since >= QUIET_S:
+            return []
         time.sleep(0.05)
-    return left
+    return marked(mark, session)
+
+
+def remove_folder(folder: Path, *, timeout_s: float = 5.0) -> None:
+    """Remove a folder that processes just ended, or another cleaner, may be touching a last time."""
+    deadline = time.monotonic() + timeout_s
+    while folder.exists() and time.monotonic() < deadline:
+        shutil.rmtree(folder, ignore_errors=True)
+        if folder.exists():
+            time.sleep(0.05)
 
 
 def _pids() -> list[int]:

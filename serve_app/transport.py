@@ -169,6 +169,8 @@ class Transport:
         except ValueError:
             document = None
         if not isinstance(document, dict) or not isinstance(document.get("error"), str):
+            if status == 404:  # Ray Serve's own answer while the application is being deployed
+                return UnavailableError(f"{url} answered 404 with {_shown(content)}: no rlservo server is there (yet)")
             return _class_of_status(status)(f"{url} answered {status} with {_shown(content)}: is it an rlservo server?")
         details = document.get("details")
         kind = error_classes().get(str(document.get("code")), _class_of_status(status))
@@ -223,8 +225,6 @@ def _class_of_status(status: int) -> type[RlservoError]:
         return DeadlineError
     if status == 413:
         return TooLargeError
-    if status == 404:  # Ray Serve's own answer while the application is being deployed
-        return UnavailableError
     return UnavailableError if status >= 500 or status < 400 else RequestError
 
 

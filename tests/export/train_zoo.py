@@ -56,6 +56,7 @@ def toy(spaces: str, **more: Any) -> Any:
 
 def off_policy(config: Any, env: str, **environment: Any) -> Any:
     config.environment(env, **environment).env_runners(num_env_runners=0, rollout_fragment_length=1)
+    config.reporting(min_sample_timesteps_per_iteration=20, min_time_s_per_iteration=0)
     config.training(num_steps_sampled_before_learning_starts=8, train_batch_size_per_learner=8)
     return config.rl_module(model_config=SMALL)
 
@@ -95,26 +96,35 @@ def record(algorithm: Any, file: Path) -> None:
             piece._update_stats = False
     runner.sample(num_timesteps=1, explore=False, force_reset=True)  # drops observations filtered before the freeze
     env = runner.env.unwrapped.envs[0]
-    seen: list[tuple[Any, Any]] = []
-    last: list[Any] = []
+    seen: list[dict[str, Any]] = []
+    last: dict[str, Any] = {}
     real_reset, real_step = env.reset, env.step
 
     def reset(**kwargs: Any) -> Any:
         obs, info = real_reset(**kwargs)
-        last[:] = [obs]
+        last.update(obs=obs, reward=0.0, restart=True)
         return obs, info
 
     def step(action: Any) -> Any:
         if last:
-            seen.append((np.copy(last[0]), np.copy(action)))
+            named = {**leaves(last["obs"], "obs"), **leaves(action, "action")}
+            seen.append({**named, "reward": last["reward"], "restart": last["restart"]})
         result = real_step(action)
-        last[:] = [result[0]]
+        last.update(obs=result[0], reward=result[1], restart=False)
         return result
 
     env.reset, env.step = reset, step
     runner.sample(num_timesteps=100, explore=False, force_reset=True)
     assert len(seen) >= 90, len(seen)
-    np.savez(file, obs=np.stack([obs for obs, _ in seen]), action=np.stack([action for _, action in seen]))
+    np.savez(file, **{name: np.stack([one[name] for one in seen]) for name in seen[0]})
+
+
+def leaves(tree: Any, name: str) -> dict[str, Any]:
+    """Return a copy of every part of a nested observation or action by its path."""
+    if isinstance(tree, dict | tuple):
+        inside = tree.items() if isinstance(tree, dict) else enumerate(tree)
+        return {path: leaf for key, child in inside for path, leaf in leaves(child, f"{name}.{key}").items()}
+    return {name: np.copy(tree)}
 
 
 def main(out: Path, only: list[str]) -> None:

@@ -63,3 +63,16 @@ def test_marked_processes_are_ended_with_their_children_and_others_are_left() ->
         bystander.kill()
         parent.wait()
         bystander.wait()
+
+
+def test_a_process_that_lost_its_mark_is_found_by_its_session() -> None:
+    """Ray's workers overwrite the memory of their environment with their title."""
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], env={}, start_new_session=True)
+    try:
+        assert process.pid in marked("no such mark", process.pid)
+        assert marked("no such mark") == []
+        assert end_marked("no such mark", process.pid) == []
+        assert process.wait(5) == -9
+    finally:
+        process.kill()
+        process.wait()

@@ -1,0 +1,161 @@
+"""The wider zoo: spaces, recurrent policies, connectors and algorithms. See train_zoo.py, whose tools it uses.
+
+    python train_wide_zoo.py OUT [NAME...]
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import ray
+from ray import tune
+from ray.rllib.algorithms.appo import APPOConfig
+from ray.rllib.algorithms.dqn import DQNConfig
+from ray.rllib.algorithms.impala import IMPALAConfig
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.algorithms.sac import SACConfig
+from ray.rllib.algorithms.tqc import TQCConfig
+from ray.rllib.connectors.env_to_module import FlattenObservations, MeanStdFilter, PrevActionsPrevRewards
+from ray.rllib.connectors.env_to_module.frame_stacking import FrameStackingEnvToModule
+from ray.rllib.connectors.learner.frame_stacking import FrameStackingLearner
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
+from ray.rllib.examples.rl_modules.classes.autoregressive_actions_rlm import AutoregressiveActionsRLM
+
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE / "app"), str(HERE)]
+import zoo_spaces  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
+from train_zoo import record  # pyright: ignore[reportMissingImports]
+
+SMALL = DefaultModelConfig(fcnet_hiddens=[16])
+LSTM = DefaultModelConfig(fcnet_hiddens=[8], use_lstm=True, lstm_cell_size=8, max_seq_len=10)
+CNN = DefaultModelConfig(
+    conv_filters=[[4, 4, 2], [8, 3, 2]], head_fcnet_hiddens=[8], fcnet_hiddens=[8], conv_activation="relu"
+)
+
+
+def pieces(*kinds: Any) -> Any:
+    def make(env: Any = None, spaces: Any = None, device: Any = None) -> Any:
+        return [kind() for kind in kinds]
+
+    return make
+
+
+def previous() -> Any:
+    return PrevActionsPrevRewards(n_prev_actions=2, n_prev_rewards=3)
+
+
+def stacked() -> Any:
+    return FrameStackingEnvToModule(num_frames=3)
+
+
+
+
+
+
+def stacked_for_learning(input_observation_space: Any, input_action_space: Any, device: Any = None) -> Any:
+    return FrameStackingLearner(num_frames=3)
+
+
+def spaces_env(config: Any, obs: str, action: str, *before: Any, after: Any = None, **runners: Any) -> Any:
+    config.environment("spaces", env_config={"obs": obs, "action": action})
+    runners = {"num_env_runners": 0, **runners}
+    if before:
+        runners["env_to_module_connector"] = pieces(*before)
+    if after:
+        runners["module_to_env_connector"] = lambda env=None, spaces=None: after()
+    return config.env_runners(**runners)
+
+
+def ppo(obs: str, action: str, *before: Any, model: Any = SMALL, spec: Any = None, after: Any = None) -> Any:
+    config = spaces_env(PPOConfig(), obs, action, *before, after=after)
+    config.training(train_batch_size=128, minibatch_size=64, num_epochs=1)
+    return config.rl_module(rl_module_spec=spec) if spec else config.rl_module(model_config=model)
+
+
+def off_policy(config: Any, obs: str, action: str, *before: Any, model: Any = SMALL, **training: Any) -> Any:
+    spaces_env(config, obs, action, *before, rollout_fragment_length=1)
+    config.reporting(min_sample_timesteps_per_iteration=20, min_time_s_per_iteration=0)
+    config.training(num_steps_sampled_before_learning_starts=8, train_batch_size_per_learner=8, **training)
+    return config.rl_module(model_config=model)
+
+
+def configurations() -> dict[str, Any]:
+    flat = FlattenObservations
+    impala = spaces_env(IMPALAConfig(), "vector", "box").learners(num_learners=0).rl_module(model_config=SMALL)
+    appo = spaces_env(APPOConfig(), "vector", "multi_discrete").learners(num_learners=0).rl_module(model_config=LSTM)
+    masking = RLModuleSpec(module_class=ActionMaskingTorchRLModule, model_config={"head_fcnet_hiddens": [8]})
+    return {
+        "lstm_box": ppo("vector", "box", MeanStdFilter, model=LSTM),
+        "lstm_discrete": ppo("vector", "discrete", model=LSTM),
+        "lstm_previous": ppo("vector", "discrete", previous, flat, model=LSTM),
+        "previous": ppo("discrete", "discrete", previous, flat),
+        "user_gru": ppo("vector", "discrete", spec=RLModuleSpec(module_class=zoo_spaces.GruModule, model_config={"max_seq_len": 10})),
+        "appo_lstm": appo.training(train_batch_size_per_learner=64),
+        "obs_discrete": ppo("discrete", "box", flat),
+        "obs_below_zero": ppo("below_zero", "discrete", flat),
+        "obs_multi_discrete": ppo("multi_discrete", "discrete", flat),
+        "obs_multi_binary": ppo("multi_binary", "discrete", flat),
+        "obs_integers": ppo("integers", "discrete", flat, MeanStdFilter),
+        "obs_integers_filtered_first": ppo("integers", "discrete", MeanStdFilter, flat),
+        "obs_bytes": ppo("bytes", "discrete", flat),
+        "obs_dict": ppo("dict", "discrete", flat),
+        "obs_tuple": ppo("tuple", "discrete", flat, MeanStdFilter),
+        "obs_nested": ppo("nested", "box", flat),
+        "dict_module": ppo("dict", "discrete", spec=RLModuleSpec(module_class=zoo_spaces.DictModule)),
+        "greedy_module": ppo("dict", "discrete", spec=RLModuleSpec(module_class=zoo_spaces.GreedyModule)),
+        "image": ppo("image", "discrete", model=CNN),
+        "byte_image": ppo("byte_image", "discrete", spec=RLModuleSpec(module_class=zoo_spaces.ByteImageModule)),
+        "stacked": ppo("gray", "discrete", stacked, model=CNN).learners(learner_connector=stacked_for_learning),
+        "act_multi_discrete": ppo("vector", "multi_discrete"),
+        "act_dict": ppo("vector", "dict"),
+        "act_tuple": ppo("vector", "tuple"),
+        "act_nested": ppo("nested", "nested", flat, model=LSTM),
+        "masked": ppo("masked", "discrete", spec=masking),
+        "autoregressive": ppo("vector", "autoregressive", spec=RLModuleSpec(module_class=AutoregressiveActionsRLM)),
+        "scaled": ppo("vector", "discrete", zoo_spaces.Scaled),
+        "wrongly_scaled": ppo("vector", "discrete", zoo_spaces.WronglyScaled),
+        "halved": ppo("vector", "box", after=zoo_spaces.Halved),
+        "impala": impala.training(train_batch_size_per_learner=64),
+        "sac_discrete": off_policy(SACConfig(), "vector", "discrete"),
+        "tqc": off_policy(TQCConfig(), "vector", "box", MeanStdFilter),
+        "dqn_plain": off_policy(DQNConfig(), "vector", "discrete", dueling=False, double_q=False),
+        "dqn_distributional": off_policy(DQNConfig(), "dict", "discrete", flat, num_atoms=5, v_min=-3.0, v_max=3.0),
+        "dqn_distributional_plain": off_policy(DQNConfig(), "vector", "discrete", dueling=False, num_atoms=5),
+        "dqn_lstm": off_policy(DQNConfig(), "vector", "discrete", model=LSTM, replay_buffer_config={"type": "EpisodeReplayBuffer", "capacity": 1000}),
+    }  # fmt: skip
+
+
+def main(out: Path, only: list[str]) -> None:
+    zoo_spaces.ACTIONS["autoregressive"] = zoo_spaces.Tuple((zoo_spaces.Discrete(3), zoo_spaces.Box(-1.0, 1.0, (1,))))
+    tune.register_env("spaces", zoo_spaces.Spaces)
+    ray.init(num_cpus=1, include_dashboard=False, _temp_dir=str(out / "ray"), configure_logging=False)
+    failed = []
+    try:
+        for name, config in configurations().items():
+            if only and name not in only:
+                continue
+            try:
+                algorithm = config.build_algo()
+                algorithm.train()
+                algorithm.save_to_path(str(out / name))
+                algorithm.restore_from_path(str(out / name))
+                record(algorithm, out / f"{name}.npz")
+                algorithm.stop()
+                print(name, flush=True)
+            except Exception as e:
+                import traceback
+                traceback.print_exc()
+                print("FAILED", name, type(e), str(e)[:200], flush=True)
+                failed.append(name)
+    finally:
+        ray.shutdown()
+    print("failed:", failed)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])
