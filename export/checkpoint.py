@@ -1,4 +1,4 @@
-"""Restore a policy from an RLlib checkpoint, and run it as RLlib itself would. It imports ray.rllib, as old_stack.py does.
+"""Restore a policy of RLlib's new API stack, and run it as RLlib itself would. It imports ray.rllib, as old_stack.py.
 
 Restoring starts nothing: no `ray.init`, no environment, no worker. The module and both connector pipelines come from
 their own folders in the checkpoint; `connectors.py` reads off them what they do. `Checkpoint.reference` is the truth
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 from ray.rllib.connectors.connector_pipeline_v2 import ConnectorPipelineV2
 from ray.rllib.connectors.env_to_module.env_to_module_pipeline import EnvToModulePipeline
@@ -356,9 +356,7 @@ def _action_rule(
             f"forward gives {', '.join(sorted(given))}"
         )
     kind = module.get_inference_action_dist_cls()
-    mode = find_mode(
-        lambda probe: kind.from_logits(probe).to_deterministic().sample(), kind.__name__, action_space
-    )
+    mode = find_mode(lambda probe: kind.from_logits(probe).to_deterministic().sample(), kind.__name__, action_space)
     distribution = _distribution_kind(kind)
     if distribution is None:
         notify(f"the action distribution {kind.__name__} is not one of RLlib's: the export cannot explore with it")

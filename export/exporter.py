@@ -164,9 +164,7 @@ class _Golden:
     outputs: Outputs
 
 
-def _write_graphs(
-    folder: Path, restored: Restored, labels: list[str], api_stack: str
-) -> tuple[Parity, _Golden]:
+def _write_graphs(folder: Path, restored: Restored, labels: list[str], api_stack: str) -> tuple[Parity, _Golden]:
     """Write both formats, prove them, and return the proof and the golden vectors."""
     from rlservo.export.actor import PolicyGraph
     from rlservo.export.onnx import run_onnx, write_onnx

@@ -18,7 +18,8 @@ from rlservo.export.unpickle import first_line
 def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: Any) -> Mode:
     """Return how the deterministic action of distribution `name` comes out of its parameters.
 
-    `deterministic` gives it for parameters `[batch, n]`. RLlib 2.60 sends SAC's bare mean where other versions send its tanh: the class in the checkpoint decides.
+    `deterministic` gives it for parameters `[batch, n]`. RLlib 2.60 sends SAC's bare mean on the new API stack where
+    the old one and other versions send its tanh: the class in the checkpoint decides.
     """
     spaces = space_leaves(action_space, "action")
     widths = [parameter_count(space) for space in spaces.values()]

@@ -8,12 +8,14 @@ import pickle
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Discrete
+from numpy.typing import NDArray
 
 from rlservo.export.actor import PolicyGraph
 from rlservo.export.bundle import Parity, load_bundle
@@ -24,9 +26,9 @@ from rlservo.export.old_location import OldStackFiles
 from rlservo.export.old_models import Registration, find_registrations
 from rlservo.export.old_stack import OldStackCheckpoint, load_old_stack
 from rlservo.export.onnx import run_onnx, write_onnx
-from rlservo.export.parity import prove, record
+from rlservo.export.parity import GraphLoop, Loop, prove, record
 from rlservo.export.prune import prune_checkpoint
-from rlservo.export.recipe import ObservationFilter, Recipe, Rescale
+from rlservo.export.recipe import ObservationFilter, Preprocess, Recipe, StateLeaf
 from rlservo.export.samples import draw_batches
 from rlservo.export.torchscript import run_torchscript
 from rlservo.export.unpickle import user_code
@@ -37,7 +39,8 @@ EXPORTED = [
     "pendulum", "cart_pole", "clipped", "shared", "free_std", "no_critic", "concurrent", "unbounded", "half_bounded",
     "mixed", "double", "started", "grid", "beams", "filtered_beams", "picture", "offset", "dqn", "plain_dqn",
     "distributional_dqn", "sac", "unnormalized_sac", "discrete_sac", "appo", "impala", "marwil", "cloned", "cql",
-    "user_model", "named_model",
+    "user_model", "named_model", "lstm", "continuous_lstm", "user_recurrent", "choice", "shifted", "dials", "nested",
+    "filtered_nested", "camera", "levers", "limbs",
 ]  # fmt: skip
 SEVERAL = ["several_arm", "several_cart"]
 
@@ -76,32 +79,63 @@ def rewrite(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
     file.write_bytes(pickle.dumps(state))
 
 
+def drive(loop: Loop, seen: Mapping[str, NDArray[Any]], rows: int | None = None) -> dict[str, NDArray[Any]]:
+    """Return a loop's actions for what the environment saw: step by step, or, without a memory, all at once."""
+    obs = {name: values for name, values in seen.items() if name.startswith("obs")}
+    restart = seen["restart"].copy()
+    if rows is None:
+        return loop.step(obs, np.ones(len(restart), np.bool_))
+    restart[0] = True
+    steps = [
+        loop.step({name: values[t : t + 1] for name, values in obs.items()}, restart[t : t + 1]) for t in range(rows)
+    ]
+    return {name: np.concatenate([step[name] for step in steps]) for name in steps[0]}
+
+
+def spec_leaves(space: Any, name: str) -> dict[str, Any]:
+    """Return the contract's leaf spaces by name."""
+    inside = getattr(space, "spaces", None)
+    if inside is None:
+        return {name: space}
+    children = inside.items() if isinstance(inside, dict) else enumerate(inside)
+    return {path: leaf for key, child in children for path, leaf in spec_leaves(child, f"{name}.{key}").items()}
+
+
+def assert_same_actions(got: Mapping[str, NDArray[Any]], seen: Mapping[str, NDArray[Any]]) -> None:
+    names = [name for name in seen if name.startswith("action")]
+    assert names
+    for name in names:
+        expected = seen[name][: len(got[name])]
+        if expected.dtype.kind == "i":
+            np.testing.assert_array_equal(got[name], expected)
+        else:
+            np.testing.assert_allclose(got[name], expected, rtol=1e-5, atol=2e-6)
+
+
 @pytest.mark.parametrize("name", [*EXPORTED, *SEVERAL])
 def test_an_old_stack_export_acts_as_rllib_did_in_its_own_evaluation(
     old_zoo: Path, export: Callable[..., ExportResult], name: str
 ) -> None:
-    result = export(name)
-    assert result.contract.provenance.api_stack == "old"
-    seen = np.load(old_zoo / f"{name}.npz")
-    outputs = tuple(output.name for output in result.contract.outputs)
-    for run in (run_onnx(result.path / "policy.onnx"), run_torchscript(result.path / "policy.ts", outputs)):
-        action = run(seen["obs"])["action"]
-        if result.contract.action_space.kind == "discrete":
-            assert action.dtype == np.int64
-            np.testing.assert_array_equal(action, seen["action"])
-        else:
-            assert action.dtype == result.contract.action_space.dtype
-            np.testing.assert_allclose(action, seen["action"], rtol=1e-5, atol=2e-6)
+    contract, path = (result := export(name)).contract, result.path
+    assert contract.provenance.api_stack == "old"
+    seen = dict(np.load(old_zoo / f"{name}.npz"))
+    names = [tuple(tensor.name for tensor in side) for side in (contract.inputs, contract.outputs)]
+    state = [StateLeaf(leaf.name, np.full(leaf.shape, leaf.initial, leaf.dtype)) for leaf in contract.state]
+    for run in (run_onnx(path / "policy.onnx"), run_torchscript(path / "policy.ts", *names)):
+        got = drive(GraphLoop(run, state), seen, rows=len(seen["restart"]) if state else None)
+        assert_same_actions(got, seen)
+        for action, space in spec_leaves(contract.action_space, "action").items():
+            assert str(got[action].dtype) == space.dtype
 
 
 @pytest.mark.parametrize("name", [*EXPORTED, *SEVERAL])
 def test_the_reference_is_what_the_environment_saw(
     old_zoo: Path, load: Callable[..., OldStackCheckpoint], name: str
 ) -> None:
-    seen = np.load(old_zoo / f"{name}.npz")
-    action = load(name).reference(seen["obs"])["action"]
-    # One by one in the evaluation, together here: sums may come in another order.
-    np.testing.assert_allclose(action, seen["action"], rtol=1e-5, atol=1e-6)
+    seen = dict(np.load(old_zoo / f"{name}.npz"))
+    restored = load(name)
+    # One by one in the evaluation, together here where there is no memory: sums may come in another order.
+    assert_same_actions(drive(restored.loop(), seen, rows=45 if restored.recipe.state else None), seen)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "sac"])
@@ -167,6 +201,31 @@ def test_the_action_rule_is_the_policys_own(
     assert restored.network.names == names
 
 
+@pytest.mark.parametrize(("name", "states", "initial"), [("lstm", ["h", "c"], 0.0), ("user_recurrent", ["0"], 0.25)])
+def test_a_recurrent_models_state_goes_in_and_out_and_begins_as_the_model_says(
+    export: Callable[..., ExportResult], name: str, states: list[str], initial: float
+) -> None:
+    contract = export(name).contract
+    assert [(leaf.name, leaf.shape, leaf.initial) for leaf in contract.state] == [
+        (one, (8,), initial) for one in states
+    ]
+    assert [tensor.name for tensor in contract.inputs] == ["obs", *(f"state_in.{one}" for one in states)]
+
+
+def test_swapped_recurrent_states_are_caught(load: Callable[..., OldStackCheckpoint], tmp_path: Path) -> None:
+    restored = load("lstm")
+    h, c = restored.recipe.network_state
+    with pytest.raises(ParityError):
+        prove_as(restored, dataclasses.replace(restored.recipe, network_state=(c, h)), tmp_path)
+
+
+def test_one_hot_codes_count_from_the_spaces_start(load: Callable[..., OldStackCheckpoint], tmp_path: Path) -> None:
+    restored = load("shifted")  # Discrete(4, start=3)
+    told_wrong = (Preprocess(Discrete(4)), *restored.recipe.steps[1:])
+    with pytest.raises(ParityError):
+        prove_as(restored, dataclasses.replace(restored.recipe, steps=told_wrong), tmp_path)
+
+
 def test_a_value_head_that_nothing_trained_is_left_out_with_a_notice(
     load: Callable[..., OldStackCheckpoint], notices: list[str]
 ) -> None:
@@ -182,7 +241,7 @@ def test_a_scan_of_128_beams_is_rescaled_as_rllib_takes_it_for_an_ataris_memory(
     result = export("filtered_beams")
     assert [step.step for step in result.contract.baked_in][:2] == ["rescale", "mean_std_filter"]
     restored = load("beams")
-    assert restored.recipe.steps == (Rescale(offset=128.0, divisor=128.0),)
+    assert [type(step) for step in restored.recipe.steps] == [Preprocess]
     with pytest.raises(ParityError):
         prove_as(restored, dataclasses.replace(restored.recipe, steps=()), tmp_path)
 
@@ -190,8 +249,10 @@ def test_a_scan_of_128_beams_is_rescaled_as_rllib_takes_it_for_an_ataris_memory(
 def prove_as(restored: OldStackCheckpoint, recipe: Recipe, tmp_path: Path) -> Parity:
     """Prove a graph built from `recipe` against RLlib's own pipeline of `restored`."""
     graph = PolicyGraph(recipe, restored.network)
-    recorded = record(restored.reference, draw_batches(restored.recipe, seed=3))
-    write_onnx(graph, recorded[-1].batch.obs, tmp_path / "policy.onnx")
+    recorded = record(restored.reference, draw_batches(restored.recipe, seed=3), restored.loop)
+    last = recorded[-1].batch
+    example = GraphLoop(lambda inputs: inputs, recipe.state).complete(last.inputs, np.ones(len(last), np.bool_))
+    write_onnx(graph, example, tmp_path / "policy.onnx")
     return prove(restored.recipe, recorded, {"onnx": run_onnx(tmp_path / "policy.onnx")}, (), "old")
 
 
@@ -237,19 +298,19 @@ def test_a_clip_the_filter_does_not_have_is_caught(load: Callable[..., OldStackC
 
 def test_the_old_stack_reference_does_not_drift(load: Callable[..., OldStackCheckpoint]) -> None:
     restored = load("pendulum")
-    obs = np.array([[0.1, 0.9, 3.0]], np.float32)
-    before = restored.reference(obs)
+    inputs = {"obs": np.array([[0.1, 0.9, 3.0]], np.float32)}
+    before = restored.reference(inputs)
     for batch in draw_batches(restored.recipe, seed=5):  # some far outside the space
-        restored.reference(batch.obs.copy())
-    for name, values in restored.reference(obs).items():
+        restored.reference(batch.inputs)
+    for name, values in restored.reference(inputs).items():
         np.testing.assert_array_equal(values, before[name])
 
 
 @pytest.mark.parametrize(
     ("name", "error", "words"),
     [
-        ("lstm", UnsupportedError, r"LSTMWrapper of policy PPOTorchPolicy is recurrent"),
-        ("attention", UnsupportedError, r"AttentionWrapper of policy PPOTorchPolicy is recurrent"),
+        ("attention", UnsupportedError, r"AttentionWrapper of policy PPOTorchPolicy .*\('state_in_0', shift -50:-1\)"),
+        ("previous_lstm", UnsupportedError, r"LSTMWrapper of policy PPOTorchPolicy .*\('prev_actions', shift -1\)"),
         ("noisy_dqn", UnsupportedError, r"noisy layers \(noisy=True\)"),
         (
             "previous_action",
@@ -257,9 +318,7 @@ def test_the_old_stack_reference_does_not_drift(load: Callable[..., OldStackChec
             r"OldPreviousAction of policy PPOTorchPolicy .*\('prev_actions', shift -1",
         ),
         ("clock_reader", UnsupportedError, r"OldClockReader reads 't' besides the observation"),
-        ("choice", UnsupportedError, r"OneHotPreprocessor for observations Discrete\(6\)"),
-        ("nested", UnsupportedError, r"DictFlatteningPreprocessor for observations Dict"),
-        ("levers", UnsupportedError, r"action space MultiDiscrete"),
+        ("clipped_limbs", UnsupportedError, r"parts that are unsquashed and parts that are only clipped"),
         ("batch_reader", ParityError, r"a batch of 257 likely observations: output 'action_dist_inputs', element 0"),
         ("several", CheckpointError, r"holds 2 policies \(arm, cart\): name the one to export with --module-id"),
     ],
@@ -420,9 +479,8 @@ def test_settings_that_an_earlier_ray_did_not_know_take_their_defaults(
 
     damaged = old_copy("pendulum")
     rewrite(damaged / STATE, forget)
-    seen = np.load(old_zoo / "pendulum.npz")
-    action = load("pendulum", damaged.parent).reference(seen["obs"])["action"]
-    np.testing.assert_allclose(action, seen["action"], rtol=1e-5, atol=1e-6)
+    seen = dict(np.load(old_zoo / "pendulum.npz"))
+    assert_same_actions(drive(load("pendulum", damaged.parent).loop(), seen), seen)
 
 
 def test_a_gpu_checkpoint_is_read_on_the_cpu(

@@ -28,13 +28,15 @@ from ray.rllib.policy.policy import PolicySpec
 from ray.rllib.utils.from_config import from_config
 from ray.rllib.utils.replay_buffers import ReplayBuffer
 
+sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parent / "app"))
 import old_zoo_parts  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
 import old_zoo_registry  # pyright: ignore[reportMissingImports]
+from train_zoo import leaves  # pyright: ignore[reportMissingImports]
 
 STEPS = 100  # recorded
 REFUSED = {
-    "noisy_dqn", "batch_reader", "previous_action", "clock_reader", "lstm", "attention", "choice", "nested", "levers",
+    "noisy_dqn", "batch_reader", "previous_action", "clock_reader", "attention", "previous_lstm", "clipped_limbs",
 }  # fmt: skip
 REPLAY = {"type": "MultiAgentPrioritizedReplayBuffer", "capacity": 100}
 
@@ -42,7 +44,7 @@ REPLAY = {"type": "MultiAgentPrioritizedReplayBuffer", "capacity": 100}
 def old(config: Any, env: str, *, filtered: str = "NoFilter", kind: str = "", **environment: Any) -> Any:
     config.api_stack(enable_rl_module_and_learner=False, enable_env_runner_and_connector_v2=False)
     config.environment(env, env_config={"kind": kind} if kind else {}, **environment)
-    config.env_runners(num_env_runners=0, observation_filter=filtered)
+    config.env_runners(num_env_runners=0, observation_filter=filtered).debugging(seed=1)
     # An interval that is never reached: evaluation happens when it is asked for, with an environment of its own.
     config.evaluation(
         evaluation_interval=1000,
@@ -160,9 +162,18 @@ def configurations(out: Path) -> dict[str, Any]:
         "clock_reader": user_model(old_zoo_parts.OldClockReader),
         "lstm": ppo("CartPole-v1", model=lstm),
         "attention": ppo("CartPole-v1", model=attention),
+        "continuous_lstm": ppo("Pendulum-v1", filtered="MeanStdFilter", model={**lstm, "vf_share_layers": True}),
+        "previous_lstm": ppo("Pendulum-v1", model={**lstm, "lstm_use_prev_action": True}),
+        "user_recurrent": ppo("CartPole-v1", model={"custom_model": old_zoo_parts.OldRecurrent, "max_seq_len": 4}),
         "choice": toy("choice"),
+        "shifted": toy("shifted", filtered="MeanStdFilter"),
+        "dials": toy("dials"),
         "nested": toy("nested"),
+        "filtered_nested": toy("nested", filtered="MeanStdFilter"),
+        "camera": toy("camera", model=picture),
         "levers": toy("levers"),
+        "limbs": toy("limbs"),
+        "clipped_limbs": toy("limbs", clip_actions=True),
         "several": several(),
     }
 
@@ -174,8 +185,8 @@ def record(algorithm: Any) -> dict[str, dict[str, Any]]:
     worker.sync_filters(algorithm.env_runner.get_filters())
     worker.foreach_policy(lambda policy, _: policy.agent_connectors.in_eval())
     env = worker.async_env.get_sub_environments()[0]
-    seen: dict[str, list[tuple[Any, Any]]] = {}
-    last: list[Any] = []
+    seen: dict[str, list[dict[str, Any]]] = {}
+    last: dict[str, Any] = {}
     real_reset, real_step = env.reset, env.step
 
     def by_agent(value: Any) -> Any:
@@ -183,25 +194,22 @@ def record(algorithm: Any) -> dict[str, dict[str, Any]]:
 
     def reset(**kwargs: Any) -> Any:
         obs, info = real_reset(**kwargs)
-        last[:] = [by_agent(obs)]
+        last.update(obs=by_agent(obs), restart=True)
         return obs, info
 
     def step(action: Any) -> Any:
         for agent, one in by_agent(action).items():
             if last:
-                seen.setdefault(agent, []).append((np.copy(last[0][agent]), np.copy(one)))
+                named = {**leaves(last["obs"][agent], "obs"), **leaves(one, "action")}
+                seen.setdefault(agent, []).append({**named, "restart": last["restart"]})
         result = real_step(action)
-        last[:] = [by_agent(result[0])]
+        last.update(obs=by_agent(result[0]), restart=False)
         return result
 
     env.reset, env.step = reset, step
     algorithm.evaluate()
-    pairs = {}
-    for agent, steps in seen.items():
-        assert len(steps) >= STEPS * 0.8, (agent, len(steps))
-        obs, action = zip(*steps, strict=True)
-        pairs[agent] = {"obs": np.stack(obs), "action": np.stack(action)}
-    return pairs
+    assert all(len(steps) >= STEPS * 0.8 for steps in seen.values()) and seen
+    return {agent: {name: np.stack([one[name] for one in steps]) for name in steps[0]} for agent, steps in seen.items()}
 
 
 def chosen(out: Path, only: list[str]) -> Iterator[tuple[str, Any]]:

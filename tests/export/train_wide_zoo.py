@@ -1,6 +1,6 @@
 """The wider zoo: spaces, recurrent policies, connectors and algorithms. See train_zoo.py, whose tools it uses.
 
-    python train_wide_zoo.py OUT [NAME...]
+python train_wide_zoo.py OUT [NAME...]
 """
 
 from __future__ import annotations
@@ -51,10 +51,6 @@ def previous() -> Any:
 
 def stacked() -> Any:
     return FrameStackingEnvToModule(num_frames=3)
-
-
-
-
 
 
 def stacked_for_learning(input_observation_space: Any, input_action_space: Any, device: Any = None) -> Any:
@@ -149,6 +145,7 @@ def main(out: Path, only: list[str]) -> None:
                 print(name, flush=True)
             except Exception as e:
                 import traceback
+
                 traceback.print_exc()
                 print("FAILED", name, type(e), str(e)[:200], flush=True)
                 failed.append(name)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete
 from ray.rllib.env.multi_agent_env import MultiAgentEnv
+from ray.rllib.models.torch.recurrent_net import RecurrentNetwork
 from ray.rllib.models.torch.torch_modelv2 import TorchModelV2
 from ray.rllib.policy.view_requirement import ViewRequirement
 from torch import nn
@@ -31,16 +32,36 @@ SPACES: dict[str, tuple[gym.Space[Any], gym.Space[Any]]] = {
     "picture": (Box(0.0, 1.0, (10, 10, 3), np.float32), Discrete(3)),
     "offset": (Box(-INF, INF, (3,), np.float32), Box(-2.0, 2.0, (1,), np.float32)),
     "choice": (Discrete(6), Discrete(2)),
+    "shifted": (Discrete(4, start=3), Box(-1.0, 1.0, (2,), np.float32)),
+    "dials": (gym.spaces.MultiDiscrete([3, 4]), Box(-1.0, 1.0, (2,), np.float32)),
     "nested": (
-        gym.spaces.Dict({"pose": Box(-1.0, 1.0, (3,), np.float32), "gear": Discrete(3)}),
+        gym.spaces.Dict(
+            {
+                "pose": Box(-1.0, 1.0, (3,), np.float32),
+                "gear": Discrete(3),
+                "pair": gym.spaces.Tuple((Box(-2.0, 2.0, (2,), np.float64), gym.spaces.MultiDiscrete([2, 3]))),
+            }
+        ),
         Box(-1.0, 1.0, (2,), np.float32),
     ),
+    "camera": (Box(0, 255, (10, 10, 3), np.uint8), Discrete(3)),
     "levers": (Box(-1.0, 1.0, (3,), np.float32), gym.spaces.MultiDiscrete([2, 3])),
+    "limbs": (
+        Box(-1.0, 1.0, (3,), np.float32),
+        gym.spaces.Dict(
+            {
+                "arm": Box(-2.0, 1.0, (2,), np.float32),
+                "free": Box(-INF, INF, (1,), np.float32),
+                "grip": Discrete(3),
+                "knobs": gym.spaces.Tuple((gym.spaces.MultiDiscrete([2, 4]), Discrete(2))),
+            }
+        ),
+    ),
 }
 
 
 class OldToy(gym.Env[Any, Any]):
-    """Random observations of the space that `kind` names; 20 steps, a reward for small actions."""
+    """Random observations of the space that `kind` names; 20 steps, a reward for nothing."""
 
     def __init__(self, config: Any = None) -> None:
         self.kind = dict(config)["kind"]
@@ -48,9 +69,10 @@ class OldToy(gym.Env[Any, Any]):
 
     def _observe(self) -> Any:
         space = self.observation_space
+        space.seed(int(self.np_random.integers(1 << 30)))
         if self.kind == "offset":  # far from zero and nearly constant: the filter subtracts two nearly equal numbers
             return (1000.0 + 0.01 * self.np_random.standard_normal(3)).astype(np.float32)
-        if not isinstance(space, Box):
+        if not isinstance(space, Box) or space.dtype == np.uint8:
             return space.sample()
         if space.is_bounded():
             return self.np_random.uniform(space.low, space.high).astype(space.dtype)
@@ -63,7 +85,7 @@ class OldToy(gym.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.steps += 1
-        return self._observe(), -float(np.sum(np.square(action))), self.steps >= 20, False, {}
+        return self._observe(), float(self.np_random.random()), self.steps >= 20, False, {}
 
 
 class OldPair(MultiAgentEnv):
@@ -103,6 +125,27 @@ class OldModel(TorchModelV2, nn.Module):
 
     def value_function(self) -> Any:
         return self.values(self.features).squeeze(-1)
+
+
+class OldRecurrent(RecurrentNetwork, nn.Module):
+    """A recurrent network of the user's own."""
+
+    def __init__(self, obs_space: Any, action_space: Any, num_outputs: int, model_config: Any, name: str) -> None:
+        nn.Module.__init__(self)
+        super().__init__(obs_space, action_space, num_outputs, model_config, name)
+        self.cell = nn.GRU(obs_space.shape[0], 8, batch_first=True)
+        self.policy = nn.Linear(8, num_outputs)
+        self.values = nn.Linear(8, 1)
+
+    def get_initial_state(self) -> Any:
+        return [torch.full((8,), 0.25)]
+
+    def forward_rnn(self, inputs: Any, state: Any, seq_lens: Any) -> Any:
+        self.features, last = self.cell(inputs, state[0].unsqueeze(0))
+        return self.policy(self.features), [last.squeeze(0)]
+
+    def value_function(self) -> Any:
+        return self.values(self.features).reshape(-1)
 
 
 class OldNamedModel(OldModel):
