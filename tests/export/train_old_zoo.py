@@ -42,7 +42,7 @@ REPLAY = {"type": "MultiAgentPrioritizedReplayBuffer", "capacity": 100}
 def old(config: Any, env: str, *, filtered: str = "NoFilter", kind: str = "", **environment: Any) -> Any:
     config.api_stack(enable_rl_module_and_learner=False, enable_env_runner_and_connector_v2=False)
     config.environment(env, env_config={"kind": kind} if kind else {}, **environment)
-    config.env_runners(num_env_runners=0, observation_filter=filtered)
+    config.env_runners(num_env_runners=0, observation_filter=filtered).debugging(seed=1)
     # An interval that is never reached: evaluation happens when it is asked for, with an environment of its own.
     config.evaluation(
         evaluation_interval=1000,
