@@ -104,7 +104,9 @@ def export(
     name: Annotated[str | None, typer.Option(help="Policy name; the environment's by default.")] = None,
     version: Annotated[str | None, typer.Option(help="Integer or x.y.z; the next integer by default.")] = None,
     description: Annotated[str, typer.Option(help="A sentence for people, kept in the contract.")] = "",
-    module_id: Annotated[str | None, typer.Option(help="Which RLModule; needed when there are several.")] = None,
+    module_id: Annotated[
+        str | None, typer.Option(help="Which RLModule (old API stack: policy); needed when there are several.")
+    ] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
     metric: Annotated[
         str | None, typer.Option(help="Of a Tune trial or experiment, the checkpoint with the best of this metric.")

@@ -1,4 +1,4 @@
-"""Restore a policy from an RLlib checkpoint, and run it as RLlib itself would. The one file that imports ray.rllib.
+"""Restore a policy of RLlib's new API stack, and run it as RLlib itself would. It imports ray.rllib, as old_stack.py.
 
 Restoring starts nothing: no `ray.init`, no environment, no worker. The module and both connector pipelines come from
 their own folders in the checkpoint; `connectors.py` reads off them what they do. `Checkpoint.reference` is the truth
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.connector_pipeline_v2 import ConnectorPipelineV2
@@ -35,7 +35,8 @@ from rlservo.export.errors import CheckpointError, UnsupportedError
 from rlservo.export.facts import read_config
 from rlservo.export.heads import replace_heads
 from rlservo.export.location import CTOR_FILE, STATE_STEMS, CheckpointFiles
-from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf, parameter_count
+from rlservo.export.modes import find_mode
+from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.samples import Inputs, draw_batches
 from rlservo.export.trees import Tree, build, build_like, is_nested, map_tree, named_leaves, space_leaves, tree_leaves
 from rlservo.export.unpickle import explain, first_line, unpickle
@@ -404,7 +405,7 @@ def _action_rule(
             f"forward gives {', '.join(sorted(given))}"
         )
     kind = module.get_inference_action_dist_cls()
-    mode = _mode(kind, action_space)
+    mode = find_mode(lambda probe: kind.from_logits(probe).to_deterministic().sample(), kind.__name__, action_space)
     distribution = _distribution_kind(kind)
     if distribution is None:
         notify(f"the action distribution {kind.__name__} is not one of RLlib's: the export cannot explore with it")
@@ -418,45 +419,6 @@ def _distribution_kind(kind: Any) -> DistributionKind | None:
     # RLlib binds a space to MultiCategorical and MultiDistribution by a class of one more level.
     named = kind.__mro__[1] if kind.__name__.endswith("Partial") else kind
     return DISTRIBUTIONS.get(named.__name__)
-
-
-def _mode(kind: Any, action_space: Any) -> Mode:
-    """Return how the distribution's deterministic action comes out of its parameters.
-
-    RLlib 2.60 sends SAC's bare mean where other versions send its tanh: the class in the checkpoint decides.
-    """
-    spaces = space_leaves(action_space, "action")
-    widths = [parameter_count(space) for space in spaces.values()]
-    generator = torch.Generator().manual_seed(0)
-    probe = 2.0 * torch.randn((7, sum(widths)), generator=generator)
-    try:
-        actions = tree_leaves(kind.from_logits(probe.clone()).to_deterministic().sample())
-    except Exception as error:  # a user's distribution may raise anything
-        raise UnsupportedError(
-            f"the action distribution {kind.__name__} does not take {sum(widths)} parameters for {action_space}: "
-            f"{first_line(error)}"
-        ) from error
-    found: set[Mode] = set()
-    for space, action, part in zip(spaces.values(), actions, torch.split(probe, widths, dim=-1), strict=True):
-        mean = part.chunk(2, dim=-1)[0]
-        if not isinstance(space, Box):
-            sizes = [int(n) for n in space.nvec] if hasattr(space, "nvec") else [int(space.n)]
-            best = torch.stack([torch.argmax(one, dim=-1) for one in torch.split(part, sizes, dim=-1)], dim=-1)
-            if torch.equal(best.reshape(action.shape), action):
-                continue
-        elif torch.equal(action, mean):
-            found.add("mean")
-            continue
-        elif torch.allclose(action, torch.tanh(mean), atol=1e-6):
-            found.add("tanh_mean")
-            continue
-        raise UnsupportedError(
-            f"the deterministic action of {kind.__name__} on {space} is neither its mean, nor the mean's tanh, nor the "
-            "largest logit: not exported"
-        )
-    if len(found) > 1:
-        raise UnsupportedError(f"{kind.__name__} squashes some parts of the action and not others: not exported")
-    return found.pop() if found else "argmax"
 
 
 def _forward_once(pipelines: Pipelines, recipe: Recipe) -> dict[str, Any]:

@@ -37,6 +37,7 @@ from rlservo.export.errors import ParityError, UsageError
 from rlservo.export.facts import CheckpointFacts, read_facts
 from rlservo.export.location import CheckpointFiles, locate_checkpoint
 from rlservo.export.naming import check_names, choose_target, default_name
+from rlservo.export.old_location import OldStackFiles
 from rlservo.export.parity import GraphLoop, Outputs, Recorded, Runner, prove, record, replay, ties
 from rlservo.export.recipe import Recipe
 from rlservo.export.samples import BATCH_SIZES, Inputs, draw_batches
@@ -46,7 +47,7 @@ from rlservo.export.threads import one_thread
 from rlservo.export.unpickle import user_code
 
 if TYPE_CHECKING:
-    from rlservo.export.checkpoint import Checkpoint
+    from rlservo.export.restore import Restored
 
 GOLDEN_SAMPLES = {"likely": 48, "wide": 8, "extreme": 8}
 GOLDEN_BYTES = 2_000_000  # of images a few observations are as much as a bundle should carry
@@ -94,7 +95,8 @@ def export_checkpoint(
         restored = _load(files, notify, value)
         elements = read_elements(facts.env_id, facts.env_config, restored.recipe, notify)
         with _temporary_folder(target) as folder, one_thread():
-            parity, golden = _write_graphs(folder, restored, [element.name for element in elements.action])
+            labels = [element.name for element in elements.action]
+            parity, golden = _write_graphs(folder, restored, labels, files.api_stack)
             recipe = restored.recipe
             contract = Contract(
                 name=name,
@@ -118,11 +120,11 @@ def export_checkpoint(
     return ExportResult(target, contract)
 
 
-def _load(files: CheckpointFiles, notify: Callable[[str], None], value: bool) -> Checkpoint:
-    # Here and not at the top: RLlib takes seconds to import, and a wrong path should not have to wait for it.
-    from rlservo.export.checkpoint import load_checkpoint
+def _load(files: CheckpointFiles | OldStackFiles, notify: Callable[[str], None], value: bool) -> Restored:
+    # Here and not at the top: torch and RLlib take seconds to import, and a wrong path should not have to wait for it.
+    from rlservo.export.restore import restore
 
-    return load_checkpoint(files, notify, value=value)
+    return restore(files, notify, value=value)
 
 
 @contextlib.contextmanager
@@ -150,7 +152,7 @@ class _Golden:
     outputs: Outputs
 
 
-def _write_graphs(folder: Path, restored: Checkpoint, labels: list[str]) -> tuple[Parity, _Golden]:
+def _write_graphs(folder: Path, restored: Restored, labels: list[str], api_stack: str) -> tuple[Parity, _Golden]:
     """Write both formats, prove them, and return the proof and the golden vectors."""
     from rlservo.export.actor import PolicyGraph
     from rlservo.export.onnx import run_onnx, write_onnx
@@ -166,7 +168,7 @@ def _write_graphs(folder: Path, restored: Checkpoint, labels: list[str]) -> tupl
     write_onnx(graph, example, folder / ONNX_FILE)
     onnx = run_onnx(folder / ONNX_FILE)
     script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
-    parity = prove(recipe, recorded, {"onnx": onnx, "torchscript": script}, labels)
+    parity = prove(recipe, recorded, {"onnx": onnx, "torchscript": script}, labels, api_stack)
     inputs = _golden_inputs(recipe, recorded, onnx)
     outputs = onnx(inputs)
     ordered = {name: inputs[name] for name in graph.input_names}
@@ -210,13 +212,13 @@ def _tensor(name: str, values: NDArray[Any]) -> TensorSpec:
     return TensorSpec(name=name, dtype=str(values.dtype), shape=(-1, *values.shape[1:]))
 
 
-def _provenance(files: CheckpointFiles, facts: CheckpointFacts, restored: Checkpoint) -> Provenance:
+def _provenance(files: CheckpointFiles | OldStackFiles, facts: CheckpointFacts, restored: Restored) -> Provenance:
     import ray
     import torch
 
     return Provenance(
         algorithm=facts.algorithm,
-        api_stack="new",
+        api_stack=files.api_stack,
         module_id=files.module_id,
         module_class=restored.module_class,
         checkpoint_sha256=files.sha256(),

@@ -2,7 +2,8 @@
 
 None of it changes what the policy does, so none of it may stop an export: what cannot be read is left out, with a
 notice. A pruned checkpoint holds these facts as JSON; a full one holds them in RLlib's configuration pickles, which
-this file opens without importing RLlib itself.
+this file opens without importing RLlib itself. On the old API stack that is the algorithm's state; a policy's folder on
+its own has only the policy's configuration.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 from rlservo.export.errors import CheckpointError
 from rlservo.export.location import CTOR_FILE, FACTS_FILE
+from rlservo.export.old_location import ALGORITHM_STATE, POLICY_STATE, old_stack_root
 from rlservo.export.unpickle import unpickle
 
 # Where RLlib (ray 2.60) keeps its counters in algorithm_state.pkl.
@@ -40,12 +42,14 @@ def read_facts(root: Path, notify: Callable[[str], None]) -> CheckpointFacts:
     """Return what the algorithm checkpoint at `root` says of itself, with a notice for each part that is unreadable."""
     if (root / FACTS_FILE).is_file():
         return _from_json(root / FACTS_FILE, notify)
+    if not (root / CTOR_FILE).is_file() and old_stack_root(root) is not None:
+        return _read_old_facts(root, notify)
     algorithm: str = "unknown"
     config: Mapping[str, Any] = {}
     if (opened := _open(root / CTOR_FILE, "algorithm and environment", notify)) is not None:
         algorithm = getattr(opened.get("class"), "__name__", "unknown")
         config = read_config(opened.get("ctor_args_and_kwargs"))
-    state = _open(root / "algorithm_state.pkl", "training progress", notify) or {}
+    state = _open(root / ALGORITHM_STATE, "training progress", notify) or {}
     stats = state.get("metrics_logger", {}).get("stats", {})
     return CheckpointFacts(
         algorithm=algorithm,
@@ -53,6 +57,27 @@ def read_facts(root: Path, notify: Callable[[str], None]) -> CheckpointFacts:
         env_config=_json_values(config.get("env_config") or {}, notify),
         training_iterations=_whole(state.get("training_iteration")),
         env_steps=_whole(stats.get(_ENV_STEPS, {}).get("lifetime_sum")),
+        ray_version=_ray_version(root),
+    )
+
+
+def _read_old_facts(root: Path, notify: Callable[[str], None]) -> CheckpointFacts:
+    state = _open(root / ALGORITHM_STATE, "algorithm, environment and progress", notify) or {}
+    algorithm = getattr(state.get("algorithm_class"), "__name__", "unknown")
+    config = _as_mapping(state.get("config"))
+    if not state and (
+        spec := (_open(root / POLICY_STATE, "algorithm and environment", notify) or {}).get("policy_spec")
+    ):
+        kind = spec.get("policy_class")
+        name = kind if isinstance(kind, str) else getattr(kind, "__name__", "")
+        algorithm = name.removesuffix("TorchPolicy") or "unknown"  # BC's policy is MARWIL's: not told apart
+        config = _as_mapping(spec.get("config"))
+    return CheckpointFacts(
+        algorithm=algorithm,
+        env_id=_env_name(config.get("env")),
+        env_config=_json_values(config.get("env_config") or {}, notify),
+        training_iterations=_whole(state.get("training_iteration")),
+        env_steps=_whole(state.get("counters", {}).get("num_env_steps_sampled")),
         ray_version=_ray_version(root),
     )
 
@@ -81,7 +106,10 @@ def read_config(ctor_args_and_kwargs: Any) -> Mapping[str, Any]:
     if not isinstance(ctor_args_and_kwargs, tuple) or len(ctor_args_and_kwargs) != 2:
         return {}
     args, kwargs = ctor_args_and_kwargs
-    config = kwargs.get("config", args[0] if args else {})
+    return _as_mapping(kwargs.get("config", args[0] if args else {}))
+
+
+def _as_mapping(config: Any) -> Mapping[str, Any]:
     if isinstance(config, Mapping):
         return config
     return dict(vars(config))

@@ -51,6 +51,14 @@ def replace_heads(module: nn.Module) -> None:
                 setattr(parent, name, lean)
 
 
+def replace_bias_layers(model: nn.Module) -> None:
+    """Replace, in place, the old stack's layer that appends a free scale by one whose batch size is not fixed."""
+    for parent in list(model.modules()):
+        for name, child in list(parent.named_children()):
+            if type(child).__name__ == "AppendBiasLayer" and isinstance(child.log_std, Tensor):
+                setattr(parent, name, FreeGaussianHead(nn.Identity(), child.log_std.detach().clone()))
+
+
 def _lean(head: Any) -> nn.Module | None:
     kind = type(head).__name__
     if kind == "TorchMLPHead" and head.clip_log_std:

@@ -7,12 +7,13 @@ before anything heavy is imported or any code in the checkpoint is run.
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar, Literal
 
 from rlservo.export.errors import CheckpointError, UnsupportedError
+from rlservo.export.old_location import OldStackFiles, locate_policy, old_stack_root
 
 MODULES = Path("learner_group") / "learner" / "rl_module"
 RUNNERS = ("env_runner", "eval_env_runner")
@@ -35,6 +36,8 @@ class CheckpointFiles:
 
     An algorithm that trains from recorded data may have no environment runner, and then no connector folders either.
     """
+
+    api_stack: ClassVar[Literal["new"]] = "new"
 
     root: Path
     module_id: str
@@ -79,11 +82,12 @@ class CheckpointFiles:
         return digest.hexdigest()
 
 
-def locate_checkpoint(path: str | Path, module_id: str | None = None) -> CheckpointFiles:
+def locate_checkpoint(path: str | Path, module_id: str | None = None) -> CheckpointFiles | OldStackFiles:
     """Return the files of one policy.
 
-    `path` may be an algorithm checkpoint, a folder inside one (such as its RLModule folder), or a Tune trial folder,
-    of which the newest `checkpoint_NNNNNN` is taken.
+    `path` may be an algorithm checkpoint of either API stack, a folder inside one (such as its RLModule or policy
+    folder), an old-stack policy's folder on its own, or a Tune trial folder, of which the newest `checkpoint_NNNNNN` is
+    taken.
 
     Raises CheckpointError when there is nothing to read, UnsupportedError when it is of a kind that is not exported.
     """
@@ -97,6 +101,8 @@ def locate_checkpoint(path: str | Path, module_id: str | None = None) -> Checkpo
         alone = CheckpointFiles(root, module_id or DEFAULT_MODULE, alone=True)
         _check_complete(alone)
         return alone
+    if not (root / MODULES).is_dir():
+        return locate_policy(root, given, module_id)
     if root != given and (root / MODULES) in given.parents and module_id is None:
         module_id = given.relative_to(root / MODULES).parts[0]
     files = CheckpointFiles(root, _choose_module(root, module_id))
@@ -109,7 +115,8 @@ def _find_root(given: Path) -> Path:
     for folder in (given, *given.parents):
         if (folder / MODULES).is_dir():
             return folder
-    _refuse_old_stack(given)
+    if old := old_stack_root(given):
+        return old
     if newest := _newest_checkpoint(given):
         return _find_root(newest)
     if _is_module(given):
@@ -138,27 +145,6 @@ def _newest_checkpoint(folder: Path) -> Path | None:
         if (match := _TUNE_CHECKPOINT.fullmatch(child.name)) and child.is_dir()
     ]
     return max(numbered)[1] if numbered else None
-
-
-def _refuse_old_stack(folder: Path) -> None:
-    """Raise UnsupportedError when `folder` was written by RLlib's old API stack."""
-    old_files = any((folder / "policies").glob("*/policy_state.*")) or any(folder.glob("policy_state.*"))
-    very_old = any(re.fullmatch(r"checkpoint-\d+", child.name) for child in folder.iterdir())
-    if old_files or very_old or _recorded_version(folder) in ("0", "1"):
-        raise UnsupportedError(
-            f"{folder} is a checkpoint of RLlib's old API stack, which is not exported yet: its filter, preprocessor "
-            "and action connectors live in the policy state; train with the new API stack (RLlib's default), or wait "
-            "for old-stack support"
-        )
-
-
-def _recorded_version(folder: Path) -> str | None:
-    """Return the major checkpoint version in rllib_checkpoint.json, if that can be read."""
-    try:
-        recorded = json.loads((folder / "rllib_checkpoint.json").read_text(encoding="utf-8"))
-        return str(recorded["checkpoint_version"]).split(".")[0]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 def _choose_module(root: Path, module_id: str | None) -> str:

@@ -15,11 +15,12 @@ import torch
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from torch import Tensor, nn
 
-from rlservo.export.recipe import Flatten, FrameStack, ObservationFilter, Previous, Recipe, UserStep
+from rlservo.export.recipe import Flatten, FrameStack, ObservationFilter, Preprocess, Previous, Recipe, UserStep
 from rlservo.export.trees import Tree, space_leaves, tree_leaves
 
 # What may be left out of the filter's mean, in units of the filtered observation: below float32's step near 1.
 NEGLIGIBLE = 1e-7
+ATARI_RAM = (128,)
 
 
 class ObservationNode(nn.Module, abc.ABC):
@@ -40,6 +41,9 @@ def observation_nodes(recipe: Recipe) -> nn.ModuleList:
             nodes.append(FilterNode(step, dtype))
         elif isinstance(step, Flatten):
             nodes.append(FlattenNode(step))
+            dtype = torch.float32
+        elif isinstance(step, Preprocess):
+            nodes.append(PreprocessNode(step))
             dtype = torch.float32
         elif isinstance(step, FrameStack):
             nodes.append(FrameStackNode(step))
@@ -88,6 +92,30 @@ def _one_hot(leaf: Tensor, depth: int, *, below_zero: bool) -> Tensor:
     if below_zero:
         index = torch.remainder(index, depth)
     return torch.eq(index.unsqueeze(-1), torch.arange(depth)).float()
+
+
+class PreprocessNode(ObservationNode):
+    """The old API stack's preprocessor."""
+
+    def __init__(self, step: Preprocess) -> None:
+        super().__init__()
+        self.leaves = list(space_leaves(step.space, "obs").values())
+
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
+        parts = [_preprocess(leaf, space) for leaf, space in zip(tree_leaves(obs), self.leaves, strict=True)]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+
+
+def _preprocess(leaf: Tensor, space: Any) -> Tensor:
+    """Return one leaf as float32 `[batch, n]`."""
+    if isinstance(space, Discrete):
+        return _one_hot(leaf - int(space.start), int(space.n), below_zero=False)
+    if isinstance(space, MultiDiscrete):
+        index = leaf.flatten(1) - torch.from_numpy(np.asarray(space.start).ravel().astype(np.int64))
+        sizes = [int(n) for n in space.nvec.ravel()]
+        return torch.cat([_one_hot(index[:, i], n, below_zero=False) for i, n in enumerate(sizes)], dim=-1)
+    row = _float(leaf.flatten(1) if leaf.dim() > 1 else leaf.unsqueeze(1))
+    return (row - 128.0) / 128.0 if tuple(space.shape) == ATARI_RAM else row
 
 
 class FilterNode(ObservationNode):

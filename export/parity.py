@@ -30,10 +30,13 @@ RTOL = 1e-5
 ATOL = 1e-6
 MASKED = 1e30
 """A score beyond this stands for 'not allowed' (RLlib's action masks add -3.4e38); it measures nothing."""
-REFERENCE = (
-    "RLlib's own env-to-module connectors, inference forward and module-to-env connectors, restored from the "
-    "checkpoint, observation filter frozen, exploration off"
-)
+REFERENCES: dict[str, str] = {
+    "new": "RLlib's own env-to-module connectors, inference forward and module-to-env connectors, restored from the "
+    "checkpoint, observation filter frozen, exploration off",
+    "old": "RLlib's own agent connectors, compute_actions_from_input_dict and action connectors (old API stack), "
+    "restored from the checkpoint, observation filter frozen, exploration off",
+}
+"""What an export is compared with, by API stack."""
 
 Outputs: TypeAlias = dict[str, NDArray[Any]]
 Runner: TypeAlias = Callable[[Inputs], Outputs]
@@ -125,6 +128,7 @@ def prove(
     recorded: Sequence[Recorded],
     formats: Mapping[str, Runner],
     labels: Sequence[str] = (),
+    api_stack: str = "new",
 ) -> Parity:
     """Compare every format with what was recorded and return the largest differences.
 
@@ -133,7 +137,7 @@ def prove(
     """
     results = {name: _prove_format(name, recipe, recorded, run, labels) for name, run in formats.items()}
     return Parity(
-        reference=REFERENCE,
+        reference=REFERENCES[api_stack],
         samples=sum(len(one.batch) for one in recorded),
         batch_sizes=BATCH_SIZES,
         rtol=RTOL,

@@ -30,7 +30,9 @@ def prune_checkpoint(
 ) -> list[Path]:
     """Copy the module, both connector pipelines and the facts of checkpoint `src` to the new folder `dst`.
 
-    The copy exports to the same policy, with the same hash; it cannot be trained further (the optimizer stays behind).
+    Of an old-stack checkpoint that is the policy's state, as it is: one pickle that also holds optimizer and settings,
+    and cannot be taken apart without becoming another file. The copy exports to the same policy, with the same hash; a
+    new-stack one cannot be trained further (the optimizer stays behind).
     Returns the files kept, relative to `dst`. `notify` is told what was kept, and of any file that names the home
     folder. Raises CheckpointError or UnsupportedError for `src`, UsageError when `dst` exists.
     """
@@ -55,7 +57,8 @@ def prune_checkpoint(
         raise
     kept = sorted(file for file in target.rglob("*") if file.is_file())
     size = sum(file.stat().st_size for file in kept)
-    notify(f"kept {len(kept)} files, {size / 1024:.0f} KiB: the module, both connector pipelines and {FACTS_FILE}")
+    what = "the module, both connector pipelines" if files.api_stack == "new" else "the policy's state"
+    notify(f"kept {len(kept)} files, {size / 1024:.0f} KiB: {what} and {FACTS_FILE}")
     for file in kept:
         if str(Path.home()).encode() in file.read_bytes():
             notify(f"{file} names the home folder {Path.home()}: look at it before publishing it")

@@ -89,7 +89,18 @@ class UserStep:
     function: Callable[[Any], Any] = field(compare=False)
 
 
-ObservationStep: TypeAlias = ObservationFilter | Flatten | FrameStack | Previous | UserStep
+@dataclass(frozen=True)
+class Preprocess:
+    """The old API stack's preprocessor: one float32 row of the space's leaves, Dict keys in sorted order.
+
+    Discrete leaves are one-hot from their start on. A Box of 128 numbers is taken for an Atari console's memory:
+    `(x - 128) / 128` (ray/rllib/models/preprocessors.py, ray 2.60).
+    """
+
+    space: Any
+
+
+ObservationStep: TypeAlias = ObservationFilter | Flatten | FrameStack | Previous | UserStep | Preprocess
 
 Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax", "given"]
 """How the deterministic action comes out of the distribution's parameters (or Q-values), or that it is given."""

@@ -12,6 +12,7 @@ from rlservo.export.recipe import (
     FrameStack,
     ObservationFilter,
     ObservationStep,
+    Preprocess,
     Previous,
     Recipe,
     leaf_transform,
@@ -43,6 +44,8 @@ def _observation_step(step: ObservationStep) -> BakedStep:
         return _filter_step(step)
     if isinstance(step, Flatten):
         return _flatten_step(step)
+    if isinstance(step, Preprocess):
+        return _preprocess_step(step)
     if isinstance(step, FrameStack):
         return BakedStep(
             step="frame_stack",
@@ -71,6 +74,18 @@ def _flatten_step(step: Flatten) -> BakedStep:
             values={"order": list(leaves)},
         )
     return BakedStep(step="flatten", detail=f"to one row{left_out}", values={"order": list(leaves)} if leaves else {})
+
+
+def _preprocess_step(step: Preprocess) -> BakedStep:
+    leaves = space_leaves(step.space, "obs")
+    rescaled = [name for name, leaf in leaves.items() if isinstance(leaf, Box) and leaf.shape == (128,)]
+    flat = _flatten_step(Flatten(step.space))
+    if not rescaled:
+        return flat
+    detail = f"{', '.join(rescaled)}: (obs - 128) / 128, as RLlib does with every Box of 128 numbers"
+    if len(leaves) == 1:
+        return BakedStep(step="rescale", detail=detail, values={"offset": 128.0, "divisor": 128.0})
+    return flat.model_copy(update={"detail": f"{flat.detail}; {detail}"})
 
 
 def _filter_step(frozen: ObservationFilter) -> BakedStep:

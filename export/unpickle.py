@@ -29,6 +29,11 @@ def user_code(app_dir: str | Path) -> Iterator[None]:
             sys.path.remove(folder)
 
 
+def user_folder() -> Path:
+    """Return the folder that `user_code` let the checkpoint import from."""
+    return Path(sys.path[0] or ".")
+
+
 def unpickle(file: Path) -> Any:
     """Return the object pickled in `file` (cloudpickle writes ordinary pickles).
 

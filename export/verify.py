@@ -66,15 +66,15 @@ def verify_bundle(
     if not same:
         notify("the bundle was exported from another checkpoint: expect a difference")
     with user_code(app_dir), one_thread():
-        from rlservo.export.checkpoint import load_checkpoint
+        from rlservo.export.restore import restore
 
         has_value = any(output.name == "value" for output in loaded.contract.outputs)
-        restored = load_checkpoint(files, notify, value=has_value)
+        restored = restore(files, notify, value=has_value)
         _check_spaces(loaded.contract, restored.recipe)
         formats = _formats(loaded)
         labels = [element.name for element in loaded.contract.action_space.elements]
         recorded = record(restored.reference, draw_batches(restored.recipe, SEED), restored.loop)
-        parity = prove(restored.recipe, recorded, formats, labels)
+        parity = prove(restored.recipe, recorded, formats, labels, files.api_stack)
         evaluation = None
         if env_id is not None:
             run, recipe = formats["onnx"], restored.recipe

@@ -65,6 +65,12 @@ def wide_zoo() -> Iterator[Path]:
     yield from trained("train_wide_zoo.py")
 
 
+@pytest.fixture(scope="session")
+def old_zoo() -> Iterator[Path]:
+    """The same for RLlib's old API stack."""
+    yield from trained("train_old_zoo.py")
+
+
 @pytest.fixture
 def copy_of(zoo: Path, tmp_path: Path) -> Callable[[str], Path]:
     """Return a function that copies a checkpoint to where a test may damage it."""

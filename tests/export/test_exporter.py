@@ -128,7 +128,6 @@ def test_a_discrete_space_that_starts_elsewhere_is_told(
     ("name", "error", "words"),
     [
         ("user_connector", UnsupportedError, "connector Doubler"),
-        ("old_stack", UnsupportedError, "old API stack"),
         ("batch_reader", ParityError, "a batch of 257 likely observations: output 'action_dist_inputs', element 0"),
     ],
 )

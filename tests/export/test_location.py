@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 import shutil
 from collections.abc import Callable
@@ -78,12 +77,6 @@ def test_a_filter_whose_statistics_were_not_saved_is_refused(
     (damaged / "class_and_ctor_args.pkl").unlink()
     with pytest.raises(CheckpointError, match="it has neither env_runner/"):
         locate_checkpoint(damaged)
-
-
-def test_old_stack_checkpoints_are_refused_with_what_would_be_needed(zoo: Path) -> None:
-    for path in (zoo / "old_stack", zoo / "old_stack" / "policies" / "default_policy"):
-        with pytest.raises(UnsupportedError, match="old API stack, which is not exported yet"):
-            locate_checkpoint(path)
 
 
 def test_several_trials_are_not_guessed_between(zoo: Path, tmp_path: Path) -> None:
@@ -191,9 +184,3 @@ def test_weights_that_are_not_finite_are_refused(copy_of: Callable[[str], Path],
     rewrite_weights(damaged, lambda state: np.copyto(state["pi.net.mlp.0.bias"], np.nan))
     with pytest.raises(CheckpointError, match="training diverged"):
         load_checkpoint(locate_checkpoint(damaged), notices.append)
-
-
-def test_a_version_one_marker_is_enough_to_tell_the_old_stack(tmp_path: Path) -> None:
-    (tmp_path / "rllib_checkpoint.json").write_text(json.dumps({"checkpoint_version": "1.1"}))
-    with pytest.raises(UnsupportedError, match="old API stack"):
-        locate_checkpoint(tmp_path)

@@ -64,9 +64,6 @@ def off_policy(config: Any, env: str, **environment: Any) -> Any:
 def configurations() -> dict[str, Any]:
     appo = APPOConfig().environment("CartPole-v1").env_runners(num_env_runners=0).learners(num_learners=0)
     appo.rl_module(model_config=SMALL)
-    old = PPOConfig().api_stack(enable_rl_module_and_learner=False, enable_env_runner_and_connector_v2=False)
-    old.environment("CartPole-v1").env_runners(num_env_runners=0)
-    old.training(train_batch_size=64, minibatch_size=64, num_epochs=1)
     return {
         "pendulum": ppo("Pendulum-v1", before=mean_std_filter),
         "cart_pole": ppo("CartPole-v1"),
@@ -88,7 +85,6 @@ def configurations() -> dict[str, Any]:
         "batch_reader": ppo("CartPole-v1", spec=RLModuleSpec(module_class=zoo_parts.BatchReader)),
         "user_connector": ppo("CartPole-v1", before=doubler),
         "lstm": ppo("CartPole-v1", model=DefaultModelConfig(fcnet_hiddens=[8], use_lstm=True, lstm_cell_size=8)),
-        "old_stack": old,
     }
 
 
@@ -143,13 +139,10 @@ def main(out: Path, only: list[str]) -> None:
                 continue
             algorithm = config.build_algo()
             algorithm.train()
-            if name == "old_stack":
-                algorithm.save(str(out / name))
-            else:
-                algorithm.save_to_path(str(out / name))
-                # APPO's environment runner lags behind its learner, and the checkpoint holds the learner's weights.
-                algorithm.restore_from_path(str(out / name))
-                record(algorithm, out / f"{name}.npz")
+            algorithm.save_to_path(str(out / name))
+            # APPO's environment runner lags behind its learner, and the checkpoint holds the learner's weights.
+            algorithm.restore_from_path(str(out / name))
+            record(algorithm, out / f"{name}.npz")
             algorithm.stop()
             print(name, flush=True)
     finally:
