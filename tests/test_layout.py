@@ -14,7 +14,7 @@ FOLDERS = ("envs", "export", "serve_app", "deploy")
 ONLY_IN = {
     "ray.rllib": ("export/checkpoint.py", "examples/"),
     "ray.serve": ("serve_app/app.py", "serve_app/launcher.py"),
-    "fastapi": ("serve_app/http.py", "serve_app/docs.py", "serve_app/app.py"),
+    "fastapi": ("serve_app/http.py", "serve_app/edge.py", "serve_app/oip.py", "serve_app/docs.py", "serve_app/app.py"),
     "mujoco": ("envs/",),
     "torch": ("export/",),
     "pickle": ("export/unpickle.py",),

@@ -1,0 +1,71 @@
+"""What every protocol asks: which policies there are, and one decision within its limits.
+
+The protocols (`http.py`, `oip.py`, `stream.py`) read bytes and write bytes; what lies between is here, once: whether
+the policies are loaded, the deadline, the batch limit. It knows nothing of HTTP, WebSockets or JSON.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError
+from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.store import Decision, PolicyStore
+
+StoreProvider = Callable[[], PolicyStore | None]
+
+
+class Core:
+    """The policies as the protocols see them; `store_provider` gives None for as long as they are being loaded."""
+
+    def __init__(self, store_provider: StoreProvider, settings: ServerSettings) -> None:
+        self._store_provider = store_provider
+        self.settings = settings
+
+    @property
+    def ready(self) -> bool:
+        """Whether the policies are loaded and proven."""
+        return self._store_provider() is not None
+
+    def store(self) -> PolicyStore:
+        """Return the policies. Raises UnavailableError while they are being loaded."""
+        store = self._store_provider()
+        if store is None:
+            raise UnavailableError("the policies are still being loaded: try again shortly")
+        return store
+
+    def act(
+        self,
+        name: str,
+        version: str | None,
+        obs: Any,
+        *,
+        received: float,
+        explore: bool = False,
+        seed: int | None = None,
+        seq: int | None = None,
+        deadline_ms: float | None = None,
+    ) -> Decision:
+        """Decide for `obs`, unless `deadline_ms` have passed since `received` (`time.perf_counter`).
+
+        Raises DeadlineError, TooLargeError, UnavailableError and what `PolicyStore.act` raises.
+        """
+        store = self.store()
+        if deadline_ms is not None:
+            late_ms = (time.perf_counter() - received) * 1e3
+            if late_ms >= deadline_ms:
+                raise DeadlineError(
+                    f"the deadline of {deadline_ms:g} ms passed before the policy was asked: nothing computed",
+                    {"deadline_ms": deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": seq},
+                )
+        if (type(obs) is list or (type(obs) is np.ndarray and obs.ndim)) and len(obs) > self.settings.max_batch:
+            shape = store.get(name, version).contract.observation_space.shape
+            if len(obs) != (shape or (0,))[0]:  # not one long observation
+                raise TooLargeError(
+                    f"a batch of {len(obs)} observations is too large: at most {self.settings.max_batch}"
+                )
+        return store.act(name, version, obs, explore=explore, seed=seed)
