@@ -23,6 +23,7 @@ from rlservo.serve_app.core import Core, StoreProvider
 from rlservo.serve_app.docs import add_docs
 from rlservo.serve_app.edge import JSON, JSON_HEADERS, BareRoute, Body, Endpoint, Headers
 from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.stream import Stream
 
 CODES = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "wrong-media-type"}
 ACT_PATH = "/v1/policies/{name}/act"
@@ -37,6 +38,7 @@ def create_app(store_provider: StoreProvider, settings: ServerSettings) -> FastA
     infer = oip.endpoint(core)
     app = PolicyApp(
         ((ACT_PATTERN, act), (oip.INFER_PATTERN, infer)),
+        Stream(core),
         title="rlservo",
         description=DESCRIPTION,
         docs_url=None,
@@ -65,9 +67,10 @@ class PolicyApp(FastAPI):
     the documentation, and for whatever is not a POST.
     """
 
-    def __init__(self, direct: tuple[tuple[re.Pattern[str], ASGIApp], ...], **options: Any) -> None:
+    def __init__(self, direct: tuple[tuple[re.Pattern[str], ASGIApp], ...], stream: ASGIApp, **options: Any) -> None:
         super().__init__(**options)
         self._direct = direct
+        self._stream = stream
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Dispatch one ASGI connection."""
@@ -79,6 +82,9 @@ class PolicyApp(FastAPI):
                     scope["path_params"] = match.groupdict()
                     await endpoint(scope, receive, send)
                     return
+        elif scope["type"] == "websocket":
+            await self._stream(scope, receive, send)
+            return
         await super().__call__(scope, receive, send)
 
 

@@ -37,6 +37,9 @@ class ServerSettings(BaseModel):
     max_ongoing_requests: int = Field(256, ge=1)
     """Requests one replica works on at once; beyond it Ray Serve answers 503."""
 
+    default_policy: str | None = None
+    """The policy of a WebSocket at `/`, where openpi's clients connect; the only one, where there is one."""
+
     docs: bool = True
     """Serve the interactive API documentation at /docs, from files that come with the server."""
 
