@@ -24,8 +24,8 @@ MAX_AXES = 32  # numpy itself stops at 64
 
 def pack(document: Mapping[str, Any]) -> bytes:
     """Return the document as msgpack; arrays and numpy scalars of number types may be anywhere in it."""
-    packed: bytes = msgpack.packb(document, default=_pack_array)
-    return packed
+    packed: Any = msgpack.packb(document, default=_pack_array)
+    return bytes(packed)
 
 
 def unpack(content: bytes) -> Any:

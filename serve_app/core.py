@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError
+from rlservo.serve_app.keys import Guard, Keys
+from rlservo.serve_app.metrics import Metrics
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import Decision, PolicyStore
 
@@ -22,14 +24,12 @@ StoreProvider = Callable[[], PolicyStore | None]
 class Core:
     """The policies as the protocols see them; `store_provider` gives None for as long as they are being loaded."""
 
-    def __init__(self, store_provider: StoreProvider, settings: ServerSettings) -> None:
+    def __init__(self, store_provider: StoreProvider, settings: ServerSettings, *, replica: str = "") -> None:
+        """Read the keys that `settings` name; `replica` names this process in the metrics. Raises UsageError."""
         self._store_provider = store_provider
         self.settings = settings
-
-    @property
-    def ready(self) -> bool:
-        """Whether the policies are loaded and proven."""
-        return self._store_provider() is not None
+        self.guard = Guard(Keys.from_settings(settings))
+        self.metrics = Metrics(replica)
 
     def store(self) -> PolicyStore:
         """Return the policies. Raises UnavailableError while they are being loaded."""
@@ -69,3 +69,17 @@ class Core:
                     f"a batch of {len(obs)} observations is too large: at most {self.settings.max_batch}"
                 )
         return store.act(name, version, obs, explore=explore, seed=seed)
+
+    def failed(self, protocol: str, name: str, version: str | None, code: str) -> None:
+        """Count a request that got no action; names that are not loaded are not told apart."""
+        store = self._store_provider()
+        if store is None or name not in store.names:
+            name = version = ""
+        elif version is not None and version not in store.versions(name):
+            version = ""
+        self.metrics.failed(protocol, name, version or "", code)
+
+    def exposition(self) -> bytes:
+        """Return the metrics as Prometheus reads them."""
+        store = self._store_provider()
+        return self.metrics.exposition({} if store is None else {name: store.versions(name) for name in store.names})

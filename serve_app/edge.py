@@ -28,7 +28,9 @@ from rlservo.export.errors import (
     UnknownPolicyError,
 )
 from rlservo.serve_app import wire
-from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.core import Core
+from rlservo.serve_app.keys import ForbiddenError, UnauthenticatedError
+from rlservo.serve_app.store import Decision
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +42,8 @@ STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; w
     (RequestError, 400),
     (DeadlineError, 408),
     (UnavailableError, 503),
+    (UnauthenticatedError, 401),
+    (ForbiddenError, 403),
     (ActionError, 500),
 )
 RETRY_AFTER_S = 1
@@ -47,18 +51,20 @@ JSON = b"application/json"
 
 Headers = tuple[tuple[bytes, bytes], ...]
 Body = bytes | bytearray
-Handle = Callable[[Scope, Body, float], tuple[bytes, Headers]]
+Handle = Callable[[Scope, Body, float], tuple[bytes, Headers, Decision]]
 CheckHeaders = Callable[[list[tuple[bytes, bytes]]], None]
 
 
 class Endpoint:
     """A POST endpoint: reads the body, calls `handle(scope, body, received)`, answers, errors included."""
 
-    def __init__(self, handle: Handle, check_headers: CheckHeaders, settings: ServerSettings) -> None:
+    def __init__(self, protocol: str, handle: Handle, check_headers: CheckHeaders, core: Core) -> None:
+        self._protocol = protocol
         self._handle = handle
         self._check_headers = check_headers
-        self._max_body = settings.max_body_bytes
-        self._timeout_s = settings.body_timeout_s
+        self._core = core
+        self._max_body = core.settings.max_body_bytes
+        self._timeout_s = core.settings.body_timeout_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -69,13 +75,16 @@ class Endpoint:
             body = await read_body(receive, max_bytes=self._max_body, timeout_s=self._timeout_s)
             if body is None:  # the client has gone
                 return
-            content, headers = self._handle(scope, body, received)
+            content, headers, decision = self._handle(scope, body, received)
             status = 200
+            self._core.metrics.answered(self._protocol, decision, decision.batch or 1, time.perf_counter() - received)
         except RlservoError as error:
             status, content, headers = error_answer(error)
+            self._failed(scope, error.code)
         except Exception:
             logger.exception("a request to %s failed", scope["path"])
             status, content, headers = 500, encode_bug(), JSON_HEADERS
+            self._core.metrics.failed(self._protocol, "", "", "internal")  # what failed may be the policies
         await send(
             {
                 "type": "http.response.start",
@@ -84,6 +93,10 @@ class Endpoint:
             }
         )
         await send({"type": "http.response.body", "body": content})
+
+    def _failed(self, scope: Scope, code: str) -> None:
+        params = scope["path_params"]
+        self._core.failed(self._protocol, params["name"], params.get("version"), code)
 
 
 JSON_HEADERS: Headers = ((b"content-type", JSON),)
@@ -194,6 +207,8 @@ def error_answer(error: RlservoError) -> tuple[int, bytes, Headers]:
     headers = JSON_HEADERS
     if status == 503:
         headers += ((b"retry-after", str(RETRY_AFTER_S).encode()),)
+    elif status == 401:
+        headers += ((b"www-authenticate", b"Bearer"),)
     elif status >= 500:
         logger.error("%s", error.message)
     return status, encode_error(error), headers

@@ -13,6 +13,7 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
+from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -22,8 +23,10 @@ from rlservo.serve_app import edge, oip, wire
 from rlservo.serve_app.core import Core, StoreProvider
 from rlservo.serve_app.docs import add_docs
 from rlservo.serve_app.edge import JSON, JSON_HEADERS, BareRoute, Body, Endpoint, Headers
+from rlservo.serve_app.keys import Guard
 from rlservo.serve_app.settings import ServerSettings
-from rlservo.serve_app.stream import Stream
+from rlservo.serve_app.store import Decision
+from rlservo.serve_app.stream import Stream, refuse
 
 CODES = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "wrong-media-type"}
 ACT_PATH = "/v1/policies/{name}/act"
@@ -31,14 +34,18 @@ ACT_VERSION_PATH = "/v1/policies/{name}/versions/{version}/act"
 ACT_PATTERN = re.compile(r"/v1/policies/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/act")
 
 
-def create_app(store_provider: StoreProvider, settings: ServerSettings) -> FastAPI:
-    """Return the application; `store_provider` gives None for as long as the policies are being loaded."""
-    core = Core(store_provider, settings)
-    act = Endpoint(_Act(core), _check_headers, settings)
+def create_app(store_provider: StoreProvider, settings: ServerSettings, *, replica: str = "") -> FastAPI:
+    """Return the application; `store_provider` gives None for as long as the policies are being loaded.
+
+    Raises UsageError when the API keys that `settings` name cannot be read.
+    """
+    core = Core(store_provider, settings, replica=replica)
+    act = Endpoint("json", _Act(core), _check_headers, core)
     infer = oip.endpoint(core)
     app = PolicyApp(
         ((ACT_PATTERN, act), (oip.INFER_PATTERN, infer)),
         Stream(core),
+        core.guard,
         title="rlservo",
         description=DESCRIPTION,
         docs_url=None,
@@ -46,7 +53,7 @@ def create_app(store_provider: StoreProvider, settings: ServerSettings) -> FastA
     )
     _add_act(app, act)
     _add_policies(app, core)
-    _add_health(app)
+    _add_health(app, core)
     oip.add_routes(app, core, infer)
     if settings.docs:
         add_docs(app)
@@ -67,15 +74,26 @@ class PolicyApp(FastAPI):
     the documentation, and for whatever is not a POST.
     """
 
-    def __init__(self, direct: tuple[tuple[re.Pattern[str], ASGIApp], ...], stream: ASGIApp, **options: Any) -> None:
+    def __init__(
+        self, direct: tuple[tuple[re.Pattern[str], ASGIApp], ...], stream: ASGIApp, guard: Guard, **options: Any
+    ) -> None:
         super().__init__(**options)
         self._direct = direct
         self._stream = stream
+        self._guard = guard
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Dispatch one ASGI connection."""
+        if scope["type"] == "lifespan":
+            await super().__call__(scope, receive, send)
+            return
+        path = scope["path"].removeprefix(scope.get("root_path", ""))
+        try:
+            self._guard.check(scope, path)
+        except RlservoError as error:
+            await refuse(scope, receive, send, error)
+            return
         if scope["type"] == "http" and scope["method"] == "POST":
-            path = scope["path"].removeprefix(scope.get("root_path", ""))
             for pattern, endpoint in self._direct:
                 match = pattern.fullmatch(path)
                 if match is not None:
@@ -94,7 +112,7 @@ class _Act:
     def __init__(self, core: Core) -> None:
         self._core = core
 
-    def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers]:
+    def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
         self._core.store()  # not ready comes before any fault of the request
         request = wire.read_request(body)
         params = scope["path_params"]
@@ -115,7 +133,7 @@ class _Act:
             raise
         if request.non_finite:
             wire.refuse_non_finite()
-        return wire.encode_decision(decision, request.seq), JSON_HEADERS
+        return wire.encode_decision(decision, request.seq), JSON_HEADERS, decision
 
 
 def _add_act(app: FastAPI, act: ASGIApp) -> None:
@@ -177,10 +195,14 @@ def _add_policies(app: FastAPI, core: Core) -> None:
         return Response(contract_json(store().get(name, version).contract), media_type="application/json")
 
 
-def _add_health(app: FastAPI) -> None:
+def _add_health(app: FastAPI, core: Core) -> None:
     @app.get("/healthz", tags=["health"], summary="The process answers", response_class=Response)
     async def healthz() -> Response:
         return Response("OK", media_type="text/plain")
+
+    @app.get("/metrics", tags=["health"], summary="For Prometheus: what this replica answered", response_class=Response)
+    async def metrics() -> Response:
+        return Response(core.exposition(), media_type=CONTENT_TYPE_LATEST)
 
 
 # Errors of the routes that FastAPI runs; `edge.py` has the table.

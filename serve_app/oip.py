@@ -28,6 +28,7 @@ from rlservo.export.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.serve_app import wire
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import JSON_HEADERS, BareRoute, Body, Endpoint, Headers, error_models, read_body, too_large
+from rlservo.serve_app.store import Decision
 from rlservo.serve_app.tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor
 
 INFER_PATTERN = re.compile(r"/v2/models/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/infer")
@@ -112,7 +113,7 @@ class ModelState(BaseModel):
 
 def endpoint(core: Core) -> Endpoint:
     """Return the endpoint that answers inference requests."""
-    return Endpoint(_Infer(core), _check_headers, core.settings)
+    return Endpoint("oip", _Infer(core), _check_headers, core)
 
 
 class _Infer:
@@ -121,7 +122,7 @@ class _Infer:
     def __init__(self, core: Core) -> None:
         self._core = core
 
-    def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers]:
+    def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
         params, encoding, accepted, length = scope["path_params"], b"", b"", None
         contract = self._core.store().get(params["name"], params.get("version")).contract
         for name, value in scope["headers"]:
@@ -155,37 +156,27 @@ class _Infer:
         )
         if non_finite:
             wire.refuse_non_finite()
-        return self._reply(
-            document, decision.action, decision.name, decision.version, decision.infer_ms, seq, binary, accepted
-        )
-
-    def _reply(
-        self,
-        document: Mapping[str, Any],
-        action: NDArray[Any],
-        name: str,
-        version: str,
-        infer_ms: float,
-        seq: int | None,
-        binary: bool,
-        accepted: bytes,
-    ) -> tuple[bytes, Headers]:
-        tensor, raw = write_tensor(OUTPUT, action, binary=binary)
-        parameters: dict[str, Any] = {"infer_ms": round(infer_ms, 4)}
-        if seq is not None:
-            parameters["seq"] = seq
-        reply: dict[str, Any] = {"model_name": name, "model_version": version, "parameters": parameters}
-        if "id" in document:
-            reply["id"] = document["id"]
-        reply["outputs"] = [tensor]
-        content = orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
-        headers = JSON_HEADERS
-        if binary:
-            headers = ((b"content-type", BINARY), (LENGTH_HEADER, b"%d" % len(content)))
-            content += raw
+        content, headers = _encode_reply(decision, document.get("id"), seq, binary=binary)
         if accepted and len(content) >= SMALLEST_COMPRESSED:
-            return _compress(content, headers, accepted)
-        return content, headers
+            content, headers = _compress(content, headers, accepted)
+        return content, headers, decision
+
+
+def _encode_reply(
+    decision: Decision, request_id: str | None, seq: int | None, *, binary: bool
+) -> tuple[bytes, Headers]:
+    tensor, raw = write_tensor(OUTPUT, decision.action, binary=binary)
+    parameters: dict[str, Any] = {"infer_ms": round(decision.infer_ms, 4)}
+    if seq is not None:
+        parameters["seq"] = seq
+    reply: dict[str, Any] = {"model_name": decision.name, "model_version": decision.version, "parameters": parameters}
+    if request_id is not None:
+        reply["id"] = request_id
+    reply["outputs"] = [tensor]
+    content = orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
+    if not binary:
+        return content, JSON_HEADERS
+    return content + raw, ((b"content-type", BINARY), (LENGTH_HEADER, b"%d" % len(content)))
 
 
 def _read_request(view: memoryview, length: int | None) -> tuple[dict[str, Any], dict[str, NDArray[Any]], bool]:

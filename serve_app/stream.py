@@ -25,12 +25,14 @@ from rlservo.serve_app import wire
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import encode_bug, error_answer, status_of
+from rlservo.serve_app.keys import check_origin
 
 logger = logging.getLogger(__name__)
 
 STREAM_PATTERN = re.compile(r"/(?:v1/policies/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/stream)?")
 FAILED = 1011  # the close code openpi's server uses for every error
 KNOWN = frozenset({"obs", *wire.OPTIONS, "reset"})
+PROTOCOL = "websocket"
 NO_OPTIONS: dict[str, Any] = {}
 DENIAL = "websocket.http.response"  # the ASGI extension that answers an upgrade with an HTTP error
 
@@ -44,24 +46,33 @@ class Stream:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection until the client closes it."""
-        await receive()  # websocket.connect
+        name = ""
+        version: str | None = None
         try:
+            check_origin(scope)
             name, version = self._addressed(scope["path"].removeprefix(scope.get("root_path", "")))
             contract = self._core.store().get(name, version).contract
         except RlservoError as error:
-            await refuse(scope, send, error)
+            self._core.failed(PROTOCOL, name, version, error.code)
+            await refuse(scope, receive, send, error)
             return
+        await receive()  # websocket.connect
         await send({"type": "websocket.accept"})
+        self._core.metrics.stream(name, 1)
         try:
             await send(_binary(pack(_metadata(contract))))
             await self._answer(name, version, receive, send)
         except RlservoError as error:
+            self._core.failed(PROTOCOL, name, version, error.code)
             if status_of(error) >= 500:
                 logger.error("%s", error.message)
             await _fail(send, error_answer(error)[1])
         except Exception:
             logger.exception("the stream of policy '%s' failed", name)
+            self._core.metrics.failed(PROTOCOL, "", "", "internal")
             await _fail(send, encode_bug())
+        finally:
+            self._core.metrics.stream(name, -1)
 
     async def _answer(self, name: str, version: str | None, receive: Receive, send: Send) -> None:
         previous_ms: float | None = None
@@ -79,9 +90,8 @@ class Stream:
             if previous_ms is not None:
                 timing["prev_total_ms"] = previous_ms
             action = decision.action
-            single = action.ndim == len(self._core.store().get(name, version).contract.action_space.shape)
             reply: dict[str, Any] = {
-                "actions": action[None, ...] if single else action[:, None, ...],
+                "actions": action[None, ...] if decision.batch is None else action[:, None, ...],
                 "policy": decision.name,
                 "version": decision.version,
                 "server_timing": timing,
@@ -89,7 +99,9 @@ class Stream:
             if seq is not None:
                 reply["seq"] = seq
             await send(_binary(pack(reply)))
-            previous_ms = (time.perf_counter() - received) * 1e3
+            taken = time.perf_counter() - received
+            previous_ms = taken * 1e3
+            self._core.metrics.answered(PROTOCOL, decision, decision.batch or 1, taken)
 
     def _addressed(self, path: str) -> tuple[str, str | None]:
         """Return (policy, version) that a path means; `/` is the default policy."""
@@ -139,9 +151,19 @@ def _metadata(contract: Contract) -> dict[str, Any]:
     }
 
 
-async def refuse(scope: Scope, send: Send, error: RlservoError) -> None:
-    """Answer the upgrade with an HTTP error, or, where the server cannot, accept and fail in the protocol's own way."""
+async def refuse(scope: Scope, receive: Receive, send: Send, error: RlservoError) -> None:
+    """Answer a request with an error before anybody reads it.
+
+    A WebSocket's upgrade gets the same HTTP error; where the server cannot send one, it is accepted and fails in the
+    protocol's own way.
+    """
     status, content, headers = error_answer(error)
+    if scope["type"] == "http":
+        headers += ((b"content-length", b"%d" % len(content)),)
+        await send({"type": "http.response.start", "status": status, "headers": list(headers)})
+        await send({"type": "http.response.body", "body": content})
+        return
+    await receive()  # websocket.connect
     if DENIAL in scope.get("extensions", {}):
         headers += ((b"content-length", b"%d" % len(content)),)
         await send({"type": f"{DENIAL}.start", "status": status, "headers": list(headers)})

@@ -277,7 +277,7 @@ def discrete_policy() -> Callable[..., Path]:
 def over_uvicorn(app: Any) -> Iterator[int]:
     """Serve an ASGI application from a thread; gives the port."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", access_log=False, lifespan="off"))
+        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", access_log=False, lifespan="on"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         try:

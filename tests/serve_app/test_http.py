@@ -275,6 +275,7 @@ def test_the_openapi_document_is_valid_3_0_and_describes_every_route(ask: Ask) -
         "/v1/policies/{name}/act",
         "/v1/policies/{name}/versions/{version}/act",
         "/healthz",
+        "/metrics",
         "/v2",
         "/v2/health/live",
         "/v2/health/ready",
