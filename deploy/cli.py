@@ -245,6 +245,28 @@ def serve(
 
 
 @app.command()
+def key(
+    label: Annotated[str, typer.Argument(help="Whom the key is for: a robot, a person. Shown in messages.")],
+    admin: Annotated[bool, typer.Option("--admin", help="For administration; robots need no such key.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make an API key: the key for the client, and the line with its hash for the server's key file.
+
+    Example: `rlservo key cell-7`; append the line to a file and name that in RLSERVO_API_KEYS_FILE
+    """
+    from rlservo.serve_app.keys import new_key
+
+    made, line = new_key(label, admin=admin)
+    if as_json:
+        _print_json({"key": made, "line": line})
+        return
+    _note("the key, for the client; it is not kept anywhere and not shown again:")
+    print(made)
+    _note("the line, for the server's key file (RLSERVO_API_KEYS_FILE):")
+    print(line)
+
+
+@app.command()
 def rollout(
     env: Annotated[str, typer.Argument(help="Gymnasium environment id.")],
     url: Annotated[str | None, typer.Option(help="Server to ask for actions.")] = None,

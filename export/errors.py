@@ -133,3 +133,15 @@ class UsageError(RlservoError):
     """An argument, or something already running on the machine, prevents the start."""
 
     code = "bad-usage"
+
+
+class UnauthenticatedError(RlservoError):
+    """The request carries no key, or one that is not known."""
+
+    code = "unauthenticated"
+
+
+class ForbiddenError(RlservoError):
+    """The key, or the page the request comes from, may not do this."""
+
+    code = "forbidden"

@@ -11,14 +11,17 @@ import asyncio
 from pathlib import Path
 from typing import Any, cast
 
+import ray
 from fastapi import FastAPI
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from ray import serve
 from ray.serve import Application, Deployment
 from ray.serve.config import HTTPOptions
+from ray.serve.context import _get_global_client
 
 from rlservo.export.errors import RlservoError
 from rlservo.serve_app.http import create_app
+from rlservo.serve_app.keys import check_exposure
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
 
@@ -75,19 +78,30 @@ class PolicyServer:
         """Load and prove every policy; Serve sends requests only after this has returned."""
         self._settings = ServerSettings(**settings)
         try:
+            check_exposure(_listening_host(), self._settings)
             self._store = PolicyStore.load(folders, threads=self._settings.threads)
         except RlservoError as error:
             # Ray pickles what a constructor raises and prints its text: one sentence instead of our class and details.
             raise RuntimeError(error.message) from None
 
     def __serve_build_asgi_app__(self) -> FastAPI:  # Serve's hook: the app is built in the replica
-        return create_app(lambda: self._store, self._settings)
+        return create_app(lambda: self._store, self._settings, replica=serve.get_replica_context().replica_tag)
 
     async def check_health(self) -> None:
         """Tell Serve's controller that the event loop turns and the policies are there; if not, it replaces us."""
         await asyncio.sleep(0)
         if not self._store.names:
             raise RuntimeError("no policies are loaded")
+
+
+def _listening_host() -> str:
+    """Return the address that Serve's HTTP options name; it is where this replica's own port listens, too.
+
+    Serve tells its replicas, and nobody else (ray 2.60): hence the private client.
+    """
+    client: Any = _get_global_client()
+    options: Any = ray.get(client._controller.get_http_config.remote())
+    return str(options.host)
 
 
 def start(policies: list[str], *, host: str, port: int, replicas: int, settings: dict[str, Any]) -> None:

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.errors import UnavailableError, UsageError
+from rlservo.serve_app.keys import check_exposure, is_loopback
 from rlservo.serve_app.processes import MARK, check_port, end_marked, free_ports, remove_folder
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
@@ -38,7 +39,6 @@ STOP_TIMEOUT_S = 30.0
 MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 STOP, STOP_NOW = "stop", "stop now"
 
 # HAProxy's statistics and metrics listen on every interface, whatever host is asked for (ray 2.60,
@@ -88,7 +88,7 @@ def serve_policies(
     with contextlib.closing(PolicyStore.load(paths, threads=1)) as store:
         policies = tuple((name, store.versions(name)[-1]) for name in store.names)
     check_port(host, port)
-    if host not in LOOPBACK:
+    if not check_exposure(host, chosen).keys and not is_loopback(host):
         logger.warning("listening on %s without authentication: whoever reaches this port can ask for actions", host)
     haproxy = _haproxy_binary()
     if haproxy is None:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from typing_extensions import Self
 
 from rlservo.export.errors import UsageError
@@ -37,8 +38,26 @@ class ServerSettings(BaseModel):
     max_ongoing_requests: int = Field(256, ge=1)
     """Requests one replica holds at once; further ones wait for a place (hence the short `body_timeout_s`)."""
 
+    api_keys_file: str | None = None
+    """File of the API keys' hashes, a line each: `<label> <act|admin> sha256:<hash>`; `rlservo key` makes them."""
+
+    api_keys: str = Field("", repr=False)
+    """The same lines, separated by commas, for where a variable is easier to set than a file."""
+
+    allow_unauthenticated: bool = False
+    """Listen beyond this machine without any key: whoever reaches the port can ask for actions."""
+
+    default_policy: str | None = None
+    """The policy of a WebSocket at `/`, where openpi's clients connect; the only one, where there is one."""
+
     docs: bool = True
     """Serve the interactive API documentation at /docs, from files that come with the server."""
+
+    @field_validator("api_keys_file")
+    @classmethod
+    def _absolute(cls, value: str | None) -> str | None:
+        """A replica's working directory is not the caller's."""
+        return None if value is None else str(Path(value).expanduser().absolute())
 
     @classmethod
     def from_environment(
@@ -64,4 +83,4 @@ class ServerSettings(BaseModel):
             source = PREFIX + name.upper() if name in values and name not in given else f"the setting '{name}'"
             known = ", ".join(cls.model_fields)
             hint = f"; known: {known}" if first["type"] == "extra_forbidden" else ""
-            raise UsageError(f"{source} is not usable: {first['msg']} (given: {first['input']!r}){hint}") from error
+            raise UsageError(f"{source} is not usable: {first['msg']} (given: {first['input']!r:.80}){hint}") from error

@@ -33,6 +33,7 @@ class Decision:
     name: str
     version: str
     infer_ms: float  # [ms] checking the observation, the network, checking the action
+    batch: int | None = None  # how many observations there were; None for one that came alone
 
 
 class PolicyStore:
@@ -127,7 +128,9 @@ class PolicyStore:
         started = time.perf_counter()
         action = policy.act(obs, explore=explore, seed=seed)
         infer_ms = (time.perf_counter() - started) * 1e3
-        return Decision(action, name, policy.contract.version, infer_ms)
+        contract = policy.contract
+        batch = len(action) if action.ndim > len(contract.action_space.shape) else None
+        return Decision(action, name, contract.version, infer_ms, batch)
 
     def close(self) -> None:
         """Close every policy."""

@@ -90,6 +90,7 @@ class Act:
 
 
 KNOWN = frozenset(ActRequest.model_fields)
+OPTIONS = ("explore", "seed", "seq", "deadline_ms")
 STATEFUL = ("state", "session_id")
 
 
@@ -98,29 +99,30 @@ def read_request(body: bytes | bytearray) -> Act:
 
     Raises RequestError when it is not a JSON object of the known fields, or ObservationError when it has no `obs`.
     """
-    non_finite = False
-    try:
-        document = orjson.loads(body)
-    except orjson.JSONDecodeError as error:
-        document = _read_lenient(body, error)
-        non_finite = True
-    if type(document) is not dict:
-        raise RequestError(
-            f'the request body must be a JSON object such as {{"obs": [...]}}, got {_json_type(document)}'
-        )
+    document, non_finite = read_json(body, such_as='{"obs": [...]}')
     if "obs" not in document:
         _check_fields(document)
         raise ObservationError("the request has no 'obs': send {\"obs\": [...]}")
     if len(document) == 1 and not non_finite:  # the usual request
         return Act(document["obs"], False, None, None, None)
     _check_fields(document)
-    explore = document.get("explore")
-    if explore is not None and type(explore) is not bool:
-        raise RequestError(f"'explore' must be true or false, got {_json_type(explore)}")
-    seed = _integer(document, "seed")
-    if seed is not None and not 0 <= seed <= MAX_SEED:
-        raise RequestError(f"'seed' must be in 0..{MAX_SEED}, got {seed}")
-    return Act(document["obs"], bool(explore), seed, _integer(document, "seq"), _deadline(document), non_finite)
+    return Act(document["obs"], *read_options(document), non_finite)
+
+
+def read_json(body: bytes | bytearray | memoryview, *, such_as: str) -> tuple[dict[str, Any], bool]:
+    """Return the JSON object in `body`, and whether it holds NaN or Infinity, which JSON does not have.
+
+    Raises RequestError.
+    """
+    non_finite = False
+    try:
+        document = orjson.loads(body)
+    except orjson.JSONDecodeError as error:
+        document = _read_lenient(bytes(body), error, such_as)
+        non_finite = True
+    if type(document) is not dict:
+        raise RequestError(f"the request body must be a JSON object such as {such_as}, got {json_type(document)}")
+    return document, non_finite
 
 
 def encode_decision(decision: Decision, seq: int | None) -> bytes:
@@ -154,7 +156,7 @@ def encode_json(document: Mapping[str, Any]) -> bytes:
         return json.dumps(document, default=str).encode()
 
 
-def _read_lenient(body: bytes | bytearray, error: orjson.JSONDecodeError) -> Any:
+def _read_lenient(body: bytes, error: orjson.JSONDecodeError, such_as: str) -> Any:
     """Parse what only Python's own parser takes: NaN, Infinity and numbers too large for a double.
 
     A policy's client that sends them has a broken sensor or a division by zero; "invalid JSON" would not help it.
@@ -165,7 +167,7 @@ def _read_lenient(body: bytes | bytearray, error: orjson.JSONDecodeError) -> Any
         except (ValueError, RecursionError):
             pass
     if not body.strip():
-        raise RequestError('the request body is empty: send a JSON object such as {"obs": [...]}') from error
+        raise RequestError(f"the request body is empty: send a JSON object such as {such_as}") from error
     raise RequestError(f"the request body is not JSON: {error}") from error
 
 
@@ -182,23 +184,37 @@ def _check_fields(document: dict[str, Any]) -> None:
             raise RequestError(f"'{name}' is for recurrent policies; this one keeps no state: leave it out")
 
 
-def _integer(document: dict[str, Any], name: str) -> int | None:
+def read_options(document: Mapping[str, Any]) -> tuple[bool, int | None, int | None, float | None]:
+    """Return (explore, seed, seq, deadline_ms), the options every protocol has. Raises RequestError."""
+    explore = document.get("explore")
+    if explore is not None and type(explore) is not bool:
+        raise RequestError(f"'explore' must be true or false, got {json_type(explore)}")
+    seed = read_integer(document, "seed")
+    if seed is not None and not 0 <= seed <= MAX_SEED:
+        raise RequestError(f"'seed' must be in 0..{MAX_SEED}, got {seed}")
+    return bool(explore), seed, read_integer(document, "seq"), read_deadline(document)
+
+
+def read_integer(document: Mapping[str, Any], name: str) -> int | None:
+    """Return an optional integer field. Raises RequestError when it is something else."""
     value = document.get(name)
     if value is None or type(value) is int:
         return value
-    raise RequestError(f"'{name}' must be an integer, got {_json_type(value)}")
+    raise RequestError(f"'{name}' must be an integer, got {json_type(value)}")
 
 
-def _deadline(document: dict[str, Any]) -> float | None:
+def read_deadline(document: Mapping[str, Any]) -> float | None:
+    """Return the optional field `deadline_ms`. Raises RequestError when it is not a finite number."""
     value = document.get("deadline_ms")
     if value is None:
         return None
     if type(value) not in (int, float) or not math.isfinite(value):
-        raise RequestError(f"'deadline_ms' must be a number of milliseconds, got {_json_type(value)}")
+        raise RequestError(f"'deadline_ms' must be a number of milliseconds, got {json_type(value)}")
     return float(value)
 
 
-def _json_type(value: Any) -> str:
+def json_type(value: Any) -> str:
+    """Say what a JSON value is, for an error's sentence."""
     if value is None:
         return "null"
     if isinstance(value, bool):

@@ -187,3 +187,17 @@ def test_env_arguments_are_json_or_strings() -> None:
     assert parsed == {"ur_model": "ur10e", "randomize_start": True, "rate": 2.5, "a": "b"}
     with pytest.raises(UsageError, match="expected NAME=VALUE"):
         parse_env_arguments(["ur-model=ur5"])
+
+
+def test_key_makes_a_key_and_the_line_that_the_server_accepts_it_by() -> None:
+    from rlservo.serve_app.keys import Keys, Role
+    from rlservo.serve_app.settings import ServerSettings
+
+    done = rlservo("key", "operator", "--admin", "--json")
+    assert done.returncode == 0, done.stderr
+    made = json.loads(done.stdout)
+    found = Keys.from_settings(ServerSettings(api_keys=made["line"])).find(made["key"].encode())
+    assert found is not None and (found.label, found.role) == ("operator", Role.admin)
+    plain = rlservo("key", "cell-7").stdout.split("\n")
+    assert plain[0].startswith("rlservo_") and plain[1].startswith("cell-7 act sha256:")
+    refused(rlservo("key", "two words"), 2, "label 'two words': expected 1 to 64 letters")

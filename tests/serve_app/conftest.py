@@ -5,8 +5,15 @@ They are written with `onnx.helper` and `rlservo.export.bundle` alone, so that t
 
 from __future__ import annotations
 
+import contextlib
+import socket
+import subprocess
+import sys
+import threading
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +21,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+import uvicorn
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
@@ -263,3 +271,42 @@ def box_policy() -> Callable[..., Path]:
 def discrete_policy() -> Callable[..., Path]:
     """`write_discrete_policy`."""
     return write_discrete_policy
+
+
+@contextlib.contextmanager
+def over_uvicorn(app: Any) -> Iterator[int]:
+    """Serve an ASGI application from a thread; gives the port."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", access_log=False, lifespan="on"))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            while not server.started:
+                time.sleep(0.01)
+            yield listener.getsockname()[1]
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+@pytest.fixture(scope="session")
+def served() -> Callable[[Any], AbstractContextManager[int]]:
+    """`over_uvicorn`."""
+    return over_uvicorn
+
+
+@pytest.fixture(scope="session")
+def client_environment(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Install packages that cannot share our environment into one of their own; gives its Python, or skips."""
+
+    def install(*packages: str) -> Path:
+        folder = tmp_path_factory.mktemp("client")
+        commands = [[sys.executable, "-m", "venv", str(folder)]]
+        commands.append([str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", *packages])
+        for command in commands:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+            if done.returncode != 0:
+                pytest.skip(f"{', '.join(packages)} cannot be installed here: {done.stderr.strip()[-300:]}")
+        return folder / "bin" / "python"
+
+    return install

@@ -275,8 +275,17 @@ def test_the_openapi_document_is_valid_3_0_and_describes_every_route(ask: Ask) -
         "/v1/policies/{name}/act",
         "/v1/policies/{name}/versions/{version}/act",
         "/healthz",
+        "/metrics",
+        "/v2",
         "/v2/health/live",
         "/v2/health/ready",
+        "/v2/models/{name}",
+        "/v2/models/{name}/versions/{version}",
+        "/v2/models/{name}/ready",
+        "/v2/models/{name}/versions/{version}/ready",
+        "/v2/models/{name}/infer",
+        "/v2/models/{name}/versions/{version}/infer",
+        "/v2/repository/index",
     }
     request = document["paths"]["/v1/policies/{name}/act"]["post"]["requestBody"]["content"]["application/json"][
         "schema"

@@ -1,0 +1,93 @@
+"""What every protocol asks: which policies there are, and one decision within its limits.
+
+The protocols (`http.py`, `oip.py`, `stream.py`) read bytes and write bytes; what lies between is here, once: whether
+the policies are loaded, the deadline, the batch limit. It knows nothing of HTTP, WebSockets or JSON.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError
+from rlservo.serve_app.keys import Guard, Keys
+from rlservo.serve_app.metrics import Metrics
+from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.store import Decision, PolicyStore
+
+StoreProvider = Callable[[], PolicyStore | None]
+
+
+class Core:
+    """The policies as the protocols see them; `store_provider` gives None for as long as they are being loaded."""
+
+    def __init__(self, store_provider: StoreProvider, settings: ServerSettings, *, replica: str = "") -> None:
+        """Read the keys that `settings` name; `replica` names this process in the metrics. Raises UsageError."""
+        self._store_provider = store_provider
+        self.settings = settings
+        self.guard = Guard(Keys.from_settings(settings))
+        self.metrics = Metrics(replica)
+
+    def store(self) -> PolicyStore:
+        """Return the policies. Raises UnavailableError while they are being loaded."""
+        store = self._store_provider()
+        if store is None:
+            raise UnavailableError("the policies are still being loaded: try again shortly")
+        return store
+
+    def act(
+        self,
+        name: str,
+        version: str | None,
+        obs: Any,
+        *,
+        received: float,
+        explore: bool = False,
+        seed: int | None = None,
+        seq: int | None = None,
+        deadline_ms: float | None = None,
+    ) -> Decision:
+        """Decide for `obs`, unless `deadline_ms` have passed since `received` (`time.perf_counter`).
+
+        Raises DeadlineError, TooLargeError, UnavailableError and what `PolicyStore.act` raises.
+        """
+        store = self.store()
+        if deadline_ms is not None:
+            late_ms = (time.perf_counter() - received) * 1e3
+            if late_ms >= deadline_ms:
+                raise DeadlineError(
+                    f"the deadline of {deadline_ms:g} ms passed before the policy was asked: nothing computed",
+                    {"deadline_ms": deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": seq},
+                )
+        rows = _rows(obs)
+        if rows > self.settings.max_batch:
+            shape = getattr(store.get(name, version).contract.observation_space, "shape", ())
+            if type(obs) is dict or rows != (shape or (0,))[0]:  # not one long observation
+                raise TooLargeError(f"a batch of {rows} observations is too large: at most {self.settings.max_batch}")
+        return store.act(name, version, obs, explore=explore, seed=seed)
+
+    def failed(self, protocol: str, name: str, version: str | None, code: str) -> None:
+        """Count a request that got no action; names that are not loaded are not told apart."""
+        store = self._store_provider()
+        if store is None or name not in store.names:
+            name = version = ""
+        elif version is not None and version not in store.versions(name):
+            version = ""
+        self.metrics.failed(protocol, name, version or "", code)
+
+    def exposition(self) -> bytes:
+        """Return the metrics as Prometheus reads them."""
+        store = self._store_provider()
+        return self.metrics.exposition({} if store is None else {name: store.versions(name) for name in store.names})
+
+
+def _rows(obs: Any) -> int:
+    """Return how many observations a batch would hold: lists, arrays, or names to either."""
+    if type(obs) is dict:
+        return max((_rows(value) for value in obs.values()), default=0)
+    if type(obs) is np.ndarray:
+        return len(obs) if obs.ndim else 0
+    return len(obs) if type(obs) is list else 0

@@ -1,0 +1,235 @@
+"""What the HTTP protocols share: a body within its limits, one answer for each error, and a route without machinery.
+
+`Endpoint` is the hot path: a plain ASGI callable, because FastAPI's dependency and response machinery costs more than
+the policy does. Everything runs in the event loop: a decision takes microseconds, a hop to a thread takes more.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from fastapi.routing import APIRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from rlservo.export.errors import (
+    ActionError,
+    DeadlineError,
+    ForbiddenError,
+    MediaTypeError,
+    ObservationError,
+    RequestError,
+    RlservoError,
+    TooLargeError,
+    UnauthenticatedError,
+    UnavailableError,
+    UnknownPolicyError,
+)
+from rlservo.serve_app import wire
+from rlservo.serve_app.core import Core
+from rlservo.serve_app.store import Decision
+
+logger = logging.getLogger(__name__)
+
+STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; whatever does not fit is our fault: 500
+    (ObservationError, 422),
+    (UnknownPolicyError, 404),
+    (MediaTypeError, 415),
+    (TooLargeError, 413),
+    (RequestError, 400),
+    (DeadlineError, 408),
+    (UnavailableError, 503),
+    (UnauthenticatedError, 401),
+    (ForbiddenError, 403),
+    (ActionError, 500),
+)
+RETRY_AFTER_S = 1
+JSON = b"application/json"
+
+Headers = tuple[tuple[bytes, bytes], ...]
+Body = bytes | bytearray
+Handle = Callable[[Scope, Body, float], tuple[bytes, Headers, Decision]]
+CheckHeaders = Callable[[list[tuple[bytes, bytes]]], None]
+
+
+class Endpoint:
+    """A POST endpoint: reads the body, calls `handle(scope, body, received)`, answers, errors included."""
+
+    def __init__(self, protocol: str, handle: Handle, check_headers: CheckHeaders, core: Core) -> None:
+        self._protocol = protocol
+        self._handle = handle
+        self._check_headers = check_headers
+        self._core = core
+        self._max_body = core.settings.max_body_bytes
+        self._timeout_s = core.settings.body_timeout_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        received = time.perf_counter()
+        try:
+            self._check_headers(scope["headers"])
+            check_length(scope["headers"], self._max_body)
+            body = await read_body(receive, max_bytes=self._max_body, timeout_s=self._timeout_s)
+            if body is None:  # the client has gone
+                return
+            content, headers, decision = self._handle(scope, body, received)
+            status = 200
+            self._core.metrics.answered(self._protocol, decision, decision.batch or 1, time.perf_counter() - received)
+        except RlservoError as error:
+            status, content, headers = error_answer(error)
+            self._failed(scope, error.code)
+        except Exception:
+            logger.exception("a request to %s failed", scope["path"])
+            status, content, headers = 500, encode_bug(), JSON_HEADERS
+            self._core.metrics.failed(self._protocol, "", "", "internal")  # what failed may be the policies
+        await send(
+            {
+                "type": "http.response.start",
+                "status": status,
+                "headers": [(b"content-length", b"%d" % len(content)), *headers],
+            }
+        )
+        await send({"type": "http.response.body", "body": content})
+
+    def _failed(self, scope: Scope, code: str) -> None:
+        params = scope["path_params"]
+        self._core.failed(self._protocol, params["name"], params.get("version"), code)
+
+
+JSON_HEADERS: Headers = ((b"content-type", JSON),)
+
+
+class BareRoute(APIRoute):
+    """A route FastAPI documents and routes to, and otherwise leaves alone: `app` is a bare ASGI callable."""
+
+    def __init__(
+        self,
+        path: str,
+        endpoint: ASGIApp,
+        *,
+        operation: str,
+        tag: str,
+        summary: str,
+        reply: Any,
+        body: Mapping[str, Any],
+        responses: dict[int | str, dict[str, Any]],
+    ) -> None:
+        async def documented() -> None:
+            """Documented, never called: `app` answers."""
+
+        super().__init__(
+            path,
+            documented,
+            methods=["POST"],
+            name=operation,
+            tags=[tag],
+            summary=summary,
+            description=summary + ".",
+            response_model=reply,
+            responses=responses,
+            openapi_extra={
+                "requestBody": {"required": True, "content": body},
+                "parameters": [
+                    {"name": name, "in": "path", "required": True, "schema": {"type": "string"}}
+                    for name in ("name", "version")
+                    if f"{{{name}}}" in path
+                ],
+            },
+            generate_unique_id_function=lambda _route: operation,
+        )
+        self.app = endpoint
+
+
+async def read_body(receive: Receive, *, max_bytes: int, timeout_s: float) -> Body | None:
+    """Return the body, or None when the client hung up. The first message usually holds all of it.
+
+    Raises TooLargeError and DeadlineError.
+    """
+    task, late = asyncio.current_task(), False
+
+    def expire() -> None:
+        nonlocal late
+        late = True
+        if task is not None:
+            task.cancel()
+
+    timer = asyncio.get_running_loop().call_later(timeout_s, expire)
+    try:
+        message = await receive()
+        body = message.get("body", b"")
+        if message.get("more_body", False):
+            body = bytearray(body)
+            while message.get("more_body", False):
+                message = await receive()
+                body += message.get("body", b"")
+                if len(body) > max_bytes:
+                    break
+    except asyncio.CancelledError:
+        if not late:
+            raise
+        if sys.version_info >= (3, 11) and task is not None:  # it counts cancellations
+            task.uncancel()
+        raise DeadlineError(f"the request body did not arrive within {timeout_s:g} s") from None
+    finally:
+        timer.cancel()
+    if message["type"] == "http.disconnect":
+        return None
+    if len(body) > max_bytes:
+        raise too_large(max_bytes)
+    return body  # type: ignore[no-any-return]  # ASGI messages are untyped
+
+
+def check_length(headers: list[tuple[bytes, bytes]], max_bytes: int) -> None:
+    """Raise TooLargeError for a body that announces itself as too large."""
+    for name, value in headers:
+        if name == b"content-length" and value.isdigit() and len(value) < 20 and int(value) > max_bytes:
+            raise too_large(max_bytes)
+
+
+def too_large(limit: int) -> TooLargeError:
+    return TooLargeError(f"the request body is larger than {limit} bytes", {"max_body_bytes": limit})
+
+
+# Errors: the one table above, and one body for all.
+
+
+def status_of(error: RlservoError) -> int:
+    """Return the HTTP status of an error."""
+    return next((status for kind, status in STATUS if isinstance(error, kind)), 500)
+
+
+def error_answer(error: RlservoError) -> tuple[int, bytes, Headers]:
+    """Return (status, body, headers) and log what is our own fault."""
+    status = status_of(error)
+    headers = JSON_HEADERS
+    if status == 503:
+        headers += ((b"retry-after", str(RETRY_AFTER_S).encode()),)
+    elif status == 401:
+        headers += ((b"www-authenticate", b"Bearer"),)
+    elif status >= 500:
+        logger.error("%s", error.message)
+    return status, encode_error(error), headers
+
+
+def encode_error(error: RlservoError) -> bytes:
+    """Return the body of an error; the inside of the server stays inside."""
+    if status_of(error) == 500 and not isinstance(error, ActionError):
+        return encode_bug()
+    document: dict[str, Any] = {"error": error.message, "code": error.code}
+    if error.details:
+        document["details"] = error.details
+    return wire.encode_json(document)
+
+
+def encode_bug() -> bytes:
+    """Return the body of an error that is none of ours to explain to a client."""
+    return wire.encode_json({"error": "the server failed on this request; its log says how", "code": "internal"})
+
+
+def error_models(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return FastAPI's `responses` for these error statuses."""
+    return {status: {"model": wire.ErrorReply} for status in statuses}

@@ -1,0 +1,194 @@
+"""Who may ask: API keys, kept as hashes, and the check of each request against them.
+
+A key is 256 random bits, so its plain SHA-256 is all that needs keeping: there is no dictionary to try. A line of the
+key file, or an entry of RLSERVO_API_KEYS (separated by commas), is
+
+    <label> <act|admin> sha256:<64 hexadecimal digits>
+
+`rlservo key LABEL` makes a key and its line. It knows HTTP's headers and ASGI's scope; nothing of policies.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import ipaddress
+import re
+import secrets
+import stat
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from typing_extensions import Self
+
+from rlservo.export.errors import ForbiddenError, UnauthenticatedError, UsageError
+from rlservo.serve_app.settings import ServerSettings
+
+if TYPE_CHECKING:
+    from starlette.types import Scope
+
+LINE = re.compile(r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|admin)\s+sha256:(?P<digest>[0-9a-f]{64})")
+KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets can tell what they found
+KEY_BYTES = 32
+SCHEMES = (b"bearer", b"api-key")  # the second is what openpi's clients say
+# What orchestrators probe without a key, and the documentation, which says nothing of this server's policies.
+OPEN = frozenset({"/healthz", "/v2/health/live", "/v2/health/ready", "/docs", "/openapi.json"})
+OPEN_FOLDER = "/docs/files/"
+ADMIN = re.compile(r"/v1/admin(/.*)?|/v2/repository/models/[^/]+/(load|unload)")
+
+
+class Role(str, Enum):
+    """What a key is for; an admin key may also do all that an act key may."""
+
+    act = "act"
+    admin = "admin"
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key as it is kept: not the key itself."""
+
+    label: str
+    role: Role
+    digest: bytes
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The keys a server accepts; none at all means that it asks for none."""
+
+    keys: tuple[Key, ...] = ()
+
+    @classmethod
+    def from_settings(cls, settings: ServerSettings) -> Self:
+        """Read the file and the entries that the settings name. Raises UsageError."""
+        lines: list[tuple[str, str]] = []
+        if settings.api_keys_file is not None:
+            lines += _read_file(Path(settings.api_keys_file))
+        entries = [entry.strip() for entry in settings.api_keys.split(",")]
+        lines += [(f"entry {n} of RLSERVO_API_KEYS", entry) for n, entry in enumerate(entries, start=1) if entry]
+        keys = []
+        for where, line in lines:
+            match = LINE.fullmatch(line)
+            if match is None:  # the line is not shown: it may be a key by mistake
+                raise UsageError(
+                    f"{where}: expected '<label> <act|admin> sha256:<64 hexadecimal digits>', as "
+                    "'rlservo key LABEL' makes it"
+                )
+            keys.append(Key(match["label"], Role(match["role"]), bytes.fromhex(match["digest"])))
+        if (settings.api_keys_file is not None or settings.api_keys.strip()) and not keys:
+            raise UsageError(
+                "the key settings name no key, and would leave the server open: add one, or leave them out"
+            )
+        return cls(tuple(keys))
+
+    def find(self, presented: bytes) -> Key | None:
+        """Return the key that was presented. Every kept digest is compared, each in constant time."""
+        digest = hashlib.sha256(presented).digest()
+        found = None
+        for key in self.keys:
+            if hmac.compare_digest(digest, key.digest):
+                found = key
+        return found
+
+
+class Guard:
+    """Checks requests before anything else sees them."""
+
+    def __init__(self, keys: Keys) -> None:
+        self._keys = keys
+
+    def check(self, scope: Scope, path: str) -> None:
+        """Raise UnauthenticatedError or ForbiddenError unless this request may go on.
+
+        Without keys everything may but administration, which always needs an admin key.
+        """
+        admin = ADMIN.fullmatch(path) is not None
+        if not self._keys.keys:
+            if admin:
+                raise ForbiddenError(
+                    "administration needs an admin key, and this server has none: see 'rlservo key --help'"
+                )
+            return
+        if path in OPEN or path.startswith(OPEN_FOLDER):
+            return
+        presented = _presented(scope["headers"])
+        if presented is None:
+            raise UnauthenticatedError("this server wants an API key: send 'Authorization: Bearer KEY'")
+        key = self._keys.find(presented)
+        if key is None:
+            raise UnauthenticatedError("this API key is not known to the server")
+        if admin and key.role is not Role.admin:
+            raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key")
+
+
+def check_origin(scope: Scope) -> None:
+    """Raise ForbiddenError for a WebSocket that a web page of another origin opens.
+
+    Browsers let any page open a WebSocket to any address, the robot's own computer included; robots send no origin.
+    """
+    origin = host = None
+    for name, value in scope["headers"]:
+        if name == b"origin":
+            origin = value
+        elif name == b"host":
+            host = value
+    if origin is not None and urlsplit(origin.decode("latin-1")).netloc.encode("latin-1") != host:
+        raise ForbiddenError(f"a page of {origin[:100].decode('latin-1')} may not open a stream here")
+
+
+def new_key(label: str, *, admin: bool = False) -> tuple[str, str]:
+    """Return (the key, for the client alone; its line, for the server). Raises UsageError."""
+    key = KEY_PREFIX + secrets.token_urlsafe(KEY_BYTES)
+    line = f"{label} {'admin' if admin else 'act'} sha256:{hashlib.sha256(key.encode()).hexdigest()}"
+    if LINE.fullmatch(line) is None:
+        raise UsageError(f"label {label[:80]!r}: expected 1 to 64 letters, digits, '.', '_' and '-'")
+    return key, line
+
+
+def check_exposure(host: str, settings: ServerSettings) -> Keys:
+    """Return the keys; raise UsageError where others than this machine could ask for actions without one."""
+    keys = Keys.from_settings(settings)
+    if not keys.keys and not settings.allow_unauthenticated and not is_loopback(host):
+        raise UsageError(
+            f"listening on {host} without API keys would let whoever reaches this port ask for actions: make a key "
+            "with 'rlservo key LABEL' and name its file in RLSERVO_API_KEYS_FILE, listen on 127.0.0.1, or say "
+            "RLSERVO_ALLOW_UNAUTHENTICATED=1"
+        )
+    return keys
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a server that listens on `host`."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:  # a name: wherever it points
+        return False
+
+
+def _read_file(file: Path) -> list[tuple[str, str]]:
+    try:
+        mode = file.stat().st_mode
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"the key file {file} cannot be read: {error}") from error
+    if mode & stat.S_IWOTH:
+        raise UsageError(f"the key file {file} can be written by every user of this machine: chmod o-w {file}")
+    stripped = ((number, line.strip()) for number, line in enumerate(lines, start=1))
+    return [(f"{file}, line {number}", line) for number, line in stripped if line and not line.startswith("#")]
+
+
+def _presented(headers: list[tuple[bytes, bytes]]) -> bytes | None:
+    for name, value in headers:
+        if name == b"authorization":
+            scheme, _, key = value.partition(b" ")
+            if scheme.lower() in SCHEMES:
+                return key.strip()
+        elif name == b"x-api-key":
+            return value.strip()
+    return None

@@ -1,0 +1,453 @@
+"""The Open Inference Protocol v2 over HTTP, with binary tensors: what Triton's and KServe's clients speak.
+
+A policy is a model with the contract's inputs and one output, `action`; every call is for a batch, as the protocol's
+shapes say. The request parameters `explore`, `seed`, `seq` and `deadline_ms` mean what they mean in the JSON protocol.
+It knows HTTP's headers and the protocol's documents; tensors are `tensors.py`'s, decisions the core's.
+
+Specification: github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+import orjson
+from fastapi import FastAPI, Request
+from fastapi.responses import Response
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.types import Scope
+
+from rlservo.export.bundle import Contract, TensorSpec
+from rlservo.export.errors import MediaTypeError, ObservationError, RequestError
+from rlservo.serve_app import wire
+from rlservo.serve_app.core import Core
+from rlservo.serve_app.edge import JSON_HEADERS, BareRoute, Body, Endpoint, Headers, error_models, read_body, too_large
+from rlservo.serve_app.store import Decision
+from rlservo.serve_app.tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor
+
+INFER_PATTERN = re.compile(r"/v2/models/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/infer")
+LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
+BINARY = b"application/octet-stream"
+PLATFORM = "onnx_onnxv1"
+OUTPUT = "action"
+EXTENSIONS = ("binary_tensor_data", "parameters")
+REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
+# What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
+PARAMETERS = frozenset({*wire.OPTIONS, "binary_data_output", "sequence_id", "sequence_start", "sequence_end"})
+TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
+IGNORED = frozenset({"priority", TIMEOUT, "headers", "content_type"})
+SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits one packet either way
+COMPRESSION_LEVEL = 1  # numbers of a robot hardly compress; a control loop waits for them
+SUCH_AS = '{"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [...]}]}'
+
+
+class Tensor(BaseModel):
+    """A tensor, in JSON or (with the parameter `binary_data_size`) as bytes after the JSON."""
+
+    name: str
+    shape: list[int]
+    datatype: str = Field(description="One of " + ", ".join(DTYPES))
+    parameters: dict[str, Any] | None = None
+    data: list[Any] | None = Field(None, description="Nested or flat, in row-major order.")
+
+
+class InferRequest(BaseModel):
+    """Ask for a batch of actions."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    id: str | None = Field(None, description="Echoed.")
+    parameters: dict[str, Any] | None = Field(
+        None, description="`explore`, `seed`, `seq`, `deadline_ms`, `binary_data_output`."
+    )
+    inputs: list[Tensor]
+    outputs: list[dict[str, Any]] | None = Field(
+        None, description='`[{"name": "action", "parameters": {"binary_data": true}}]` for bytes after the JSON.'
+    )
+
+
+class InferReply(BaseModel):
+    """A batch of actions, ready for the environment's `step`."""
+
+    model_name: str
+    model_version: str
+    id: str | None = None
+    parameters: dict[str, Any]
+    outputs: list[Tensor]
+
+
+class ServerMetadata(BaseModel):
+    name: str
+    version: str
+    extensions: list[str]
+
+
+class TensorMetadata(BaseModel):
+    name: str
+    datatype: str
+    shape: list[int] = Field(description="-1 is the batch.")
+
+
+class ModelMetadata(BaseModel):
+    name: str
+    versions: list[str]
+    platform: str
+    inputs: list[TensorMetadata]
+    outputs: list[TensorMetadata]
+
+
+class ModelState(BaseModel):
+    """A line of the repository index."""
+
+    name: str
+    version: str
+    state: str
+    reason: str
+
+
+def endpoint(core: Core) -> Endpoint:
+    """Return the endpoint that answers inference requests."""
+    return Endpoint("oip", _Infer(core), _check_headers, core)
+
+
+class _Infer:
+    """Answers inference requests: JSON and raw tensors in, JSON and raw tensors out."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+
+    def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
+        params, encoding, accepted, length = scope["path_params"], b"", b"", None
+        contract = self._core.store().get(params["name"], params.get("version")).contract
+        for name, value in scope["headers"]:
+            if name == LENGTH_HEADER:
+                length = _read_length(value)
+            elif name == b"content-encoding":
+                encoding = value.strip().lower()
+            elif name == b"accept-encoding":
+                accepted = value.lower()
+        if encoding not in (b"", b"identity"):
+            body = _decompress(body, encoding, self._core.settings.max_body_bytes)
+        view = memoryview(body)
+        if length == 0 and len(view):
+            document: dict[str, Any] = {}
+            inputs, non_finite = {contract.inputs[0].name: _raw_input(contract, view)}, False
+        else:
+            document, inputs, non_finite = _read_request(view, length)
+        parameters = document.get("parameters") or {}
+        explore, seed, seq, deadline_ms = _options(parameters) if parameters else (False, None, None, None)
+        binary = _wants_binary(document, parameters)
+        obs = _observation(contract, inputs)
+        decision = self._core.act(
+            params["name"],
+            params.get("version"),
+            obs,
+            received=received,
+            explore=explore,
+            seed=seed,
+            seq=seq,
+            deadline_ms=deadline_ms,
+        )
+        if non_finite:
+            wire.refuse_non_finite()
+        content, headers = _encode_reply(decision, document.get("id"), seq, binary=binary)
+        if accepted and len(content) >= SMALLEST_COMPRESSED:
+            content, headers = _compress(content, headers, accepted)
+        return content, headers, decision
+
+
+def _encode_reply(
+    decision: Decision, request_id: str | None, seq: int | None, *, binary: bool
+) -> tuple[bytes, Headers]:
+    tensor, raw = write_tensor(OUTPUT, decision.action, binary=binary)
+    parameters: dict[str, Any] = {"infer_ms": round(decision.infer_ms, 4)}
+    if seq is not None:
+        parameters["seq"] = seq
+    reply: dict[str, Any] = {"model_name": decision.name, "model_version": decision.version, "parameters": parameters}
+    if request_id is not None:
+        reply["id"] = request_id
+    reply["outputs"] = [tensor]
+    content = orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
+    if not binary:
+        return content, JSON_HEADERS
+    return content + raw, ((b"content-type", BINARY), (LENGTH_HEADER, b"%d" % len(content)))
+
+
+def _read_request(view: memoryview, length: int | None) -> tuple[dict[str, Any], dict[str, NDArray[Any]], bool]:
+    """Return (the JSON document, the inputs by name, whether the JSON held NaN)."""
+    if length is not None and length > len(view):
+        raise RequestError(f"Inference-Header-Content-Length is {length}, and the body has {len(view)} bytes")
+    header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
+    document, non_finite = wire.read_json(header, such_as=SUCH_AS)
+    unknown = sorted(document.keys() - REQUEST_FIELDS)
+    if unknown:
+        raise RequestError(f"unknown field '{unknown[0][:64]}': known are {', '.join(sorted(REQUEST_FIELDS))}")
+    if document.get("id") is not None and type(document["id"]) is not str:
+        raise RequestError(f"'id' must be a string, got {wire.json_type(document['id'])}")
+    if document.get("parameters") is not None and type(document["parameters"]) is not dict:
+        raise RequestError(f"'parameters' must be an object, got {wire.json_type(document['parameters'])}")
+    tensors = document.get("inputs")
+    if type(tensors) is not list or not tensors:
+        raise RequestError(f"'inputs' must be a list of tensors: send {SUCH_AS}")
+    inputs: dict[str, NDArray[Any]] = {}
+    offset = 0
+    for tensor in tensors:
+        name, array, offset = read_tensor(tensor, raw, offset)
+        if name in inputs:
+            raise RequestError(f"input '{name[:64]}' is there twice")
+        inputs[name] = array
+    if offset != len(raw):
+        raise RequestError(f"the body has {len(raw) - offset} bytes after the last tensor's data")
+    return document, inputs, non_finite
+
+
+def _raw_input(contract: Contract, view: memoryview) -> NDArray[Any]:
+    """Read a body without any JSON: the one input's bytes; the batch is whatever they amount to."""
+    if len(contract.inputs) != 1:
+        names = ", ".join(tensor.name for tensor in contract.inputs)
+        raise RequestError(f"a body without JSON is for models of one input; this one has {names}")
+    tensor = contract.inputs[0]
+    dtype = DTYPES[datatype_of(tensor.dtype)]
+    row = dtype.itemsize * int(np.prod(tensor.shape[1:]))
+    if len(view) % row:
+        raise ObservationError(
+            f"input '{tensor.name}' is of {row} bytes per observation, and the body has {len(view)}: not a multiple"
+        )
+    return from_bytes(view, (len(view) // row, *tensor.shape[1:]), dtype)
+
+
+def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    """Return the policy's observation batch out of the named inputs."""
+    expected = contract.inputs[0]
+    unknown = sorted(inputs.keys() - {expected.name})
+    if unknown or expected.name not in inputs:
+        wrong = f"has no input '{unknown[0][:64]}'" if unknown else "did not get it"
+        raise ObservationError(f"policy '{contract.name}' has the input '{expected.name}' and {wrong}")
+    array = inputs[expected.name]
+    if array.shape[1:] != expected.shape[1:] or array.ndim != len(expected.shape):
+        raise ObservationError(
+            f"policy '{contract.name}' expects input '{expected.name}' of shape {list(expected.shape)} "
+            f"(-1 is the batch), got {list(array.shape)}",
+            {"policy": contract.name, "expected_shape": list(expected.shape), "shape": list(array.shape)},
+        )
+    return array
+
+
+def _options(parameters: Mapping[str, Any]) -> tuple[bool, int | None, int | None, float | None]:
+    """Return (explore, seed, seq, deadline_ms); refuse what would otherwise be ignored in silence."""
+    for name in parameters:
+        if name not in PARAMETERS and name not in IGNORED:
+            raise RequestError(
+                f"unknown parameter '{name[:64]}': known are {', '.join(sorted(PARAMETERS | IGNORED))}",
+                {"known": sorted(PARAMETERS | IGNORED)},
+            )
+    if parameters.get("sequence_id") not in (None, 0, ""):
+        raise RequestError("'sequence_id' is for recurrent policies; this one keeps no state: leave it out")
+    explore, seed, seq, deadline_ms = wire.read_options(parameters)
+    timeout_us = wire.read_integer(parameters, TIMEOUT)
+    if deadline_ms is None and timeout_us:
+        deadline_ms = timeout_us / 1e3
+    return explore, seed, seq, deadline_ms
+
+
+def _wants_binary(document: Mapping[str, Any], parameters: Mapping[str, Any]) -> bool:
+    """Whether the one output is to be binary. Raises RequestError for outputs that do not exist."""
+    binary = flag(parameters, "binary_data_output") if parameters else None
+    outputs = document.get("outputs")
+    if not outputs:
+        return bool(binary)
+    if type(outputs) is not list:
+        raise RequestError(f"'outputs' must be a list of {{\"name\": ...}}, got {wire.json_type(outputs)}")
+    for output in outputs:
+        if type(output) is not dict or output.get("name") != OUTPUT:
+            given = wire.json_type(output.get("name") if type(output) is dict else output)
+            raise RequestError(f"an output {given} does not exist: the model's output is '{OUTPUT}'")
+        own = output.get("parameters") or {}
+        if type(own) is not dict:
+            raise RequestError(f"an output's 'parameters' must be an object, got {wire.json_type(own)}")
+        refused = next((name for name in ("classification", "shared_memory_region") if name in own), None)
+        if refused is not None:
+            raise RequestError(f"the output parameter '{refused}' is not offered: leave it out")
+        chosen = flag(own, "binary_data")
+        binary = binary if chosen is None else chosen
+    return bool(binary)
+
+
+# Bytes: lengths and compression.
+
+
+def _check_headers(headers: list[tuple[bytes, bytes]]) -> None:
+    """Triton's client names no content type, others name JSON or octets: the length header is what tells them apart."""
+    for name, value in headers:
+        if name == b"content-encoding" and value.strip().lower() not in (b"identity", b"gzip", b"deflate", b""):
+            raise MediaTypeError(
+                f"the content encoding '{value[:32].decode('latin-1')}' is not read: send gzip, deflate or none"
+            )
+
+
+def _read_length(value: bytes) -> int:
+    if not value.isdigit() or len(value) > 15:
+        raise RequestError(
+            f"Inference-Header-Content-Length must be the JSON's length, got '{value[:32].decode('latin-1')}'"
+        )
+    return int(value)
+
+
+def _decompress(body: Body, encoding: bytes, limit: int) -> bytes:
+    """Undo gzip or deflate, to `limit` bytes at most: a few kilobytes can unpack to gigabytes."""
+    try:
+        stream = zlib.decompressobj(zlib.MAX_WBITS | (16 if encoding == b"gzip" else 0))
+        plain = stream.decompress(body, limit + 1)
+    except zlib.error as error:
+        raise RequestError(f"the body is not {encoding.decode()}: {error}") from None
+    if len(plain) > limit:
+        raise too_large(limit)
+    if not stream.eof or stream.unused_data:
+        state = "incomplete" if not stream.eof else "followed by other bytes"
+        raise RequestError(f"the {encoding.decode()} body is {state}")
+    return plain
+
+
+def _compress(content: bytes, headers: Headers, accepted: bytes) -> tuple[bytes, Headers]:
+    """Compress for a client that asked for it with accept-encoding."""
+    offered = {part.split(b";")[0].strip() for part in accepted.split(b",") if b"q=0" not in part.replace(b"q=0.", b"")}
+    for encoding, bits in ((b"gzip", zlib.MAX_WBITS | 16), (b"deflate", zlib.MAX_WBITS)):
+        if encoding in offered:
+            stream = zlib.compressobj(COMPRESSION_LEVEL, wbits=bits)
+            headers += ((b"content-encoding", encoding), (b"vary", b"accept-encoding"))
+            return stream.compress(content) + stream.flush(), headers
+    return content, headers
+
+
+# What can be asked about the server and its models. FastAPI runs these: nobody asks a thousand times a second.
+
+
+def add_routes(app: FastAPI, core: Core, infer: Endpoint) -> None:
+    """Add /v2 to the application."""
+    _add_health(app, core)
+    _add_models(app, core)
+    for path, operation, summary in (
+        ("/v2/models/{name}/infer", "infer", "Infer with the newest version"),
+        ("/v2/models/{name}/versions/{version}/infer", "infer_version", "Infer with one version"),
+    ):
+        app.router.routes.append(
+            BareRoute(
+                path,
+                infer,
+                operation=operation,
+                tag="open inference protocol",
+                summary=summary,
+                reply=InferReply,
+                body={
+                    "application/json": {"schema": _request_schema()},
+                    "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+                },
+                responses=error_models(400, 404, 408, 413, 415, 422, 500, 503),
+            )
+        )
+
+
+def _request_schema() -> dict[str, Any]:
+    """The request's schema; the tensor's is already among the document's, through the reply."""
+    schema = InferRequest.model_json_schema(ref_template="#/components/schemas/{model}")
+    schema.pop("$defs")
+    return schema
+
+
+def _add_health(app: FastAPI, core: Core) -> None:
+    @app.get("/v2/health/live", tags=["health"], summary="The process answers (Open Inference Protocol)")
+    async def live() -> Response:
+        return _json({"live": True})
+
+    @app.get(
+        "/v2/health/ready", tags=["health"], summary="The policies are loaded and proven", responses=error_models(503)
+    )
+    async def ready() -> Response:
+        core.store()
+        return _json({"ready": True})
+
+
+def _add_models(app: FastAPI, core: Core) -> None:
+    tags: list[Any] = ["open inference protocol"]
+    errors = error_models(404, 503)
+
+    @app.get("/v2", tags=tags, summary="The server and the extensions it speaks", response_model=ServerMetadata)
+    async def server() -> Response:
+        return _json({"name": "rlservo", "version": _version(), "extensions": EXTENSIONS})
+
+    @app.get("/v2/models/{name}", tags=tags, summary="A model", response_model=ModelMetadata, responses=errors)
+    async def model(name: str) -> Response:
+        return _json(_metadata(core, name, None))
+
+    @app.get(
+        "/v2/models/{name}/versions/{version}",
+        tags=tags,
+        summary="One version of a model",
+        response_model=ModelMetadata,
+        responses=errors,
+    )
+    async def model_version(name: str, version: str) -> Response:
+        return _json(_metadata(core, name, version))
+
+    @app.get("/v2/models/{name}/ready", tags=tags, summary="The model is loaded and proven", responses=errors)
+    async def model_ready(name: str) -> Response:
+        return _json({"name": core.store().get(name).contract.name, "ready": True})
+
+    @app.get("/v2/models/{name}/versions/{version}/ready", tags=tags, summary="The version is loaded", responses=errors)
+    async def model_version_ready(name: str, version: str) -> Response:
+        return _json({"name": core.store().get(name, version).contract.name, "ready": True})
+
+    @app.post(
+        "/v2/repository/index",
+        tags=tags,
+        summary="Every version of every model",
+        response_model=list[ModelState],
+        responses=error_models(400, 408, 413, 503),
+    )
+    async def index(request: Request) -> Response:
+        settings = core.settings
+        body = await read_body(request.receive, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+        if body:
+            document, _ = wire.read_json(body, such_as='{"ready": true}')
+            flag(document, "ready")  # all that are here are ready
+        store = core.store()
+        return _json(
+            [
+                {"name": name, "version": version, "state": "READY", "reason": ""}
+                for name in store.names
+                for version in store.versions(name)
+            ]
+        )
+
+
+def _metadata(core: Core, name: str, version: str | None) -> dict[str, Any]:
+    contract = core.store().get(name, version).contract
+    versions = core.store().versions(name) if version is None else (contract.version,)
+
+    def described(tensor: TensorSpec) -> dict[str, Any]:
+        return {"name": tensor.name, "datatype": datatype_of(tensor.dtype), "shape": tensor.shape}
+
+    return {
+        "name": name,
+        "versions": versions,
+        "platform": PLATFORM,
+        "inputs": [described(tensor) for tensor in contract.inputs],
+        "outputs": [described(tensor) for tensor in contract.outputs if tensor.name == OUTPUT],
+    }
+
+
+def _version() -> str:
+    try:
+        return version("rlservo")
+    except PackageNotFoundError:  # run from a checkout that was never installed
+        return "0"
+
+
+def _json(document: Any) -> Response:
+    return Response(orjson.dumps(document), media_type="application/json")

@@ -1,0 +1,185 @@
+"""A WebSocket per robot: the openpi policy server's protocol, which its clients speak unchanged.
+
+On connecting the server sends one msgpack map, the metadata; then request and response alternate as binary frames. A
+request is `{"obs": ...}` with the JSON protocol's options, or the observation map itself, from element name to value.
+`actions` in the reply is a chunk of one action, `(1, ...)`, as openpi's clients expect; a batch of observations gets
+one chunk each. An error is a text frame with the JSON protocol's error body, then close 1011.
+
+It knows WebSockets as ASGI shows them; decisions are the core's. Source of the protocol:
+github.com/Physical-Intelligence/openpi, websocket_policy_server.py.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from starlette.types import Message, Receive, Scope, Send
+
+from rlservo.export.bundle import Contract
+from rlservo.export.errors import RequestError, RlservoError, TooLargeError, UnknownPolicyError
+from rlservo.serve_app import wire
+from rlservo.serve_app.arrays import pack, unpack
+from rlservo.serve_app.core import Core
+from rlservo.serve_app.edge import encode_bug, error_answer, status_of
+from rlservo.serve_app.keys import check_origin
+
+logger = logging.getLogger(__name__)
+
+STREAM_PATTERN = re.compile(r"/(?:v1/policies/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/stream)?")
+FAILED = 1011  # the close code openpi's server uses for every error
+KNOWN = frozenset({"obs", *wire.OPTIONS, "reset"})
+PROTOCOL = "websocket"
+NO_OPTIONS: dict[str, Any] = {}
+DENIAL = "websocket.http.response"  # the ASGI extension that answers an upgrade with an HTTP error
+
+
+class Stream:
+    """Answers WebSocket connections."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._max_bytes = core.settings.max_body_bytes
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection until the client closes it."""
+        name = ""
+        version: str | None = None
+        try:
+            check_origin(scope)
+            name, version = self._addressed(scope["path"].removeprefix(scope.get("root_path", "")))
+            contract = self._core.store().get(name, version).contract
+        except RlservoError as error:
+            self._core.failed(PROTOCOL, name, version, error.code)
+            await refuse(scope, receive, send, error)
+            return
+        await receive()  # websocket.connect
+        await send({"type": "websocket.accept"})
+        self._core.metrics.stream(name, 1)
+        try:
+            await send(_binary(pack(_metadata(contract))))
+            await self._answer(name, version, receive, send)
+        except RlservoError as error:
+            self._core.failed(PROTOCOL, name, version, error.code)
+            if status_of(error) >= 500:
+                logger.error("%s", error.message)
+            await _fail(send, error_answer(error)[1])
+        except Exception:
+            logger.exception("the stream of policy '%s' failed", name)
+            self._core.metrics.failed(PROTOCOL, "", "", "internal")
+            await _fail(send, encode_bug())
+        finally:
+            self._core.metrics.stream(name, -1)
+
+    async def _answer(self, name: str, version: str | None, receive: Receive, send: Send) -> None:
+        previous_ms: float | None = None
+        while True:
+            message = await receive()
+            received = time.perf_counter()
+            if message["type"] == "websocket.disconnect":
+                return
+            obs, options = self._read(message)
+            explore, seed, seq, deadline_ms = wire.read_options(options) if options else (False, None, None, None)
+            decision = self._core.act(
+                name, version, obs, received=received, explore=explore, seed=seed, seq=seq, deadline_ms=deadline_ms
+            )
+            timing = {"infer_ms": decision.infer_ms}
+            if previous_ms is not None:
+                timing["prev_total_ms"] = previous_ms
+            action = decision.action
+            reply: dict[str, Any] = {
+                "actions": action[None, ...] if decision.batch is None else action[:, None, ...],
+                "policy": decision.name,
+                "version": decision.version,
+                "server_timing": timing,
+            }
+            if seq is not None:
+                reply["seq"] = seq
+            await send(_binary(pack(reply)))
+            taken = time.perf_counter() - received
+            previous_ms = taken * 1e3
+            self._core.metrics.answered(PROTOCOL, decision, decision.batch or 1, taken)
+
+    def _addressed(self, path: str) -> tuple[str, str | None]:
+        """Return (policy, version) that a path means; `/` is the default policy."""
+        match = STREAM_PATTERN.fullmatch(path)
+        if match is None:
+            raise UnknownPolicyError(f"no stream is at {path[:200]}: connect to /v1/policies/NAME/stream")
+        if match["name"] is not None:
+            return match["name"], match["version"]
+        names = self._core.store().names
+        default = self._core.settings.default_policy or (names[0] if len(names) == 1 else None)
+        if default is None:
+            raise UnknownPolicyError(
+                f"this server has no default policy, but {', '.join(names)}: connect to /v1/policies/NAME/stream, or "
+                "set RLSERVO_DEFAULT_POLICY",
+                {"policies": list(names)},
+            )
+        return default, None
+
+    def _read(self, message: Message) -> tuple[Any, Mapping[str, Any]]:
+        """Return (observation, options) of one frame."""
+        content = message.get("bytes")
+        if content is None:
+            raise RequestError("the message is a text frame: send msgpack in a binary one")
+        if len(content) > self._max_bytes:
+            raise TooLargeError(f"the message is larger than {self._max_bytes} bytes", {"max_bytes": self._max_bytes})
+        document = unpack(content)
+        if type(document) is not dict:
+            raise RequestError(f"the message must be a map such as {{'obs': ...}}, got {type(document).__name__}")
+        if "obs" not in document:
+            return document, NO_OPTIONS  # element names and values
+        if len(document) == 1:
+            return document["obs"], NO_OPTIONS
+        unknown = sorted(str(key)[:64] for key in document.keys() - KNOWN)
+        if unknown:
+            raise RequestError(f"unknown field '{unknown[0]}': known are {', '.join(sorted(KNOWN))}")
+        return document["obs"], document
+
+
+def _metadata(contract: Contract) -> dict[str, Any]:
+    """What a client learns on connecting: who decides, and the whole contract."""
+    return {
+        "server": "rlservo",
+        "policy": contract.name,
+        "version": contract.version,
+        "control_rate_hz": contract.control_rate_hz,
+        "contract": contract.model_dump(mode="json"),
+    }
+
+
+async def refuse(scope: Scope, receive: Receive, send: Send, error: RlservoError) -> None:
+    """Answer a request with an error before anybody reads it.
+
+    A WebSocket's upgrade gets the same HTTP error; where the server cannot send one, it is accepted and fails in the
+    protocol's own way.
+    """
+    status, content, headers = error_answer(error)
+    if scope["type"] == "http":
+        headers += ((b"content-length", b"%d" % len(content)),)
+        await send({"type": "http.response.start", "status": status, "headers": list(headers)})
+        await send({"type": "http.response.body", "body": content})
+        return
+    await receive()  # websocket.connect
+    if DENIAL in scope.get("extensions", {}):
+        headers += ((b"content-length", b"%d" % len(content)),)
+        await send({"type": f"{DENIAL}.start", "status": status, "headers": list(headers)})
+        await send({"type": f"{DENIAL}.body", "body": content})
+        return
+    await send({"type": "websocket.accept"})
+    await _fail(send, content)
+
+
+async def _fail(send: Send, content: bytes) -> None:
+    try:
+        await send({"type": "websocket.send", "text": content.decode()})
+        await send({"type": "websocket.close", "code": FAILED, "reason": "see the text frame"})
+    except (OSError, RuntimeError):  # the client has gone meanwhile: nobody is left to tell
+        logger.debug("a stream's client went before its error could be sent")
+
+
+def _binary(content: bytes) -> Message:
+    return {"type": "websocket.send", "bytes": content}
