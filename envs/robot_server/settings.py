@@ -88,8 +88,8 @@ class URSettings(Common):
             object_model(name)
         if not mode.objects <= len(objects) <= MAX_OBJECTS:
             raise ValueError(
-                f"rs_mode {self.rs_mode!r} tells of {mode.objects} objects, and there are {len(objects)}: "
-                f"expected {mode.objects} to {MAX_OBJECTS}"
+                f"rs_mode {self.rs_mode!r} needs {mode.objects} to {MAX_OBJECTS} objects, and there are {len(objects)}"
+                " (a launch line has them with objects_controller:=true n_objects:=... object_0_model_name:=...)"
             )
 
     @property

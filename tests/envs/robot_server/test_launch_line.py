@@ -93,7 +93,7 @@ def test_mir100_and_two_object_lines_are_understood() -> None:
         (f"{UR} ur_model:=ur5 real_robot:=true", "real_robot:=true is not simulated: expected real_robot:=false"),
         (f"{UR} ur_model:=ur5 object_trajectory_file_name:=splines_ur5", "splines_ur5 is not simulated"),
         (f"{UR} ur_model:=ur5 z:=1.0", "z:=1.0 is not simulated: expected z:=0.1"),
-        (f"{UR} ur_model:=ur5 rs_mode:=1object", "rs_mode '1object' tells of 1 objects, and there are 0"),
+        (f"{UR} ur_model:=ur5 rs_mode:=1object", "rs_mode '1object' needs 1 to 10 objects, and there are 0"),
         (f"{UR} ur_model:=ur5 objects_controller:=true n_objects:=1", "object_0_model_name is missing"),
         (f"{UR} ur_model:=ur5 objects_controller:=true n_objects:=1e9", "n_objects is 1e.09: expected a whole number"),
         (
