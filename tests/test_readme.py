@@ -71,7 +71,7 @@ def test_commands_run_as_written(checkout: Path) -> None:
             time.sleep(0.5)
         answer = run(curl)
         assert re.search(r'"action":\[(-?[\d.e-]+,){4}-?[\d.e-]+\].*"policy":"ur5"', answer)
-        # Random targets, of which the policy reaches 99.4 %: fewer than 18 of 20 would be one run in ten thousand.
+        # Random targets, of which the policy reaches 99.4 %: fewer than 18 of 20 would be one run in thousands.
         found = re.search(r"success: (\d+)", run(rollout))
         assert found is not None
         assert int(found.group(1)) >= 18
