@@ -9,6 +9,7 @@ import ctypes.util
 import json
 import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import Enum
@@ -99,13 +100,21 @@ def _root(show_version: Annotated[bool, typer.Option("--version", help="Print th
 
 @app.command()
 def export(
-    checkpoint: Annotated[Path, typer.Argument(help="RLlib checkpoint folder (or a Tune trial folder: its newest).")],
+    checkpoint: Annotated[
+        str, typer.Argument(help="RLlib checkpoint folder (of a Tune trial the newest), or a URI such as s3://...")
+    ],
     out: Annotated[Path, typer.Option(help="Repository folder; the bundle goes to OUT/<name>/<version>/.")],
     name: Annotated[str | None, typer.Option(help="Policy name; the environment's by default.")] = None,
     version: Annotated[str | None, typer.Option(help="Integer or x.y.z; the next integer by default.")] = None,
     description: Annotated[str, typer.Option(help="A sentence for people, kept in the contract.")] = "",
     module_id: Annotated[
         str | None, typer.Option(help="Which RLModule (old API stack: policy); needed when there are several.")
+    ] = None,
+    all_modules: Annotated[
+        bool, typer.Option("--all-modules", help="Export every module, each to OUT/<name>-<module>; all or none.")
+    ] = False,
+    agent_id: Annotated[
+        str | None, typer.Option(help="For which agent, where a module serves several that are filtered differently.")
     ] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
     metric: Annotated[
@@ -119,31 +128,62 @@ def export(
     Examples: `rlservo export examples/checkpoints/ur5_positioning --out policies`,
     `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
     """
-    with _extra("train"):
+    started = time.perf_counter()
+    if all_modules and (module_id is not None or agent_id is not None):
+        raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
+    with _err.status("importing") as status, _extra("train"):
         from rlservo.export.experiment import best_checkpoint
-        from rlservo.export.exporter import LOADING_RUNS_CODE, export_checkpoint
-        from rlservo.export.report import export_report
+        from rlservo.export.exporter import LOADING_RUNS_CODE, export_all_modules, export_checkpoint
+        from rlservo.export.remote import fetched
+        from rlservo.export.report import export_report, peak_memory_mb
 
-    if metric is not None:
-        _note(LOADING_RUNS_CODE.format(path=checkpoint))
-        best = best_checkpoint(checkpoint, metric, mode.value, app_dir=app_dir, notify=_note)
-        _note(f"{best.path} has the {mode.value} {metric}: {best.score:g}")
-        checkpoint = best.path
-    result = export_checkpoint(
-        checkpoint,
-        out,
-        name=name,
-        version=version,
-        description=description,
-        module_id=module_id,
-        app_dir=app_dir,
-        notify=_note,
-    )
+        with fetched(checkpoint, status.update) as local:
+            found: str | Path = checkpoint
+            if metric is not None:
+                _note(LOADING_RUNS_CODE.format(path=checkpoint))
+                best = best_checkpoint(local, metric, mode.value, app_dir=app_dir, notify=_note)
+                _note(f"{best.path} has the {mode.value} {metric}: {best.score:g}")
+                found = best.path
+            elif local != Path(checkpoint):
+                found = local
+            if all_modules:
+                results = export_all_modules(
+                    found,
+                    out,
+                    name=name,
+                    version=version,
+                    description=description,
+                    app_dir=app_dir,
+                    notify=_note,
+                    progress=status.update,
+                )
+            else:
+                results = [
+                    export_checkpoint(
+                        found,
+                        out,
+                        name=name,
+                        version=version,
+                        description=description,
+                        module_id=module_id,
+                        agent_id=agent_id,
+                        app_dir=app_dir,
+                        notify=_note,
+                        progress=status.update,
+                    )
+                ]
+    cost = {"seconds": round(time.perf_counter() - started, 2), "peak_memory_mb": round(peak_memory_mb())}
     if as_json:
-        _print_json({"path": str(result.path), "contract": result.contract.model_dump(mode="json")})
-    else:
+        documents = [
+            {"path": str(result.path), "contract": result.contract.model_dump(mode="json"), **cost}
+            for result in results
+        ]
+        _print_json(documents if all_modules else documents[0])
+        return
+    for result in results:
         _out.print(export_report(result.contract), soft_wrap=True)
         _out.print(f"written   {result.path}", markup=False, highlight=False, soft_wrap=True)
+    _out.print(f"cost      {cost['seconds']:.1f} s, {cost['peak_memory_mb']} MB at the peak", highlight=False)
 
 
 @app.command()

@@ -256,6 +256,7 @@ class Provenance(_Model):
     algorithm: str
     api_stack: Literal["new", "old"]
     module_id: str
+    agent_id: str | None = Field(default=None, description="For which agent of a multi-agent environment")
     module_class: str
     checkpoint_sha256: str = Field(description="Hash over the checkpoint files that were read")
     training_iterations: int | None = None

@@ -19,7 +19,6 @@ import torch
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
-from ray.rllib.connectors.connector_pipeline_v2 import ConnectorPipelineV2
 from ray.rllib.connectors.env_to_module.env_to_module_pipeline import EnvToModulePipeline
 from ray.rllib.connectors.module_to_env.module_to_env_pipeline import ModuleToEnvPipeline
 from ray.rllib.core.columns import Columns
@@ -27,7 +26,6 @@ from ray.rllib.core.rl_module.apis import InferenceOnlyAPI, QNetAPI, ValueFuncti
 from ray.rllib.core.rl_module.rl_module import RLModule
 from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
-from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from torch import Tensor, nn
 
 from rlservo.export.connectors import check_spaces, read_action_steps, read_observation_steps
@@ -36,6 +34,7 @@ from rlservo.export.facts import read_config
 from rlservo.export.heads import replace_heads
 from rlservo.export.location import CTOR_FILE, STATE_STEMS, CheckpointFiles
 from rlservo.export.modes import find_mode
+from rlservo.export.pipelines import Pipelines, find_seat, own_copy, pipelines_of
 from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.samples import Inputs, draw_batches
 from rlservo.export.trees import Tree, build, build_like, is_nested, map_tree, named_leaves, space_leaves, tree_leaves
@@ -107,46 +106,6 @@ class Network(nn.Module):
         return (*ready, *found.values(), *after)
 
 
-@dataclass(frozen=True)
-class Pipelines:
-    """RLlib's own way from an observation to an action."""
-
-    module: Any
-    env_to_module: ConnectorPipelineV2
-    module_to_env: ConnectorPipelineV2
-    observation_space: Any
-    action_space: Any
-
-    def to_module(self, episodes: list[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return (the module's batch, what the pipelines tell each other)."""
-        shared: dict[str, Any] = {}
-        with torch.no_grad():
-            batch = self.env_to_module(
-                rl_module=self.module, batch={}, episodes=episodes, explore=False, shared_data=shared
-            )
-        return batch, shared
-
-    def forward(self, batch: dict[str, Any]) -> dict[str, Any]:
-        """Return what the module gives for its batch, which it may change."""
-        with torch.no_grad():
-            given: dict[str, Any] = self.module.forward_inference(_own(batch))
-        return given
-
-    def to_env(self, given: dict[str, Any], episodes: list[Any], shared: dict[str, Any]) -> dict[str, Any]:
-        """Return what comes out for the environment and for the episodes."""
-        with torch.no_grad():
-            sent: dict[str, Any] = self.module_to_env(
-                rl_module=self.module, batch=given, episodes=episodes, explore=False, shared_data=shared
-            )
-        return sent
-
-    def begin(self, obs: Any) -> Any:
-        """Return an episode that has just been reset."""
-        episode = SingleAgentEpisode(observation_space=self.observation_space, action_space=self.action_space)
-        episode.add_env_reset(observation=obs)
-        return episode
-
-
 class RllibLoop:
     """RLlib acting step after step, as `SingleAgentEnvRunner._sample` does it (ray 2.60): exploration off."""
 
@@ -168,9 +127,7 @@ class RllibLoop:
                 self._episodes[row] = self._pipelines.begin(obs)
             else:
                 action, extra = self._last[row]
-                self._episodes[row].add_env_step(
-                    observation=obs, action=action, reward=float(rewards[row]), extra_model_outputs=extra
-                )
+                self._pipelines.advance(self._episodes[row], obs, action, float(rewards[row]), extra)
         # RLlib's log-probability of a nested deterministic action does not fit more than one environment (ray 2.60):
         # there, it acts for one at a time.
         alone = is_nested(self._recipe.action_space)
@@ -201,9 +158,9 @@ class RllibLoop:
         with torch.no_grad():
             for name in self._network.names:
                 if name == "value":
-                    tensor = module.compute_values(_own(batch))
+                    tensor = module.compute_values(own_copy(batch))
                 elif name == "q_values":
-                    tensor = module.compute_q_values(_own(batch))[QF_PREDS]
+                    tensor = module.compute_q_values(own_copy(batch))[QF_PREDS]
                 else:
                     tensor = given[Columns.ACTION_DIST_INPUTS]
                 found[name] = (tensor.squeeze(1) if stateful else tensor).numpy().copy()
@@ -211,11 +168,6 @@ class RllibLoop:
         for leaf, tensor in zip(self._recipe.network_state, after, strict=True):
             found[f"state_out.{leaf.name}"] = tensor.numpy().copy()
         return found
-
-
-def _own(batch: dict[str, Any]) -> dict[str, Any]:
-    """Return the same tensors in dicts that a user's forward may change."""
-    return {key: map_tree(lambda leaf: leaf, value) for key, value in batch.items()}
 
 
 def _pick(tree: Tree, row: int) -> Tree:
@@ -230,6 +182,7 @@ class Checkpoint:
     network: Network
     module_class: str
     pipelines: Pipelines
+    agent_id: str | None = None
 
     def reference(self, inputs: Inputs) -> dict[str, NDArray[Any]]:
         """Return what RLlib computes for a batch of raw observations `[batch, ...]` by input name, by output name.
@@ -268,13 +221,14 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
         raise UnsupportedError(f"module {name} is not a torch RLModule: only torch modules are exported")
     module.eval().requires_grad_(False)
     no_value = _check_weights(files, module)
-    observation_space = env_to_module.input_observation_space
-    action_space: Any = module_to_env.input_action_space or module.action_space
+    seat = find_seat(files, env_to_module, module_to_env)
+    observation_space = seat.part(env_to_module.input_observation_space)
+    action_space: Any = seat.part(module_to_env.input_action_space) or module.action_space
     check_spaces(observation_space, action_space)
-    steps = read_observation_steps(env_to_module, files)
+    steps = read_observation_steps(env_to_module, files, seat)
     transform, action_steps = read_action_steps(module_to_env, action_space)
     state = _network_state(module)
-    pipelines = Pipelines(module, env_to_module, module_to_env, observation_space, action_space)
+    pipelines = pipelines_of(seat, module, env_to_module, module_to_env, observation_space, action_space)
     # What the module gives decides the rule, and asking it takes observations.
     asked = Recipe(observation_space, action_space, steps, "argmax", transform, None, state, action_steps)
     given = _forward_once(pipelines, asked)
@@ -289,7 +243,7 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
     traced = copy.deepcopy(module)
     replace_heads(traced)
     network = Network(traced, names, given=len(recipe.action_leaves) if mode == "given" else 0)
-    return Checkpoint(recipe, network, f"{type(module).__module__}.{name}", pipelines)
+    return Checkpoint(recipe, network, f"{type(module).__module__}.{name}", pipelines, seat.name)
 
 
 def _tell(recipe: Recipe, notify: Callable[[str], None]) -> None:

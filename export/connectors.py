@@ -7,6 +7,7 @@ where it offers `torch_forward`, a function of torch tensors `[batch, ...]` that
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,28 @@ HOOK = "torch_forward"
 DTYPES = ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
 
 
+@dataclass(frozen=True)
+class Seat:
+    """Whose part is read of pipelines that serve several agents; `agent` None where there is only one."""
+
+    agent: Any = None
+    module: str = ""
+
+    @property
+    def name(self) -> str | None:
+        """The agent's id as text."""
+        return None if self.agent is None else str(self.agent)
+
+    def part(self, space: Any) -> Any:
+        """Return the agent's own part of a space, which behind the mapping is its module's."""
+        if self.agent is None:
+            return space
+        return space[self.agent] if self.agent in space.spaces else space[self.module]
+
+
+ALONE = Seat()
+
+
 def check_spaces(observation_space: Any, action_space: Any) -> None:
     """Raise UnsupportedError unless every leaf of both spaces is of a kind that is exported."""
     for name, space in space_leaves(observation_space, "obs").items():
@@ -68,15 +91,17 @@ def check_spaces(observation_space: Any, action_space: Any) -> None:
             raise UnsupportedError(f"{name}: the action space {space} is not exported: only one-dimensional ones are")
 
 
-def read_observation_steps(env_to_module: Any, files: CheckpointFiles) -> tuple[ObservationStep, ...]:
-    """Return what the env-to-module pipeline does to an observation, and freeze the pipeline.
+def read_observation_steps(
+    env_to_module: Any, files: CheckpointFiles, seat: Seat = ALONE
+) -> tuple[ObservationStep, ...]:
+    """Return what the env-to-module pipeline does to an observation of whoever has the seat, and freeze the pipeline.
 
     Raises UnsupportedError for a piece that is not known, CheckpointError when a filter's statistics are missing.
     """
     steps: list[ObservationStep] = []
     taken_by = ""
     for piece in env_to_module.connectors:
-        step = _observation_step(piece, files)
+        step = _observation_step(piece, files, seat)
         name = type(piece).__name__
         if step is not None and taken_by:
             raise UnsupportedError(
@@ -122,25 +147,26 @@ def read_action_steps(module_to_env: Any, action_space: Any) -> tuple[Transform,
     return transform, tuple(steps)
 
 
-def _observation_step(piece: Any, files: CheckpointFiles) -> ObservationStep | None:
+def _observation_step(piece: Any, files: CheckpointFiles, seat: Seat) -> ObservationStep | None:
     """Return what an env-to-module piece does to an observation (None: nothing); freeze it while at it."""
     kind = type(piece)
     if not _is_rllibs(kind):
         return _user_step(piece, "env-to-module", "the network would see other numbers")
-    space = piece.input_observation_space
+    space = seat.part(piece.input_observation_space)
     if kind.__name__ == "MeanStdFilter":
         if not (files.env_to_module / kind.__name__).is_dir():
             raise CheckpointError(
                 f"{files.env_to_module / kind.__name__} is missing: the observation filter's statistics"
             )
         piece._update_stats = False  # a restored filter goes on learning from whatever it is shown
-        return None if isinstance(space, Discrete | MultiDiscrete) else _filter(piece, space)
+        return None if isinstance(space, Discrete | MultiDiscrete) else _filter(piece, space, seat)
     if kind.__name__ == "FlattenObservations":
-        return _flatten(piece, space)
+        skipped = seat.agent is not None and piece._agent_ids and seat.agent not in piece._agent_ids
+        return None if skipped else _flatten(piece, space)
     if kind.__name__ == "FrameStacking":
         return FrameStack(int(piece.num_frames), tuple(space.shape), str(space.dtype))
     if kind.__name__ == "PrevActionsPrevRewards":
-        choices = piece.input_action_space
+        choices = seat.part(piece.input_action_space)
         if not isinstance(choices, Discrete):
             raise UnsupportedError(
                 f"{kind.__name__} on the action space {choices} is not exported: RLlib's is Discrete"
@@ -183,14 +209,17 @@ def _user_step(piece: Any, pipeline: str, consequence: str) -> UserStep:
     )
 
 
-def _filter(piece: Any, space: Any) -> ObservationFilter:
+def _filter(piece: Any, space: Any, seat: Seat) -> ObservationFilter:
     if isinstance(space, Box) and np.dtype(space.dtype).kind == "u":
         raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib's result has no sign there and wraps")
     if not isinstance(space, Box | MultiBinary):
         raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib filters single arrays")
-    if set(piece.get_state()) != {None}:
-        raise UnsupportedError("MeanStdFilter is set up for several agents, which is not exported yet")
-    restored = piece._filters[None]
+    if seat.agent not in piece.get_state():
+        raise UnsupportedError(
+            "MeanStdFilter keeps no statistics for this agent: with several agents RLlib's own pipeline needs "
+            "MeanStdFilter(multi_agent=True), and with one it needs it without"
+        )
+    restored = piece._filters[seat.agent]
     stats = restored.running_stats
     mean, std = np.asarray(stats.mean, np.float64), np.asarray(stats.std, np.float32)
     if not (np.isfinite(mean).all() and np.isfinite(std).all()):

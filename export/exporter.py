@@ -7,13 +7,14 @@ there whole or not at all.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import datetime
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -33,13 +34,13 @@ from rlservo.export.bundle import (
     write_golden,
 )
 from rlservo.export.elements import read_elements
-from rlservo.export.errors import ParityError, UsageError
+from rlservo.export.errors import CheckpointError, ParityError, UsageError
 from rlservo.export.facts import CheckpointFacts, read_facts
-from rlservo.export.location import CheckpointFiles, locate_checkpoint
-from rlservo.export.naming import check_names, choose_target, default_name
-from rlservo.export.old_location import OldStackFiles
+from rlservo.export.location import Files, locate_checkpoint, locate_modules
+from rlservo.export.naming import bundle_name, check_names, choose_target, default_name
 from rlservo.export.parity import GraphLoop, Outputs, Recorded, Runner, prove, record, replay, ties
 from rlservo.export.recipe import Recipe
+from rlservo.export.remote import fetched, is_uri
 from rlservo.export.samples import BATCH_SIZES, Inputs, draw_batches
 from rlservo.export.spaces import space_spec, state_spec
 from rlservo.export.steps import baked_steps
@@ -55,12 +56,33 @@ SEED = 20240
 LOADING_RUNS_CODE = "loading {path}: checkpoints are pickles and run code when loaded; export only those you trust"
 
 
+Say: TypeAlias = Callable[[str], None]
+"""Takes one sentence for a person."""
+
+
+def _silent(_stage: str) -> None:
+    """Nobody watches the progress."""
+
+
 @dataclass(frozen=True)
 class ExportResult:
     """The bundle that was written."""
 
     path: Path
     contract: Contract
+
+
+@dataclass(frozen=True)
+class _Order:
+    """What all bundles of one export share."""
+
+    out: Path
+    name: str | None
+    version: str | None
+    description: str
+    value: bool
+    notify: Say
+    progress: Say
 
 
 def export_checkpoint(
@@ -71,56 +93,113 @@ def export_checkpoint(
     version: str | None = None,
     description: str = "",
     module_id: str | None = None,
+    agent_id: str | None = None,
     app_dir: str | Path = ".",
     value: bool = True,
-    notify: Callable[[str], None],
+    notify: Say,
+    progress: Say = _silent,
 ) -> ExportResult:
     """Export one policy of an RLlib checkpoint to `out/<name>/<version>/`.
 
-    `checkpoint` is what `locate_checkpoint` takes. `name` defaults to the environment's, `version` to the next integer
-    after the newest one present. `app_dir` holds the user's own classes, if the checkpoint needs any. `value` False
-    leaves the value head out, which costs a third of a small policy's time. `notify` gets one sentence for each thing
-    a person should know.
+    `checkpoint` is what `locate_checkpoint` takes, or a URI of such a folder. `name` defaults to the environment's (of
+    several policies with the module's behind it), `version` to the next integer after the newest one present.
+    `app_dir` holds the user's own classes, if the checkpoint needs any. `value` False leaves the value head out, which
+    costs a third of a small policy's time. `notify` gets one sentence for each thing a person should know, `progress`
+    what is being done.
 
     Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
     cannot be exported, ParityError when the graph does not give RLlib's own actions. Nothing is left behind then.
     """
-    files = locate_checkpoint(checkpoint, module_id)
-    check_names(name, version)
-    notify(LOADING_RUNS_CODE.format(path=files.root))
-    with user_code(app_dir):
-        facts = read_facts(files.root, notify)
-        name = name or default_name(facts.env_id, files.root)
-        target = choose_target(Path(out), name, version)
-        restored = _load(files, notify, value)
-        elements = read_elements(facts.env_id, facts.env_config, restored.recipe, notify)
-        with _temporary_folder(target) as folder, one_thread():
-            labels = [element.name for element in elements.action]
-            parity, golden = _write_graphs(folder, restored, labels, files.api_stack)
-            recipe = restored.recipe
-            contract = Contract(
-                name=name,
-                version=target.name,
-                description=description,
-                observation_space=space_spec(recipe.observation_space, elements.observation),
-                action_space=space_spec(recipe.action_space, elements.action, action=True),
-                inputs=tuple(_tensor(name, values) for name, values in golden.inputs.items()),
-                outputs=tuple(_tensor(output, values) for output, values in golden.outputs.items()),
-                state=tuple(state_spec(leaf) for leaf in recipe.state),
-                distribution=(
-                    Distribution(kind=recipe.distribution, transform=recipe.transform) if recipe.distribution else None
-                ),
-                baked_in=baked_steps(recipe, restored.module_class, restored.network.module),
-                control_rate_hz=elements.control_rate_hz,
-                provenance=_provenance(files, facts, restored),
-                parity=parity,
-            )
-            _write_rest(folder, contract, golden)
-            folder.rename(target)
-    return ExportResult(target, contract)
+    with fetched(checkpoint, progress) as local:
+        files = locate_checkpoint(local, module_id, agent_id)
+        order = _Order(Path(out), name, version, description, value, notify, progress)
+        return _export([files], order, app_dir, checkpoint)[0]
 
 
-def _load(files: CheckpointFiles | OldStackFiles, notify: Callable[[str], None], value: bool) -> Restored:
+def export_all_modules(
+    checkpoint: str | Path,
+    out: str | Path,
+    *,
+    name: str | None = None,
+    version: str | None = None,
+    description: str = "",
+    app_dir: str | Path = ".",
+    value: bool = True,
+    notify: Say,
+    progress: Say = _silent,
+) -> list[ExportResult]:
+    """Export every policy of a checkpoint, each to `out/<name>-<module id>/<version>/`: all of them, or none.
+
+    A module whose agents are treated differently gives a bundle an agent, `<name>-<module id>-<agent id>`. The rest is
+    as for `export_checkpoint`.
+    """
+    with fetched(checkpoint, progress) as local:
+        order = _Order(Path(out), name, version, description, value, notify, progress)
+        return _export(locate_modules(local), order, app_dir, checkpoint, name_all=True)
+
+
+def _export(
+    found: Sequence[Files], order: _Order, app_dir: str | Path, checkpoint: str | Path, *, name_all: bool = False
+) -> list[ExportResult]:
+    """Write a bundle for each of `found`; they get their names when all of them are proven."""
+    check_names(order.name, order.version)
+    root = found[0].root
+    order.notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else root))
+    with user_code(app_dir), contextlib.ExitStack() as folders:
+        order.progress("reading the checkpoint")
+        facts = read_facts(root, order.notify)
+        base = order.name or default_name(facts.env_id, root)
+        written: list[tuple[Path, ExportResult]] = []
+        waiting = list(found)
+        while waiting:
+            files = waiting.pop(0)
+            extended = files.is_one_of_several and (name_all or not order.name)
+            name = bundle_name(base, files.module_id, files.agent_id) if extended else base
+            try:
+                written.append(_build(files, facts, choose_target(order.out, name, order.version), order, folders))
+            except CheckpointError as error:
+                if not name_all or "agents" not in error.details:
+                    raise
+                waiting[:0] = [dataclasses.replace(files, agent_id=agent) for agent in error.details["agents"]]
+        for folder, result in written:
+            folder.rename(result.path)
+    return [result for _, result in written]
+
+
+def _build(
+    files: Files, facts: CheckpointFacts, target: Path, order: _Order, folders: contextlib.ExitStack
+) -> tuple[Path, ExportResult]:
+    """Return the finished bundle in a folder that only wants its name."""
+    order.progress(f"restoring '{files.module_id}' (importing torch and RLlib takes seconds)")
+    restored = _load(files, order.notify, order.value)
+    elements = read_elements(facts.env_id, facts.env_config, restored.recipe, order.notify)
+    folder = folders.enter_context(_temporary_folder(target))
+    with one_thread():
+        labels = [element.name for element in elements.action]
+        parity, golden = _write_graphs(folder, restored, labels, files.api_stack, order.progress)
+        recipe = restored.recipe
+        contract = Contract(
+            name=target.parent.name,
+            version=target.name,
+            description=order.description,
+            observation_space=space_spec(recipe.observation_space, elements.observation),
+            action_space=space_spec(recipe.action_space, elements.action, action=True),
+            inputs=tuple(_tensor(name, values) for name, values in golden.inputs.items()),
+            outputs=tuple(_tensor(output, values) for output, values in golden.outputs.items()),
+            state=tuple(state_spec(leaf) for leaf in recipe.state),
+            distribution=(
+                Distribution(kind=recipe.distribution, transform=recipe.transform) if recipe.distribution else None
+            ),
+            baked_in=baked_steps(recipe, restored.module_class, restored.network.module),
+            control_rate_hz=elements.control_rate_hz,
+            provenance=_provenance(files, facts, restored),
+            parity=parity,
+        )
+        _write_rest(folder, contract, golden)
+    return folder, ExportResult(target, contract)
+
+
+def _load(files: Files, notify: Callable[[str], None], value: bool) -> Restored:
     # Here and not at the top: torch and RLlib take seconds to import, and a wrong path should not have to wait for it.
     from rlservo.export.restore import restore
 
@@ -152,7 +231,9 @@ class _Golden:
     outputs: Outputs
 
 
-def _write_graphs(folder: Path, restored: Restored, labels: list[str], api_stack: str) -> tuple[Parity, _Golden]:
+def _write_graphs(
+    folder: Path, restored: Restored, labels: list[str], api_stack: str, progress: Say
+) -> tuple[Parity, _Golden]:
     """Write both formats, prove them, and return the proof and the golden vectors."""
     from rlservo.export.actor import PolicyGraph
     from rlservo.export.onnx import run_onnx, write_onnx
@@ -161,13 +242,16 @@ def _write_graphs(folder: Path, restored: Restored, labels: list[str], api_stack
     recipe = restored.recipe
     graph = PolicyGraph(recipe, restored.network)
     batches = draw_batches(recipe, SEED)
+    progress(f"asking RLlib itself for {sum(len(batch) for batch in batches):,} actions")
     recorded = record(restored.reference, batches, restored.loop)
     pair = next(batch for batch in batches if len(batch) == BATCH_SIZES[1])
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(len(pair), np.bool_))
+    progress("writing TorchScript and ONNX")
     write_torchscript(graph, example, folder / TORCHSCRIPT_FILE)
     write_onnx(graph, example, folder / ONNX_FILE)
     onnx = run_onnx(folder / ONNX_FILE)
     script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
+    progress("proving both against RLlib's actions")
     parity = prove(recipe, recorded, {"onnx": onnx, "torchscript": script}, labels, api_stack)
     inputs = _golden_inputs(recipe, recorded, onnx)
     outputs = onnx(inputs)
@@ -212,7 +296,7 @@ def _tensor(name: str, values: NDArray[Any]) -> TensorSpec:
     return TensorSpec(name=name, dtype=str(values.dtype), shape=(-1, *values.shape[1:]))
 
 
-def _provenance(files: CheckpointFiles | OldStackFiles, facts: CheckpointFacts, restored: Restored) -> Provenance:
+def _provenance(files: Files, facts: CheckpointFacts, restored: Restored) -> Provenance:
     import ray
     import torch
 
@@ -220,6 +304,7 @@ def _provenance(files: CheckpointFiles | OldStackFiles, facts: CheckpointFacts, 
         algorithm=facts.algorithm,
         api_stack=files.api_stack,
         module_id=files.module_id,
+        agent_id=restored.agent_id,
         module_class=restored.module_class,
         checkpoint_sha256=files.sha256(),
         training_iterations=facts.training_iterations,

@@ -10,10 +10,10 @@ import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeAlias
 
-from rlservo.export.errors import CheckpointError, UnsupportedError
-from rlservo.export.old_location import OldStackFiles, locate_policy, old_stack_root
+from rlservo.export.errors import CheckpointError
+from rlservo.export.old_location import OldStackFiles, locate_policy, old_stack_root, policy_ids
 
 MODULES = Path("learner_group") / "learner" / "rl_module"
 RUNNERS = ("env_runner", "eval_env_runner")
@@ -42,6 +42,13 @@ class CheckpointFiles:
     root: Path
     module_id: str
     alone: bool = False
+    agent_id: str | None = None
+    """The agent that was asked for, where the module serves several."""
+
+    @property
+    def is_one_of_several(self) -> bool:
+        """Whether the policy goes by an id of its own, and may have others beside it."""
+        return not self.alone and self.module_id != DEFAULT_MODULE
 
     @property
     def module(self) -> Path:
@@ -71,7 +78,14 @@ class CheckpointFiles:
         found = {file for folder in folders for file in folder.rglob("*") if file.is_file()}
         if not self.has_pipelines and not self.alone:
             found.add(self.root / CTOR_FILE)  # the configuration they are built from
+        if self.is_one_of_several and self.together.is_file():
+            found.add(self.together)
         return sorted(found)
+
+    @property
+    def together(self) -> Path:
+        """The file that says of which class the modules are parts."""
+        return self.root / MODULES / CTOR_FILE
 
     def sha256(self) -> str:
         """Return a hash over those files' names and contents: the same for a checkpoint and its pruned copy."""
@@ -82,7 +96,11 @@ class CheckpointFiles:
         return digest.hexdigest()
 
 
-def locate_checkpoint(path: str | Path, module_id: str | None = None) -> CheckpointFiles | OldStackFiles:
+Files: TypeAlias = CheckpointFiles | OldStackFiles
+"""Where one policy is, on either API stack."""
+
+
+def locate_checkpoint(path: str | Path, module_id: str | None = None, agent_id: str | None = None) -> Files:
     """Return the files of one policy.
 
     `path` may be an algorithm checkpoint of either API stack, a folder inside one (such as its RLModule or policy
@@ -102,12 +120,26 @@ def locate_checkpoint(path: str | Path, module_id: str | None = None) -> Checkpo
         _check_complete(alone)
         return alone
     if not (root / MODULES).is_dir():
+        if agent_id is not None:
+            raise CheckpointError(f"{root} is of the old API stack, whose policies filter alike for all their agents: "
+                                  "leave --agent-id out")  # fmt: skip
         return locate_policy(root, given, module_id)
     if root != given and (root / MODULES) in given.parents and module_id is None:
         module_id = given.relative_to(root / MODULES).parts[0]
-    files = CheckpointFiles(root, _choose_module(root, module_id))
+    files = CheckpointFiles(root, _choose_module(root, module_id), agent_id=agent_id)
     _check_complete(files)
     return files
+
+
+def locate_modules(path: str | Path) -> list[Files]:
+    """Return the files of every policy of a checkpoint, by module id (old API stack: policy id).
+
+    Raises what `locate_checkpoint` raises.
+    """
+    given = Path(path).expanduser().absolute()
+    root = _find_root(given) if given.is_dir() else given
+    ids = _present_modules(root) or policy_ids(root)
+    return [locate_checkpoint(root, module_id) for module_id in ids] or [locate_checkpoint(given)]
 
 
 def _find_root(given: Path) -> Path:
@@ -147,18 +179,23 @@ def _newest_checkpoint(folder: Path) -> Path | None:
     return max(numbered)[1] if numbered else None
 
 
+def _present_modules(root: Path) -> list[str]:
+    folder = root / MODULES
+    return sorted(child.name for child in folder.iterdir() if (child / CTOR_FILE).is_file()) if folder.is_dir() else []
+
+
 def _choose_module(root: Path, module_id: str | None) -> str:
-    present = sorted(child.name for child in (root / MODULES).iterdir() if (child / CTOR_FILE).is_file())
+    present = _present_modules(root)
     if module_id is not None and module_id not in present:
         raise CheckpointError(f"{root} has no module '{module_id}': it holds {', '.join(present) or 'none'}")
     if not present:
         raise CheckpointError(f"{root / MODULES} holds no module: looked for <module id>/{CTOR_FILE}")
-    if len(present) > 1:
-        raise UnsupportedError(
-            f"{root} is a multi-agent checkpoint (modules {', '.join(present)}), which is not exported yet: it would "
-            "need the agent-to-module mapping and each agent's own connectors"
+    if module_id is None and len(present) > 1:
+        raise CheckpointError(
+            f"{root} holds {len(present)} modules ({', '.join(present)}): name the one to export with --module-id, or "
+            "export each of them with --all-modules"
         )
-    return present[0]
+    return module_id or present[0]
 
 
 def _check_complete(files: CheckpointFiles) -> None:

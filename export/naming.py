@@ -21,6 +21,12 @@ def default_name(env_id: str | None, root: Path) -> str:
     return "-".join(word.lower() for word in words)[:64].strip("-") or "policy"
 
 
+def bundle_name(base: str, module_id: str, agent_id: str | None) -> str:
+    """Return the name of one policy of several: what is not allowed in a name becomes '-'."""
+    parts = [base, module_id, *([agent_id] if agent_id else [])]
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", "-".join(parts))[:64].rstrip("-.")
+
+
 def check_names(name: str | None, version: str | None) -> None:
     """Raise UsageError when a name or a version that was asked for cannot be one."""
     if name is not None and not re.fullmatch(NAME_PATTERN, name):

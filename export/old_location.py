@@ -17,6 +17,7 @@ from rlservo.export.errors import CheckpointError, UnsupportedError
 POLICIES = "policies"
 POLICY_STATE = "policy_state.pkl"
 ALGORITHM_STATE = "algorithm_state.pkl"
+DEFAULT_POLICY = "default_policy"
 
 _MARKER = "rllib_checkpoint.json"
 _MSGPACK_STATES = ("policy_state.msgpck", "policy_state.msgpack")
@@ -32,6 +33,12 @@ class OldStackFiles:
     """The algorithm checkpoint; the policy's own folder where that is all there is."""
     module_id: str
     """The policy's id, under the name the rest of the exporter has for it."""
+    agent_id: ClassVar[None] = None
+
+    @property
+    def is_one_of_several(self) -> bool:
+        """Whether the policy goes by an id of its own, and may have others beside it."""
+        return self.policy != self.root and self.module_id != DEFAULT_POLICY
 
     @property
     def policy(self) -> Path:
@@ -60,7 +67,7 @@ def old_stack_root(given: Path) -> Path | None:
     if given.parent.name == POLICIES:
         inside[POLICIES] = given.parent.parent
     for folder in (given, *inside.values()):
-        if _policy_ids(folder):
+        if policy_ids(folder):
             return folder
     if _has_state(given):
         return given
@@ -83,7 +90,7 @@ def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFil
 
     Raises CheckpointError when there is no such policy, or several to choose from.
     """
-    present = _policy_ids(root)
+    present = policy_ids(root)
     if not present:
         present = [policy_id or root.name]  # a policy's folder on its own, which does not tell its id
     elif given.parent == root / POLICIES and policy_id is None:
@@ -92,7 +99,8 @@ def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFil
         raise CheckpointError(f"{root} has no policy '{policy_id}': it holds {', '.join(present)}")
     if policy_id is None and len(present) > 1:
         raise CheckpointError(
-            f"{root} holds {len(present)} policies ({', '.join(present)}): name the one to export with --module-id"
+            f"{root} holds {len(present)} policies ({', '.join(present)}): name the one to export with --module-id, "
+            "or export each of them with --all-modules"
         )
     files = OldStackFiles(root, policy_id or present[0])
     if not files.state.is_file():
@@ -103,7 +111,8 @@ def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFil
     return files
 
 
-def _policy_ids(root: Path) -> list[str]:
+def policy_ids(root: Path) -> list[str]:
+    """Return the ids of the policies that an old-stack checkpoint holds; a policy's folder on its own holds none."""
     folder = root / POLICIES
     return sorted(child.name for child in folder.iterdir() if _has_state(child)) if folder.is_dir() else []
 

@@ -157,6 +157,7 @@ class OldStackCheckpoint:
     network: OldStackNetwork
     module_class: str
     _policy: Any
+    agent_id: None = None
 
     def reference(self, inputs: Inputs) -> dict[str, NDArray[Any]]:
         """Return what RLlib computes for a batch of raw observations `[batch, ...]` by input name, by output name.

@@ -5,6 +5,8 @@ It lays out what the contract says and judges nothing. Needs rich; no torch, ray
 
 from __future__ import annotations
 
+import resource
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -59,6 +61,12 @@ def export_report(contract: Contract) -> Text:
         f"baked in  {', '.join(step.step for step in contract.baked_in)}\n"
         f"proven    {contract.parity.samples:,} observations; largest relative difference to RLlib: {differences}"
     )
+
+
+def peak_memory_mb() -> float:
+    """Return the most memory this process has held so far [MB]."""
+    # Linux counts in KiB, macOS in bytes.
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
 
 
 def verification_report(parity: Parity, evaluation: Evaluation | None) -> RenderableType:

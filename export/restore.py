@@ -38,6 +38,11 @@ class Restored(Protocol):
     @property
     def module_class(self) -> str: ...
 
+    @property
+    def agent_id(self) -> str | None:
+        """For which agent of several; None where there is one."""
+        ...
+
     def reference(self, inputs: Inputs) -> dict[str, NDArray[Any]]:
         """Return what RLlib itself computes for raw observations `[batch, ...]` by input name, by output name."""
         ...

@@ -22,7 +22,7 @@ from rlservo.export.trees import space_leaves
 
 def baked_steps(recipe: Recipe, module_class: str, module: Any) -> tuple[BakedStep, ...]:
     """Return the contract's `baked_in` for a recipe and the torch module it surrounds."""
-    steps = [_observation_step(step) for step in recipe.steps]
+    steps = [observation_step(step) for step in recipe.steps]
     parameters = sum(weights.numel() for weights in module.parameters())
     recurrent = ", recurrent" if recipe.network_state else ""
     steps.append(
@@ -39,7 +39,8 @@ def baked_steps(recipe: Recipe, module_class: str, module: Any) -> tuple[BakedSt
     return tuple(steps)
 
 
-def _observation_step(step: ObservationStep) -> BakedStep:
+def observation_step(step: ObservationStep) -> BakedStep:
+    """Return the contract's form of one step before the network."""
     if isinstance(step, ObservationFilter):
         return _filter_step(step)
     if isinstance(step, Flatten):

@@ -12,7 +12,13 @@ FOLDERS = ("envs", "export", "serve_app", "deploy")
 
 # The one file (or folder) that may import a heavy library, by top-level module.
 ONLY_IN = {
-    "ray.rllib": ("export/checkpoint.py", "export/old_stack.py", "export/old_models.py", "examples/"),
+    "ray.rllib": (
+        "export/checkpoint.py",
+        "export/pipelines.py",
+        "export/old_stack.py",
+        "export/old_models.py",
+        "examples/",
+    ),
     "ray.serve": ("serve_app/app.py",),
     "fastapi": ("serve_app/http.py", "serve_app/edge.py", "serve_app/oip.py", "serve_app/docs.py", "serve_app/app.py"),
     "mujoco": ("envs/",),

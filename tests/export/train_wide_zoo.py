@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet
 import ray
+import torch
 from ray import tune
 from ray.rllib.algorithms.appo import APPOConfig
 from ray.rllib.algorithms.bc import BCConfig
@@ -26,10 +27,14 @@ from ray.rllib.algorithms.tqc import TQCConfig
 from ray.rllib.connectors.env_to_module import FlattenObservations, MeanStdFilter, PrevActionsPrevRewards
 from ray.rllib.connectors.env_to_module.frame_stacking import FrameStackingEnvToModule
 from ray.rllib.connectors.learner.frame_stacking import FrameStackingLearner
+from ray.rllib.core import COMPONENT_RL_MODULE
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.env import INPUT_ENV_SPACES
 from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
 from ray.rllib.examples.rl_modules.classes.autoregressive_actions_rlm import AutoregressiveActionsRLM
+from ray.rllib.offline.offline_data import OfflineData
+from ray.rllib.offline.offline_prelearner import OfflinePreLearner
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "app"), str(HERE)]
@@ -104,6 +109,36 @@ def recorded(folder: Path, action: str) -> str:
     return str(target)
 
 
+class RowsInProcess(OfflineData):
+    """RLlib's own preparation of recorded rows, in this process: Ray Data's workers take half a minute to start."""
+
+    def __init__(self, config: Any) -> None:
+        self.config = config
+        self.iter_batches_kwargs: dict[str, Any] = {}
+        table = pyarrow.parquet.read_table(f"{config.input_[0]}/rows.parquet")
+        self.rows = {name: np.array(table[name].to_pylist()) for name in table.column_names}
+
+    def sample(
+        self, num_samples: int, return_iterator: bool = False, num_shards: int = 1, module_state: Any = None
+    ) -> Any:
+        state = self.learner_handles[0].get_state(component=COMPONENT_RL_MODULE)[COMPONENT_RL_MODULE]
+        spaces = self.spaces[INPUT_ENV_SPACES]
+        prepare = OfflinePreLearner(config=self.config, spaces=spaces, module_spec=self.module_spec, module_state=state)
+        return [Batches(prepare, self.rows)]
+
+
+class Batches:
+    """The one method of a Ray Data iterator that a learner calls."""
+
+    def __init__(self, prepare: Any, rows: dict[str, Any]) -> None:
+        self.prepare = prepare
+        self.rows = rows
+
+    def iter_torch_batches(self, batch_size: int, device: Any = None, **_: Any) -> Any:
+        prepared = self.prepare({name: values[:batch_size] for name, values in self.rows.items()})
+        return [{name: torch.as_tensor(np.asarray(values)) for name, values in prepared.items()}]
+
+
 def offline(config: Any, data: str, action: str, **training: Any) -> Any:
     env = zoo_spaces.Spaces({"obs": "vector", "action": action})
     spaces_env(config, "vector", action)
@@ -111,8 +146,7 @@ def offline(config: Any, data: str, action: str, **training: Any) -> Any:
     config.offline_data(
         input_=[data],
         dataset_num_iters_per_learner=2,  # CQL's training step takes no batch, only an iterator (ray 2.60)
-        map_batches_kwargs={"concurrency": 1, "num_cpus": 0.5},
-        iter_batches_kwargs={"prefetch_batches": 0},
+        offline_data_class=RowsInProcess,
     )
     config.evaluation(evaluation_interval=1, evaluation_num_env_runners=0, evaluation_duration=1)
     config.learners(num_learners=0).training(train_batch_size_per_learner=32, **training)
@@ -174,7 +208,7 @@ def configurations(out: Path) -> dict[str, Any]:
 
 def main(out: Path, only: list[str]) -> None:
     tune.register_env("spaces", zoo_spaces.Spaces)
-    ray.init(num_cpus=2, include_dashboard=False, _temp_dir=str(out / "ray"), configure_logging=False)
+    ray.init(num_cpus=1, include_dashboard=False, _temp_dir=str(out / "ray"), configure_logging=False)
     try:
         for name, config in configurations(out).items():
             if only and name not in only:
