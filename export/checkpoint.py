@@ -67,12 +67,15 @@ class Network(nn.Module):
     Where the module computes its actions itself, their leaves come first; a recurrent one's next state comes last.
     """
 
-    def __init__(self, module: Any, names: tuple[str, ...], given: int = 0) -> None:
+    def __init__(
+        self, module: Any, names: tuple[str, ...], given: int = 0, rule: Callable[[Tensor], Tree] | None = None
+    ) -> None:
         super().__init__()
         self.module = module
         self.names = names
         self.given = given
-        """How many action leaves the module gives ready-made."""
+        """How many action leaves the module, or the distribution's own rule, gives ready-made."""
+        self._rule = rule
         self.state = module.get_initial_state() if module.is_stateful() else None
 
     def forward(self, obs: Tree, *state: list[Tensor]) -> tuple[Tensor, ...]:
@@ -98,7 +101,8 @@ class Network(nn.Module):
                 if name:
                     found[name] = given[Columns.ACTION_DIST_INPUTS]
         if self.given:
-            ready = tree_leaves(given[Columns.ACTIONS])
+            chosen = self._rule(given[Columns.ACTION_DIST_INPUTS].clone()) if self._rule else given[Columns.ACTIONS]
+            ready = tree_leaves(chosen)
         if stateful:
             after = tree_leaves(given[Columns.STATE_OUT])
             ready = [leaf.squeeze(1) for leaf in ready]
@@ -242,7 +246,9 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
             names = (*names, "value")
     traced = copy.deepcopy(module)
     replace_heads(traced)
-    network = Network(traced, names, given=len(recipe.action_leaves) if mode == "given" else 0)
+    given_leaves = len(recipe.action_leaves) if mode == "given" else 0
+    rule = _deterministic(module) if Columns.ACTION_DIST_INPUTS in names else None
+    network = Network(traced, names, given_leaves, rule)
     return Checkpoint(recipe, network, f"{type(module).__module__}.{name}", pipelines, seat.name)
 
 
@@ -359,11 +365,17 @@ def _action_rule(
             f"forward gives {', '.join(sorted(given))}"
         )
     kind = module.get_inference_action_dist_cls()
-    mode = find_mode(lambda probe: kind.from_logits(probe).to_deterministic().sample(), kind.__name__, action_space)
+    mode = find_mode(_deterministic(module), kind.__name__, action_space, given[Columns.ACTION_DIST_INPUTS])
     distribution = _distribution_kind(kind)
     if distribution is None:
         notify(f"the action distribution {kind.__name__} is not one of RLlib's: the export cannot explore with it")
     return distribution, mode, ("action_dist_inputs",)
+
+
+def _deterministic(module: Any) -> Callable[[Tensor], Tree]:
+    """Return what RLlib's `GetActions` does with the module's numbers while it does not explore (ray 2.60)."""
+    kind = module.get_inference_action_dist_cls()
+    return lambda inputs: kind.from_logits(inputs).to_deterministic().sample()
 
 
 def _distribution_kind(kind: Any) -> DistributionKind | None:

@@ -47,7 +47,7 @@ from rlservo.export.old_location import OldStackFiles
 from rlservo.export.old_models import register_custom_model
 from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.samples import Inputs
-from rlservo.export.trees import build, named_leaves, space_leaves
+from rlservo.export.trees import build, named_leaves, space_leaves, tree_leaves
 from rlservo.export.unpickle import explain, first_line, unpickle, user_folder
 
 DISTRIBUTIONS: dict[type, DistributionKind] = {
@@ -64,18 +64,20 @@ Q_VALUES = "q_values"
 class OldStackNetwork(nn.Module):
     """The policy's forward pass as a module that can be traced: network input to named tensors, then the next state."""
 
-    def __init__(self, policy: Any, names: tuple[str, ...]) -> None:
+    def __init__(self, policy: Any, names: tuple[str, ...], given: int = 0) -> None:
         super().__init__()
         self.module: Any = policy.model
         self.names = names
-        self.given = 0
+        self.given = given
+        """How many action leaves the distribution's own rule gives."""
         self._policy = policy
 
     def forward(self, obs: Tensor, *state: list[Tensor]) -> tuple[Tensor, ...]:
         """Return one tensor `[batch, ...]` for each of `names`, given the network's input `[batch, ...]`."""
-        inputs, _, after = _distribution(self._policy, obs, state[0] if state else [])
+        inputs, kind, after = _distribution(self._policy, obs, state[0] if state else [])
         named = [self.module.value_function() if name == "value" else inputs for name in self.names]
-        return (*named, *(after if state else []))
+        ready = tree_leaves(kind(inputs.clone(), self.module).deterministic_sample()) if self.given else []
+        return (*ready, *named, *(after if state else []))
 
 
 def _distribution(policy: Any, obs: Any, state: list[Tensor]) -> tuple[Tensor, Any, list[Tensor]]:
@@ -196,8 +198,9 @@ def load_old_stack(files: OldStackFiles, notify: Callable[[str], None], *, value
     _prepare(traced)
     replace_bias_layers(traced.model)
     model = type(policy.model)
+    given = len(recipe.action_leaves) if mode == "given" else 0
     return OldStackCheckpoint(
-        recipe, OldStackNetwork(traced, names), f"{model.__module__}.{model.__qualname__}", policy
+        recipe, OldStackNetwork(traced, names, given), f"{model.__module__}.{model.__qualname__}", policy
     )
 
 
@@ -325,7 +328,7 @@ def _action_rule(
     state = [torch.as_tensor(np.stack([leaf.initial] * 2)) for leaf in _network_state(policy)]
     try:
         with torch.no_grad():
-            _, kind, _ = _distribution(policy, zeros, state)
+            inputs, kind, _ = _distribution(policy, zeros, state)
     except KeyError as error:
         raise UnsupportedError(
             f"model {model} reads {error} besides the observation, which is not exported: the graph has no such input"
@@ -337,7 +340,9 @@ def _action_rule(
     plain = getattr(kind, "func", kind)  # RLlib binds the space to some of its classes
     if isinstance(policy.model, DQNTorchModel) and issubclass(plain, TorchCategorical):
         return None, "argmax", (Q_VALUES,)
-    mode = find_mode(lambda probe: kind(probe, policy.model).deterministic_sample(), plain.__name__, action_space)
+    mode = find_mode(
+        lambda probe: kind(probe, policy.model).deterministic_sample(), plain.__name__, action_space, inputs
+    )
     distribution = DISTRIBUTIONS.get(plain)
     children = getattr(kind, "keywords", {}).get("child_distributions", ())
     if any(getattr(child, "func", child) not in DISTRIBUTIONS for child in children):

@@ -42,11 +42,17 @@ def write_onnx(graph: PolicyGraph, example: Inputs, file: Path) -> None:
     """
     try:
         _export(graph, example, file, dynamo=False)
-    except Exception:  # torch.onnx raises several unrelated types
+        _finish(file)
+    except Exception:  # torch.onnx and onnx raise several unrelated types
         try:
             _export(graph, example, file, dynamo=True)
+            _finish(file)
         except Exception as error:
             raise UnsupportedError(f"the network cannot be written as ONNX: {first_line(error)}") from error
+
+
+def _finish(file: Path) -> None:
+    """Check what torch wrote, which is not always ONNX (a logarithm of integers), and give it its last form."""
     model = onnx.load(str(file))
     model.ir_version = IR_VERSION
     model.producer_name, model.producer_version = "rlservo", ""

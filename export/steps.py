@@ -106,6 +106,8 @@ def _filter_step(frozen: ObservationFilter) -> BakedStep:
 
 
 def _mode_detail(recipe: Recipe) -> str:
+    if recipe.mode == "given":
+        return "the network's own action, or its own distribution's"
     leaves = recipe.action_leaves.values()
     boxes = [leaf for leaf in leaves if isinstance(leaf, Box)]
     choice = f"the choice with the largest {'Q-value' if recipe.distribution is None else 'logit'}"
