@@ -13,11 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-import training_run
+import training_run  # before Ray  # isort: skip
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
-from ray.tune.registry import get_trainable_cls
 from training_run import RETURN, STEPS, Run
 
 SUPPORTED = ("PPO", "APPO", "IMPALA", "SAC")
@@ -87,7 +86,7 @@ def gpus_asked_for(parser: argparse.ArgumentParser) -> float:
 
 def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: float = 0.0) -> AlgorithmConfig:
     """Return the RLlib configuration: one core for the driver and learner, the others (at least two) sample."""
-    config: AlgorithmConfig = get_trainable_cls(args.run).get_default_config()
+    config = training_run.default_config(args.run)
     config.environment(task.env_id, env_config=task.env_config, clip_rewards=False)
     config.framework("torch")
     config.env_runners(

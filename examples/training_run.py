@@ -22,25 +22,24 @@ import signal
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any, NoReturn, cast
 
-# Said before Ray is imported, so that it holds for every process of the cluster that is started here.
-os.environ.setdefault("RAY_AUTH_MODE", "token")
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")
-
+import ray_settings  # before Ray  # isort: skip
 import ray
 from ray import cloudpickle, tune
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.tune.registry import get_trainable_cls
 from rich.console import Console
 from rich.table import Table
 
 from rlservo.export.errors import RlservoError, UsageError
 
+assert ray_settings
 RETURN = "env_runners/episode_return_mean"
 STEPS = "num_env_steps_sampled_lifetime"
 RUN_FILE = "run.json"
@@ -114,6 +113,19 @@ def main_with_sentences(main: Callable[[], None], script: str) -> NoReturn:
     sys.exit(0)
 
 
+def default_config(algorithm: str, log_level: str = "ERROR") -> AlgorithmConfig:
+    """Return RLlib's default configuration of an algorithm, without what RLlib says about itself on the way.
+
+    Registering the algorithms makes an environment that breaks its own space (DreamerV3's, ray 2.60), and each
+    configuration announces that the default API stack is the default.
+    """
+    logging.getLogger("ray.rllib").setLevel("WARNING" if log_level == "WARN" else log_level)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        config: AlgorithmConfig = get_trainable_cls(algorithm).get_default_config()
+    return config
+
+
 @contextlib.contextmanager
 def ray_session(
     *, num_cpus: int = 0, num_gpus: float = 0.0, address: str | None = None, log_level: str = "ERROR"
@@ -160,6 +172,11 @@ def ray_session(
 def cores() -> int:
     """Return how many cores the running Ray has."""
     return int(ray.cluster_resources().get("CPU", 0))
+
+
+def gpus() -> float:
+    """Return how many GPUs the running Ray has."""
+    return float(ray.cluster_resources().get("GPU", 0.0))
 
 
 @contextlib.contextmanager
@@ -370,7 +387,7 @@ def _trial(result: Any, run: Run, swept: Sequence[str]) -> Trial:
     config = result.config or {}
     return Trial(
         name=Path(result.path).name,
-        settings={name: config.get(name) for name in swept},
+        settings={name: config.get(name, config.get(f"_{name}")) for name in swept},  # RLlib keeps some as properties
         iterations=int(metrics.get("training_iteration", 0)),
         env_steps=int(metrics.get(STEPS, 0)),
         score=_metric(metrics, run.metric),
