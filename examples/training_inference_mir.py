@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 
 from training_inference import Task, argument_parser, run
+from training_run import main_with_sentences
 
 PPO = {
     "train_batch_size_per_learner": 8192,
@@ -50,4 +51,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main_with_sentences(main, __file__)

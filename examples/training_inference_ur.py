@@ -10,6 +10,7 @@ The policy that ships in examples/checkpoints/ur5_positioning was made by this s
 from __future__ import annotations
 
 from training_inference import Task, argument_parser, run
+from training_run import main_with_sentences
 
 TASK = Task(
     env_id="rlservo/EndEffectorPositioningURSim-v0",
@@ -36,4 +37,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main_with_sentences(main, __file__)

@@ -1,0 +1,13 @@
+"""What must be in the environment before Ray is imported, for every process of a cluster that is started from here.
+
+Ray reads these when it is first imported, so whatever imports Ray imports this first.
+"""
+
+from __future__ import annotations
+
+import os
+
+# Ray 2.60 turns token authentication on once any local ray.init() has written a token; said explicitly, it is always on.
+os.environ.setdefault("RAY_AUTH_MODE", "token")
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")
