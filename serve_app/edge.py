@@ -48,6 +48,7 @@ STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; w
     (ActionError, 500),
 )
 RETRY_AFTER_S = 1
+BUG = "the server failed on this request; its log says how"
 JSON = b"application/json"
 
 Headers = tuple[tuple[bytes, bytes], ...]
@@ -69,11 +70,13 @@ class Endpoint:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
-        received = time.perf_counter()
+        admission = self._core.admission
         try:
+            received = admission.enter()
             self._check_headers(scope["headers"])
             check_length(scope["headers"], self._max_body)
-            body = await read_body(receive, max_bytes=self._max_body, timeout_s=self._timeout_s)
+            with admission.reading():
+                body = await read_body(receive, max_bytes=self._max_body, timeout_s=self._timeout_s)
             if body is None:  # the client has gone
                 return
             content, headers, decision = self._handle(scope, body, received)
@@ -227,7 +230,7 @@ def encode_error(error: RlservoError) -> bytes:
 
 def encode_bug() -> bytes:
     """Return the body of an error that is none of ours to explain to a client."""
-    return wire.encode_json({"error": "the server failed on this request; its log says how", "code": "internal"})
+    return wire.encode_json({"error": BUG, "code": "internal"})
 
 
 def error_models(*statuses: int) -> dict[int | str, dict[str, Any]]:
