@@ -13,7 +13,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rlservo.export.errors import OverloadedError
+from rlservo.export.errors import DeadlineError, OverloadedError
+
+HURRY_S = 0.05  # [s] for a body when too many are half sent
 
 
 class Admission:
@@ -29,7 +31,8 @@ class Admission:
         self._burst_began = 0.0
         self.incoming = 0
         self.streams = 0
-        self.longest = 0  # the longest burst since it was last asked for
+        self.longest = 0  # the longest burst so far
+        self.turned_away = 0  # before anybody looked at them
 
     def enter(self) -> float:
         """Return when this request had arrived at the latest (`time.perf_counter`). Raises OverloadedError."""
@@ -46,18 +49,33 @@ class Admission:
             )
         return self._burst_began
 
+    def is_open(self) -> bool:
+        """Whether one more request would be admitted; if not, it counts as turned away."""
+        if self._burst < self._max_queued:
+            return True
+        self.turned_away += 1
+        return False
+
     def _end_burst(self) -> None:
         self.longest = max(self.longest, self._burst)
         self._burst = 0
 
     @contextmanager
-    def reading(self) -> Iterator[None]:
-        """Count a request whose body is still on its way. Raises OverloadedError."""
-        if self.incoming >= self._max_incoming:
-            raise OverloadedError(f"{self.incoming} requests are being sent to this replica: try again shortly")
+    def reading(self, timeout_s: float) -> Iterator[float]:
+        """Count a request whose body may still be on its way, and give the seconds it has.
+
+        Where too many are, one whose body is not there already has to hurry. Raises OverloadedError when it did not.
+        """
+        full = self.incoming >= self._max_incoming
         self.incoming += 1
         try:
-            yield
+            yield min(timeout_s, HURRY_S) if full else timeout_s
+        except DeadlineError:
+            if not full:
+                raise
+            raise OverloadedError(
+                f"{self._max_incoming} requests are still being sent to this replica: try again shortly"
+            ) from None
         finally:
             self.incoming -= 1
 

@@ -21,6 +21,7 @@ from ray.serve.context import _get_global_client
 
 from rlservo.export.errors import RlservoError
 from rlservo.serve_app.http import create_app
+from rlservo.serve_app.ingress import gate
 from rlservo.serve_app.keys import check_exposure, is_loopback
 from rlservo.serve_app.oip_grpc import InferenceService
 from rlservo.serve_app.settings import ServerSettings
@@ -95,6 +96,7 @@ class PolicyServer(InferenceService):
 
     def __serve_build_asgi_app__(self) -> FastAPI:  # Serve's hook: the app is built in the replica
         app = create_app(lambda: self._store, self._settings, replica=serve.get_replica_context().replica_tag)
+        gate.is_open = app.state.core.admission.is_open
         self.serve_grpc(app.state.core, local_only=is_loopback(self._host))
         return app
 

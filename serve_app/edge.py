@@ -71,14 +71,15 @@ class Endpoint:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
         admission = self._core.admission
+        started = time.perf_counter()
         try:
-            received = admission.enter()
             self._check_headers(scope["headers"])
             check_length(scope["headers"], self._max_body)
-            with admission.reading():
-                body = await read_body(receive, max_bytes=self._max_body, timeout_s=self._timeout_s)
+            with admission.reading(self._timeout_s) as timeout_s:
+                body = await read_body(receive, max_bytes=self._max_body, timeout_s=timeout_s)
             if body is None:  # the client has gone
                 return
+            received = min(started, admission.enter())  # only now: a body that is slow to come waits for itself
             content, headers, decision = self._handle(scope, body, received)
             status = 200
             self._core.metrics.answered(self._protocol, decision, decision.batch or 1, time.perf_counter() - received)

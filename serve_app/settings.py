@@ -35,7 +35,7 @@ class ServerSettings(BaseModel):
     body_timeout_s: float = Field(2.0, gt=0, allow_inf_nan=False)
     """[s] A client that takes longer to send its body is answered 408."""
 
-    max_ongoing_requests: int = Field(256, ge=1)
+    max_ongoing_requests: int = Field(128, ge=1)
     """Requests that may wait for one replica's processor at once; further ones are answered 503 immediately."""
 
     max_queue_ms: float = Field(1000.0, gt=0, allow_inf_nan=False)
