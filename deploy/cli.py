@@ -263,6 +263,9 @@ def serve(
     ],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
+    grpc_port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC, here.")
+    ] = None,
     replicas: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
 ) -> None:
     """Serve policies over HTTP with Ray Serve until Ctrl-C; nothing is left running afterwards.
@@ -276,12 +279,14 @@ def serve(
     def ready(served: Served) -> None:
         for name, default in served.policies:
             _out.print(f"{served.url}/v1/policies/{name}  (version {default})", highlight=False, soft_wrap=True)
+        if served.grpc is not None:
+            _out.print(f"{served.grpc}  gRPC, Open Inference Protocol", highlight=False, soft_wrap=True)
         if not served.haproxy:
             _err.print("HAProxy is not installed here: Ray's own proxy answers, at several times the latency")
         _out.print(f"ready; documentation at {served.url}/docs; Ctrl-C stops", highlight=False, soft_wrap=True)
 
     _err.print("starting Ray Serve ...", style="dim")
-    serve_policies(directories, host=host, port=port, replicas=replicas, on_ready=ready)
+    serve_policies(directories, host=host, port=port, grpc_port=grpc_port, replicas=replicas, on_ready=ready)
 
 
 @app.command()

@@ -18,7 +18,8 @@ handler in `deploy/cli.py` maps them to exit codes.
     ├── ObservationError          bad-observation          shape, dtype, non-finite or misnamed element
     ├── ActionError               unsafe-action            the policy produced an action that must not leave
     ├── DeadlineError             deadline-passed
-    ├── UnavailableError          unavailable              not ready, over capacity, or the server cannot be reached
+    ├── UnavailableError          unavailable              not ready, or the server cannot be reached
+    │   └── OverloadedError       over-capacity            more work than the server takes on: try again
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
 """
 
@@ -127,6 +128,12 @@ class UnavailableError(RlservoError):
     """The server is not ready, over capacity, or out of reach."""
 
     code = "unavailable"
+
+
+class OverloadedError(UnavailableError):
+    """The server has as much work as it takes on; nothing was computed."""
+
+    code = "over-capacity"
 
 
 class UsageError(RlservoError):

@@ -16,17 +16,21 @@ from fastapi import FastAPI
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from ray import serve
 from ray.serve import Application, Deployment
-from ray.serve.config import HTTPOptions
+from ray.serve.config import HTTPOptions, gRPCOptions
 from ray.serve.context import _get_global_client
 
 from rlservo.export.errors import RlservoError
 from rlservo.serve_app.http import create_app
-from rlservo.serve_app.keys import check_exposure
+from rlservo.serve_app.ingress import gate
+from rlservo.serve_app.keys import check_exposure, is_loopback
+from rlservo.serve_app.oip_grpc import InferenceService
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
 
 APPLICATION = "rlservo"
 DEPLOYMENT = "PolicyServer"
+SPARE = 64  # health, metrics, documentation
+GRPC_SERVICE = "rlservo.serve_app.grpc_ingress:add_service"
 
 
 class BuildArguments(BaseModel):
@@ -58,8 +62,13 @@ def build(args: BuildArguments) -> Application:
     # A folder may exist only on the nodes that run replicas, so it is the replica that looks.
     folders = [str(Path(folder).expanduser().absolute()) for folder in args.policies]
     server: Deployment = cast("Deployment", PolicyServer)  # the decorator's type says it is still the class
-    options = server.options(num_replicas=args.replicas, max_ongoing_requests=settings.max_ongoing_requests)
+    options = server.options(num_replicas=args.replicas, max_ongoing_requests=_serve_limit(settings))
     return options.bind(folders, settings.model_dump())
+
+
+def _serve_limit(settings: ServerSettings) -> int:
+    """Return more than a replica takes on: who waits at Serve's limit waits for whoever is slow to send a body."""
+    return settings.max_ongoing_requests + settings.max_incoming + settings.max_streams + SPARE
 
 
 @serve.deployment(
@@ -71,21 +80,25 @@ def build(args: BuildArguments) -> Application:
     graceful_shutdown_timeout_s=5,
 )
 @serve.ingress()
-class PolicyServer:
-    """A replica: the policies, and the HTTP application over them."""
+class PolicyServer(InferenceService):
+    """A replica: the policies, the HTTP application and the gRPC methods over them."""
 
     def __init__(self, folders: list[str], settings: dict[str, Any]) -> None:
         """Load and prove every policy; Serve sends requests only after this has returned."""
         self._settings = ServerSettings(**settings)
         try:
-            check_exposure(_listening_host(), self._settings)
+            self._host = _listening_host()
+            check_exposure(self._host, self._settings)
             self._store = PolicyStore.load(folders, threads=self._settings.threads)
         except RlservoError as error:
             # Ray pickles what a constructor raises and prints its text: one sentence instead of our class and details.
             raise RuntimeError(error.message) from None
 
     def __serve_build_asgi_app__(self) -> FastAPI:  # Serve's hook: the app is built in the replica
-        return create_app(lambda: self._store, self._settings, replica=serve.get_replica_context().replica_tag)
+        app = create_app(lambda: self._store, self._settings, replica=serve.get_replica_context().replica_tag)
+        gate.is_open = app.state.core.admission.is_open
+        self.serve_grpc(app.state.core, local_only=is_loopback(self._host))
+        return app
 
     async def check_health(self) -> None:
         """Tell Serve's controller that the event loop turns and the policies are there; if not, it replaces us."""
@@ -104,9 +117,12 @@ def _listening_host() -> str:
     return str(options.host)
 
 
-def start(policies: list[str], *, host: str, port: int, replicas: int, settings: dict[str, Any]) -> None:
+def start(
+    policies: list[str], *, host: str, port: int, grpc_port: int | None, replicas: int, settings: dict[str, Any]
+) -> None:
     """Start Serve in the connected Ray cluster and return when requests are answered."""
-    serve.start(http_options=HTTPOptions(host=host, port=port))
+    grpc_options = gRPCOptions(port=grpc_port or 0, grpc_servicer_functions=[GRPC_SERVICE], enable_reflection=False)
+    serve.start(http_options=HTTPOptions(host=host, port=port), grpc_options=grpc_options)
     app = build(BuildArguments(policies=policies, replicas=replicas, settings=settings))
     serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)
 

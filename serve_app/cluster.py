@@ -53,6 +53,7 @@ def main() -> int:
             plan["policies"],
             host=plan["host"],
             port=plan["port"],
+            grpc_port=plan["grpc_port"],
             replicas=plan["replicas"],
             settings=plan["settings"],
         )

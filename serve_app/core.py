@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError
+from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.keys import Guard, Keys
 from rlservo.serve_app.metrics import Metrics
 from rlservo.serve_app.settings import ServerSettings
@@ -30,6 +31,12 @@ class Core:
         self.settings = settings
         self.guard = Guard(Keys.from_settings(settings))
         self.metrics = Metrics(replica)
+        self.admission = Admission(
+            max_queued=settings.max_ongoing_requests,
+            max_queue_ms=settings.max_queue_ms,
+            max_incoming=settings.max_incoming,
+            max_streams=settings.max_streams,
+        )
 
     def store(self) -> PolicyStore:
         """Return the policies. Raises UnavailableError while they are being loaded."""
@@ -37,6 +44,16 @@ class Core:
         if store is None:
             raise UnavailableError("the policies are still being loaded: try again shortly")
         return store
+
+    @property
+    def ready(self) -> bool:
+        """Whether the policies are loaded."""
+        return self._store_provider() is not None
+
+    def has(self, name: str, version: str | None = None) -> bool:
+        """Whether a policy, in this version, is loaded."""
+        store = self._store_provider()
+        return store is not None and name in store.names and (version is None or version in store.versions(name))
 
     def act(
         self,

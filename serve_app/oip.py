@@ -140,19 +140,8 @@ class _Infer:
             inputs, non_finite = {contract.inputs[0].name: _raw_input(contract, view)}, False
         else:
             document, inputs, non_finite = _read_request(view, length)
-        parameters = document.get("parameters") or {}
-        explore, seed, seq, deadline_ms = _options(parameters) if parameters else (False, None, None, None)
-        binary = _wants_binary(document, parameters)
-        obs = _observation(contract, inputs)
-        decision = self._core.act(
-            params["name"],
-            params.get("version"),
-            obs,
-            received=received,
-            explore=explore,
-            seed=seed,
-            seq=seq,
-            deadline_ms=deadline_ms,
+        decision, seq, binary = decide(
+            self._core, params["name"], params.get("version"), document, inputs, received=received
         )
         if non_finite:
             wire.refuse_non_finite()
@@ -160,6 +149,32 @@ class _Infer:
         if accepted and len(content) >= SMALLEST_COMPRESSED:
             content, headers = _compress(content, headers, accepted)
         return content, headers, decision
+
+
+def decide(
+    core: Core,
+    name: str,
+    version: str | None,
+    document: Mapping[str, Any],
+    inputs: Mapping[str, NDArray[Any]],
+    *,
+    received: float,
+    deadline_ms: float | None = None,
+) -> tuple[Decision, int | None, bool]:
+    """Return (decision, seq, whether the output is to be binary) for a request of either transport.
+
+    Of the JSON `document`, `parameters` and `outputs` are read; `deadline_ms` is the transport's own.
+    """
+    parameters = document.get("parameters") or {}
+    explore, seed, seq, wanted_ms = _options(parameters) if parameters else (False, None, None, None)
+    if wanted_ms is not None:
+        deadline_ms = wanted_ms if deadline_ms is None else min(wanted_ms, deadline_ms)
+    binary = _wants_binary(document, parameters)
+    obs = _observation(core.store().get(name, version).contract, inputs)
+    decision = core.act(
+        name, version, obs, received=received, explore=explore, seed=seed, seq=seq, deadline_ms=deadline_ms
+    )
+    return decision, seq, binary
 
 
 def _encode_reply(
@@ -379,11 +394,11 @@ def _add_models(app: FastAPI, core: Core) -> None:
 
     @app.get("/v2", tags=tags, summary="The server and the extensions it speaks", response_model=ServerMetadata)
     async def server() -> Response:
-        return _json({"name": "rlservo", "version": _version(), "extensions": EXTENSIONS})
+        return _json(server_metadata())
 
     @app.get("/v2/models/{name}", tags=tags, summary="A model", response_model=ModelMetadata, responses=errors)
     async def model(name: str) -> Response:
-        return _json(_metadata(core, name, None))
+        return _json(model_metadata(core, name, None))
 
     @app.get(
         "/v2/models/{name}/versions/{version}",
@@ -393,7 +408,7 @@ def _add_models(app: FastAPI, core: Core) -> None:
         responses=errors,
     )
     async def model_version(name: str, version: str) -> Response:
-        return _json(_metadata(core, name, version))
+        return _json(model_metadata(core, name, version))
 
     @app.get("/v2/models/{name}/ready", tags=tags, summary="The model is loaded and proven", responses=errors)
     async def model_ready(name: str) -> Response:
@@ -416,17 +431,29 @@ def _add_models(app: FastAPI, core: Core) -> None:
         if body:
             document, _ = wire.read_json(body, such_as='{"ready": true}')
             flag(document, "ready")  # all that are here are ready
-        store = core.store()
-        return _json(
-            [
-                {"name": name, "version": version, "state": "READY", "reason": ""}
-                for name in store.names
-                for version in store.versions(name)
-            ]
-        )
+        return _json(repository_index(core))
 
 
-def _metadata(core: Core, name: str, version: str | None) -> dict[str, Any]:
+# What can be asked, as the protocol's documents; gRPC's messages have the same fields.
+
+
+def server_metadata() -> dict[str, Any]:
+    """Return who this is, and the extensions it speaks."""
+    return {"name": "rlservo", "version": _version(), "extensions": EXTENSIONS}
+
+
+def repository_index(core: Core) -> list[dict[str, str]]:
+    """Return every version of every model."""
+    store = core.store()
+    return [
+        {"name": name, "version": version, "state": "READY", "reason": ""}
+        for name in store.names
+        for version in store.versions(name)
+    ]
+
+
+def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]:
+    """Return a model's inputs and outputs; `version` None is the default."""
     contract = core.store().get(name, version).contract
     versions = core.store().versions(name) if version is None else (contract.version,)
 

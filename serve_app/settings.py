@@ -35,8 +35,20 @@ class ServerSettings(BaseModel):
     body_timeout_s: float = Field(2.0, gt=0, allow_inf_nan=False)
     """[s] A client that takes longer to send its body is answered 408."""
 
-    max_ongoing_requests: int = Field(256, ge=1)
-    """Requests one replica holds at once; further ones wait for a place (hence the short `body_timeout_s`)."""
+    max_ongoing_requests: int = Field(128, ge=1)
+    """Requests that may wait for one replica's processor at once; further ones are answered 503 immediately."""
+
+    max_queue_ms: float = Field(1000.0, gt=0, allow_inf_nan=False)
+    """[ms] Requests that have waited longer in a replica are answered 503 instead of being computed."""
+
+    max_incoming: int = Field(512, ge=1)
+    """Requests whose body may be half sent at once, per replica; those that come complete do not count."""
+
+    max_streams: int = Field(256, ge=1)
+    """Streams (WebSocket, gRPC) that may be open at once, per replica."""
+
+    stream_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
+    """[s] A stream (WebSocket, gRPC) whose client says nothing for so long is closed."""
 
     api_keys_file: str | None = None
     """File of the API keys' hashes, a line each: `<label> <act|admin> sha256:<hash>`; `rlservo key` makes them."""

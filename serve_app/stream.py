@@ -11,8 +11,11 @@ github.com/Physical-Intelligence/openpi, websocket_policy_server.py.
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import logging
 import re
+import sys
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -22,6 +25,7 @@ from starlette.types import Message, Receive, Scope, Send
 from rlservo.export.bundle import Contract
 from rlservo.export.errors import RequestError, RlservoError, TooLargeError, UnknownPolicyError
 from rlservo.serve_app import wire
+from rlservo.serve_app.admission import IdleTimer
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import encode_bug, error_answer, status_of
@@ -30,6 +34,7 @@ from rlservo.serve_app.keys import check_origin
 logger = logging.getLogger(__name__)
 
 STREAM_PATTERN = re.compile(r"/(?:v1/policies/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/stream)?")
+GOING_AWAY = 1001
 FAILED = 1011  # the close code openpi's server uses for every error
 KNOWN = frozenset({"obs", *wire.OPTIONS, "reset"})
 PROTOCOL = "websocket"
@@ -59,9 +64,18 @@ class Stream:
         await receive()  # websocket.connect
         await send({"type": "websocket.accept"})
         self._core.metrics.stream(name, 1)
+        idle = IdleTimer(self._core.settings.stream_idle_s)
         try:
-            await send(_binary(pack(_metadata(contract))))
-            await self._answer(name, version, receive, send)
+            with self._core.admission.streaming():
+                await send(_binary(pack(_metadata(contract))))
+                await self._answer(name, version, receive, send, idle)
+        except asyncio.CancelledError:
+            if not idle.expired:
+                raise
+            if sys.version_info >= (3, 11) and (task := asyncio.current_task()) is not None:
+                task.uncancel()  # Python counts cancellations
+            self._core.failed(PROTOCOL, name, version, "idle")
+            await _close_idle(send)
         except RlservoError as error:
             self._core.failed(PROTOCOL, name, version, error.code)
             if status_of(error) >= 500:
@@ -72,13 +86,15 @@ class Stream:
             self._core.metrics.failed(PROTOCOL, "", "", "internal")
             await _fail(send, encode_bug())
         finally:
+            idle.stop()
             self._core.metrics.stream(name, -1)
 
-    async def _answer(self, name: str, version: str | None, receive: Receive, send: Send) -> None:
+    async def _answer(self, name: str, version: str | None, receive: Receive, send: Send, idle: IdleTimer) -> None:
         previous_ms: float | None = None
         while True:
             message = await receive()
             received = time.perf_counter()
+            idle.touch()
             if message["type"] == "websocket.disconnect":
                 return
             obs, options = self._read(message)
@@ -179,6 +195,11 @@ async def _fail(send: Send, content: bytes) -> None:
         await send({"type": "websocket.close", "code": FAILED, "reason": "see the text frame"})
     except (OSError, RuntimeError):  # the client has gone meanwhile: nobody is left to tell
         logger.debug("a stream's client went before its error could be sent")
+
+
+async def _close_idle(send: Send) -> None:
+    with contextlib.suppress(OSError, RuntimeError):  # the client may have gone meanwhile
+        await send({"type": "websocket.close", "code": GOING_AWAY, "reason": "silent for too long"})
 
 
 def _binary(content: bytes) -> Message:

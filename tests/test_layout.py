@@ -22,8 +22,8 @@ ONLY_IN = {
     "ray.serve": ("serve_app/app.py",),
     "fastapi": ("serve_app/http.py", "serve_app/edge.py", "serve_app/oip.py", "serve_app/docs.py", "serve_app/app.py"),
     "mujoco": ("envs/",),
-    "grpc": ("envs/robot_server/",),
-    "google.protobuf": ("envs/robot_server/",),
+    "grpc": ("envs/robot_server/", "serve_app/oip_grpc.py", "serve_app/grpc_ingress.py"),
+    "google.protobuf": ("envs/robot_server/", "serve_app/oip_grpc.py", "serve_app/oip_messages.py"),
     "torch": ("export/",),
     "pickle": ("export/unpickle.py",),
 }
