@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from rlservo.deploy import robot_commands
+from rlservo.deploy import policy_commands, robot_commands
 from rlservo.export.errors import RlservoError, UsageError
 from rlservo.serve_app.acting import ActingPolicy
 
@@ -224,6 +224,11 @@ def serve(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
     replicas: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
+    config: policy_commands.ConfigOption = None,
+    versions: policy_commands.VersionsOption = None,
+    alias: policy_commands.AliasOption = None,
+    canary: policy_commands.CanaryOption = None,
+    shadow: policy_commands.ShadowOption = None,
 ) -> None:
     """Serve policies over HTTP with Ray Serve until Ctrl-C; nothing is left running afterwards.
 
@@ -232,16 +237,27 @@ def serve(
     """
     with _extra("serve"):
         from rlservo.serve_app.launcher import Served, serve_policies
+        from rlservo.serve_app.operator_key import key_file
 
     def ready(served: Served) -> None:
         for name, default in served.policies:
             _out.print(f"{served.url}/v1/policies/{name}  (version {default})", highlight=False, soft_wrap=True)
         if not served.haproxy:
             _err.print("HAProxy is not installed here: Ray's own proxy answers, at several times the latency")
+        if served.admin_key_file is not None:
+            _note(f"administration: rlservo policy --help; its key is in {served.admin_key_file}")
         _out.print(f"ready; documentation at {served.url}/docs; Ctrl-C stops", highlight=False, soft_wrap=True)
 
     _err.print("starting Ray Serve ...", style="dim")
-    serve_policies(directories, host=host, port=port, replicas=replicas, on_ready=ready)
+    serve_policies(
+        directories,
+        host=host,
+        port=port,
+        replicas=replicas,
+        served=policy_commands.served_config(config, versions, alias, canary, shadow),
+        admin_key_file=key_file(port),
+        on_ready=ready,
+    )
 
 
 @app.command()
@@ -335,6 +351,7 @@ def demo(
 
 
 robot_commands.add_to(app)
+app.add_typer(policy_commands.policy, name="policy")
 
 
 def _acting_policy(url: str | None, name: str | None, bundle: Path | None) -> ActingPolicy:

@@ -18,7 +18,10 @@ handler in `deploy/cli.py` maps them to exit codes.
     ├── ObservationError          bad-observation          shape, dtype, non-finite or misnamed element
     ├── ActionError               unsafe-action            the policy produced an action that must not leave
     ├── DeadlineError             deadline-passed
+    ├── ConflictError             conflict                 a change of what is served that contradicts what is
+    │   └── RefusedError              version-refused      a version or configuration that cannot be served
     ├── UnavailableError          unavailable              not ready, over capacity, or the server cannot be reached
+    │   └── PartlyAppliedError        partly-applied       a change that some replicas could not follow
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
 """
 
@@ -127,6 +130,24 @@ class UnavailableError(RlservoError):
     """The server is not ready, over capacity, or out of reach."""
 
     code = "unavailable"
+
+
+class PartlyAppliedError(UnavailableError):
+    """A change was accepted, and some replicas have not followed it."""
+
+    code = "partly-applied"
+
+
+class ConflictError(RlservoError):
+    """A change of what is served that contradicts what is served now."""
+
+    code = "conflict"
+
+
+class RefusedError(ConflictError):
+    """A version or a configuration cannot be served, so what ran before goes on."""
+
+    code = "version-refused"
 
 
 class UsageError(RlservoError):

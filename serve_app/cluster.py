@@ -54,6 +54,7 @@ def main() -> int:
             host=plan["host"],
             port=plan["port"],
             replicas=plan["replicas"],
+            served=plan["served"],
             settings=plan["settings"],
         )
     except Exception as error:

@@ -27,7 +27,18 @@ from rlservo.export.bundle import Contract, TensorSpec
 from rlservo.export.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.serve_app import wire
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.edge import JSON_HEADERS, BareRoute, Body, Endpoint, Headers, error_models, read_body, too_large
+from rlservo.serve_app.edge import (
+    JSON_HEADERS,
+    BareRoute,
+    Body,
+    Endpoint,
+    Headers,
+    error_models,
+    read_body,
+    session_of,
+    too_large,
+)
+from rlservo.serve_app.listing import states_of
 from rlservo.serve_app.store import Decision
 from rlservo.serve_app.tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor
 
@@ -44,6 +55,7 @@ TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
 IGNORED = frozenset({"priority", TIMEOUT, "headers", "content_type"})
 SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits one packet either way
 COMPRESSION_LEVEL = 1  # numbers of a robot hardly compress; a control loop waits for them
+STATES = {"ready": "READY", "loading": "LOADING", "failed": "UNAVAILABLE"}
 SUCH_AS = '{"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [...]}]}'
 
 
@@ -153,6 +165,7 @@ class _Infer:
             seed=seed,
             seq=seq,
             deadline_ms=deadline_ms,
+            session=session_of(scope),
         )
         if non_finite:
             wire.refuse_non_finite()
@@ -333,8 +346,12 @@ def add_routes(app: FastAPI, core: Core, infer: Endpoint) -> None:
     _add_health(app, core)
     _add_models(app, core)
     for path, operation, summary in (
-        ("/v2/models/{name}/infer", "infer", "Infer with the newest version"),
-        ("/v2/models/{name}/versions/{version}/infer", "infer_version", "Infer with one version"),
+        ("/v2/models/{name}/infer", "infer", "Infer with the default version"),
+        (
+            "/v2/models/{name}/versions/{version}/infer",
+            "infer_version",
+            "Infer with one version, or with what an alias leads to",
+        ),
     ):
         app.router.routes.append(
             BareRoute(
@@ -413,15 +430,17 @@ def _add_models(app: FastAPI, core: Core) -> None:
     async def index(request: Request) -> Response:
         settings = core.settings
         body = await read_body(request.receive, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+        ready = False
         if body:
             document, _ = wire.read_json(body, such_as='{"ready": true}')
-            flag(document, "ready")  # all that are here are ready
-        store = core.store()
+            ready = bool(flag(document, "ready"))
+        core.store()
         return _json(
             [
-                {"name": name, "version": version, "state": "READY", "reason": ""}
-                for name in store.names
-                for version in store.versions(name)
+                {"name": name, "version": version, "state": STATES[state.state], "reason": state.reason}
+                for name, versions in states_of(core).items()
+                for version, state in versions.items()
+                if state.state == "ready" or not ready
             ]
         )
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 import re
+import secrets
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -24,7 +25,7 @@ from rlservo.export.errors import RequestError, RlservoError, TooLargeError, Unk
 from rlservo.serve_app import wire
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.edge import encode_bug, error_answer, status_of
+from rlservo.serve_app.edge import encode_bug, error_answer, session_of, status_of
 from rlservo.serve_app.keys import check_origin
 
 logger = logging.getLogger(__name__)
@@ -61,7 +62,7 @@ class Stream:
         self._core.metrics.stream(name, 1)
         try:
             await send(_binary(pack(_metadata(contract))))
-            await self._answer(name, version, receive, send)
+            await self._answer(name, version, session_of(scope) or secrets.token_hex(8), receive, send)
         except RlservoError as error:
             self._core.failed(PROTOCOL, name, version, error.code)
             if status_of(error) >= 500:
@@ -74,7 +75,7 @@ class Stream:
         finally:
             self._core.metrics.stream(name, -1)
 
-    async def _answer(self, name: str, version: str | None, receive: Receive, send: Send) -> None:
+    async def _answer(self, name: str, version: str | None, session: str, receive: Receive, send: Send) -> None:
         previous_ms: float | None = None
         while True:
             message = await receive()
@@ -84,7 +85,15 @@ class Stream:
             obs, options = self._read(message)
             explore, seed, seq, deadline_ms = wire.read_options(options) if options else (False, None, None, None)
             decision = self._core.act(
-                name, version, obs, received=received, explore=explore, seed=seed, seq=seq, deadline_ms=deadline_ms
+                name,
+                version,
+                obs,
+                received=received,
+                explore=explore,
+                seed=seed,
+                seq=seq,
+                deadline_ms=deadline_ms,
+                session=session,
             )
             timing = {"infer_ms": decision.infer_ms}
             if previous_ms is not None:

@@ -14,7 +14,14 @@ FOLDERS = ("envs", "export", "serve_app", "deploy")
 ONLY_IN = {
     "ray.rllib": ("export/checkpoint.py", "export/old_stack.py", "export/old_models.py", "examples/"),
     "ray.serve": ("serve_app/app.py",),
-    "fastapi": ("serve_app/http.py", "serve_app/edge.py", "serve_app/oip.py", "serve_app/docs.py", "serve_app/app.py"),
+    "fastapi": (
+        "serve_app/http.py",
+        "serve_app/edge.py",
+        "serve_app/oip.py",
+        "serve_app/docs.py",
+        "serve_app/admin.py",
+        "serve_app/app.py",
+    ),
     "mujoco": ("envs/",),
     "grpc": ("envs/robot_server/",),
     "google.protobuf": ("envs/robot_server/",),
