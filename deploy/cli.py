@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from rlservo.deploy import robot_commands
+from rlservo.deploy import policy_commands, robot_commands
 from rlservo.export.errors import RlservoError, UsageError
 from rlservo.serve_app.acting import ActingPolicy
 
@@ -267,6 +267,11 @@ def serve(
         int | None, typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC, here.")
     ] = None,
     replicas: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
+    config: policy_commands.ConfigOption = None,
+    versions: policy_commands.VersionsOption = None,
+    alias: policy_commands.AliasOption = None,
+    canary: policy_commands.CanaryOption = None,
+    shadow: policy_commands.ShadowOption = None,
 ) -> None:
     """Serve policies over HTTP with Ray Serve until Ctrl-C; nothing is left running afterwards.
 
@@ -275,6 +280,7 @@ def serve(
     """
     with _extra("serve"):
         from rlservo.serve_app.launcher import Served, serve_policies
+        from rlservo.serve_app.operator_key import key_file
 
     def ready(served: Served) -> None:
         for name, default in served.policies:
@@ -283,10 +289,21 @@ def serve(
             _out.print(f"{served.grpc}  gRPC, Open Inference Protocol", highlight=False, soft_wrap=True)
         if not served.haproxy:
             _err.print("HAProxy is not installed here: Ray's own proxy answers, at several times the latency")
+        if served.admin_key_file is not None:
+            _note(f"administration: rlservo policy --help; its key is in {served.admin_key_file}")
         _out.print(f"ready; documentation at {served.url}/docs; Ctrl-C stops", highlight=False, soft_wrap=True)
 
     _err.print("starting Ray Serve ...", style="dim")
-    serve_policies(directories, host=host, port=port, grpc_port=grpc_port, replicas=replicas, on_ready=ready)
+    serve_policies(
+        directories,
+        host=host,
+        port=port,
+        grpc_port=grpc_port,
+        replicas=replicas,
+        served=policy_commands.served_config(config, versions, alias, canary, shadow),
+        admin_key_file=key_file(port),
+        on_ready=ready,
+    )
 
 
 @app.command()
@@ -380,6 +397,7 @@ def demo(
 
 
 robot_commands.add_to(app)
+app.add_typer(policy_commands.policy, name="policy")
 
 
 def _acting_policy(url: str | None, name: str | None, bundle: Path | None) -> ActingPolicy:

@@ -18,8 +18,11 @@ handler in `deploy/cli.py` maps them to exit codes.
     ├── ObservationError          bad-observation          shape, dtype, non-finite or misnamed element
     ├── ActionError               unsafe-action            the policy produced an action that must not leave
     ├── DeadlineError             deadline-passed
+    ├── ConflictError             conflict                 a change of what is served that contradicts what is
+    │   └── RefusedError              version-refused      a version or configuration that cannot be served
     ├── UnavailableError          unavailable              not ready, or the server cannot be reached
-    │   └── OverloadedError       over-capacity            more work than the server takes on: try again
+    │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
+    │   └── PartlyAppliedError    partly-applied           a change that some replicas could not follow
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
 """
 
@@ -134,6 +137,24 @@ class OverloadedError(UnavailableError):
     """The server has as much work as it takes on; nothing was computed."""
 
     code = "over-capacity"
+
+
+class PartlyAppliedError(UnavailableError):
+    """A change was accepted, and some replicas have not followed it."""
+
+    code = "partly-applied"
+
+
+class ConflictError(RlservoError):
+    """A change of what is served that contradicts what is served now."""
+
+    code = "conflict"
+
+
+class RefusedError(ConflictError):
+    """A version or a configuration cannot be served, so what ran before goes on."""
+
+    code = "version-refused"
 
 
 class UsageError(RlservoError):

@@ -8,6 +8,8 @@ comes here through `cluster.py`. A replica imports neither torch nor ray.rllib.
 # No `from __future__ import annotations` here: Serve reads the type of build's argument to know what to make of `args`.
 
 import asyncio
+import inspect
+import logging
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,18 +21,30 @@ from ray.serve import Application, Deployment
 from ray.serve.config import HTTPOptions, gRPCOptions
 from ray.serve.context import _get_global_client
 
-from rlservo.export.errors import RlservoError
+from rlservo.export.errors import PartlyAppliedError, RlservoError
+from rlservo.serve_app import listing
+from rlservo.serve_app.control import Control, Following
+from rlservo.serve_app.core import Core
 from rlservo.serve_app.http import create_app
 from rlservo.serve_app.ingress import gate
 from rlservo.serve_app.keys import check_exposure, is_loopback
+from rlservo.serve_app.ledger import GcsLedger
+from rlservo.serve_app.library import Library, Repository
 from rlservo.serve_app.oip_grpc import InferenceService
+from rlservo.serve_app.plan import ServedConfig
 from rlservo.serve_app.settings import ServerSettings
-from rlservo.serve_app.store import PolicyStore
+
+logger = logging.getLogger(__name__)
 
 APPLICATION = "rlservo"
 DEPLOYMENT = "PolicyServer"
 SPARE = 64  # health, metrics, documentation
 GRPC_SERVICE = "rlservo.serve_app.grpc_ingress:add_service"
+FOLLOW_TIMEOUT_S = 60.0  # [s] for every replica to load and prove what a change brought
+# A rolling update starts the new replica before the old one stops; older Rays stop first.
+SURGE: dict[str, Any] = (
+    {"max_surge_percent": 100} if "max_surge_percent" in inspect.signature(serve.deployment).parameters else {}
+)
 
 
 class BuildArguments(BaseModel):
@@ -43,6 +57,9 @@ class BuildArguments(BaseModel):
 
     replicas: int = Field(1, ge=1)
     """Processes that serve the same policies; each loads all of them."""
+
+    served: dict[str, Any] = {}
+    """Versions, aliases, canary and shadow (ServedConfig), for where `user_config` cannot be given; that wins."""
 
     settings: dict[str, Any] = {}
     """Fields of ServerSettings; what is not given comes from RLSERVO_* variables, then from the defaults."""
@@ -59,10 +76,13 @@ def build(args: BuildArguments) -> Application:
     Relative folders are taken from the directory this runs in, since a replica's own is another. Raises UsageError.
     """
     settings = ServerSettings.from_environment(args.settings)
+    ServedConfig.read(args.served)
     # A folder may exist only on the nodes that run replicas, so it is the replica that looks.
     folders = [str(Path(folder).expanduser().absolute()) for folder in args.policies]
     server: Deployment = cast("Deployment", PolicyServer)  # the decorator's type says it is still the class
-    options = server.options(num_replicas=args.replicas, max_ongoing_requests=_serve_limit(settings))
+    options = server.options(
+        num_replicas=args.replicas, max_ongoing_requests=_serve_limit(settings), user_config=args.served
+    )
     return options.bind(folders, settings.model_dump())
 
 
@@ -78,52 +98,147 @@ def _serve_limit(settings: ServerSettings) -> int:
     logging_config={"enable_access_log": False},  # a line per request costs more than the policy
     health_check_period_s=5,
     graceful_shutdown_timeout_s=5,
+    user_config={},
+    **SURGE,
 )
 @serve.ingress()
 class PolicyServer(InferenceService):
     """A replica: the policies, the HTTP application and the gRPC methods over them."""
 
     def __init__(self, folders: list[str], settings: dict[str, Any]) -> None:
-        """Load and prove every policy; Serve sends requests only after this has returned."""
+        """Check the settings. Serve calls `reconfigure` next, and sends requests only after that."""
         self._settings = ServerSettings(**settings)
+        context = serve.get_replica_context()
+        self._replica = context.replica_tag
+        self._id = context.replica_id.deployment_id
+        self._core: Core | None = None
+        self._watch: asyncio.Task[None] | None = None
         try:
             self._host = _listening_host()
             check_exposure(self._host, self._settings)
-            self._store = PolicyStore.load(folders, threads=self._settings.threads)
+            library = Library(Repository(folders), threads=self._settings.threads)
         except RlservoError as error:
-            # Ray pickles what a constructor raises and prints its text: one sentence instead of our class and details.
-            raise RuntimeError(error.message) from None
+            raise _plain(error) from None
+        self._control = Control(
+            library,
+            GcsLedger(_controller()._actor_id.hex(), context.app_name, context.deployment),
+            replica=self._replica,
+            broadcast=self._tell_all,
+            gather=self._ask_all,
+            is_current=self._is_current,
+        )
 
     def __serve_build_asgi_app__(self) -> FastAPI:  # Serve's hook: the app is built in the replica
-        app = create_app(lambda: self._store, self._settings, replica=serve.get_replica_context().replica_tag)
-        gate.is_open = app.state.core.admission.is_open
-        self.serve_grpc(app.state.core, local_only=is_loopback(self._host))
+        app = create_app(lambda: self._control.store, self._settings, replica=self._replica, control=self._control)
+        self._core = app.state.core
+        gate.is_open = self._core.admission.is_open
+        self.serve_grpc(self._core, local_only=is_loopback(self._host))
         return app
+
+    async def reconfigure(self, user_config: Any) -> None:
+        """Serve what the configuration says: Serve calls this at the start, and on `serve deploy` with another one.
+
+        Serve sends a replica nothing while this runs, so only the first call waits until all is loaded.
+        """
+        if self._control.store is None:
+            try:
+                await self._control.configure(user_config)
+            except RlservoError as error:
+                raise _plain(error) from None
+            self._watch = asyncio.create_task(self._control.watch())
+        else:
+            self._reconfiguring = asyncio.create_task(self._configure(user_config))
 
     async def check_health(self) -> None:
         """Tell Serve's controller that the event loop turns and the policies are there; if not, it replaces us."""
         await asyncio.sleep(0)
-        if not self._store.names:
-            raise RuntimeError("no policies are loaded")
+        if self._control.store is None:
+            raise RuntimeError("no policies are loaded: the deployment's user_config must be a map, and not null")
+
+    async def follow_plan(self, generation: int) -> Following:
+        """Serve a plan that another replica wrote; replicas call this of each other."""
+        return await self._control.follow(generation)
+
+    async def describe(self) -> dict[str, Any]:
+        """Return this replica's listing; replicas call this of each other."""
+        return {} if self._core is None else listing.describe(self._core)
+
+    async def _configure(self, user_config: Any) -> None:
+        try:
+            await self._control.configure(user_config)
+        except Exception:
+            logger.exception("the configuration could not be looked at; what ran before goes on")
+
+    async def _is_current(self, user_config: Any) -> bool:
+        """Whether the controller means this configuration, or already another one.
+
+        Serve starts a replica with what held when it was scheduled, and reconfigures it later (ray 2.60).
+        """
+        try:
+            current = await _controller().get_deployment_config.remote(self._id)
+        except ray.exceptions.RayError:  # the controller is coming back: nobody says otherwise
+            return True
+        return current is None or current.user_config == user_config
+
+    async def _tell_all(self, generation: int) -> list[Following]:
+        replies = await self._call_all("follow_plan", generation)
+        return [reply for reply in replies if isinstance(reply, Following)]
+
+    async def _ask_all(self) -> list[Any]:
+        return sorted(await self._call_all("describe"), key=lambda reply: str(reply.get("replica")))
+
+    async def _call_all(self, method: str, *arguments: Any) -> list[Any]:
+        """Call a method of every running replica. Raises PartlyAppliedError when one of them does not answer."""
+        handle: Any = serve.get_deployment_handle(self._id.name, self._id.app_name)
+        try:
+            replies = await handle.broadcast(method, *arguments).results_async(
+                timeout_s=FOLLOW_TIMEOUT_S, return_exceptions=True
+            )
+        except TimeoutError:
+            raise PartlyAppliedError(f"not every replica answered within {FOLLOW_TIMEOUT_S:g} s") from None
+        failures = [
+            reply
+            for reply in replies
+            if isinstance(reply, BaseException) and not isinstance(reply, ray.exceptions.ActorDiedError)
+        ]
+        if failures:
+            raise PartlyAppliedError(
+                f"{len(failures)} of {len(replies)} replicas failed to answer: {failures[0]!s:.200}"
+            )
+        return [reply for reply in replies if not isinstance(reply, BaseException)]
+
+
+def _plain(error: RlservoError) -> RuntimeError:
+    """Ray pickles what a constructor raises and prints its text: one sentence instead of our class and details."""
+    return RuntimeError(error.message)
+
+
+def _controller() -> Any:
+    """Return Serve's controller, which knows more than Serve's interface tells (ray 2.60): hence the private client."""
+    client: Any = _get_global_client()
+    return client._controller
 
 
 def _listening_host() -> str:
-    """Return the address that Serve's HTTP options name; it is where this replica's own port listens, too.
-
-    Serve tells its replicas, and nobody else (ray 2.60): hence the private client.
-    """
-    client: Any = _get_global_client()
-    options: Any = ray.get(client._controller.get_http_config.remote())
+    """Return the address that Serve's HTTP options name; it is where this replica's own port listens, too."""
+    options: Any = ray.get(_controller().get_http_config.remote())
     return str(options.host)
 
 
 def start(
-    policies: list[str], *, host: str, port: int, grpc_port: int | None, replicas: int, settings: dict[str, Any]
+    policies: list[str],
+    *,
+    host: str,
+    port: int,
+    grpc_port: int | None,
+    replicas: int,
+    served: dict[str, Any],
+    settings: dict[str, Any],
 ) -> None:
     """Start Serve in the connected Ray cluster and return when requests are answered."""
     grpc_options = gRPCOptions(port=grpc_port or 0, grpc_servicer_functions=[GRPC_SERVICE], enable_reflection=False)
     serve.start(http_options=HTTPOptions(host=host, port=port), grpc_options=grpc_options)
-    app = build(BuildArguments(policies=policies, replicas=replicas, settings=settings))
+    app = build(BuildArguments(policies=policies, replicas=replicas, served=served, settings=settings))
     serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)
 
 

@@ -55,6 +55,7 @@ def main() -> int:
             port=plan["port"],
             grpc_port=plan["grpc_port"],
             replicas=plan["replicas"],
+            served=plan["served"],
             settings=plan["settings"],
         )
     except Exception as error:

@@ -14,9 +14,11 @@ import numpy as np
 
 from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError
 from rlservo.serve_app.admission import Admission
+from rlservo.serve_app.control import Control
 from rlservo.serve_app.keys import Guard, Keys
 from rlservo.serve_app.metrics import Metrics
 from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.shadow import Shadows
 from rlservo.serve_app.store import Decision, PolicyStore
 
 StoreProvider = Callable[[], PolicyStore | None]
@@ -25,9 +27,22 @@ StoreProvider = Callable[[], PolicyStore | None]
 class Core:
     """The policies as the protocols see them; `store_provider` gives None for as long as they are being loaded."""
 
-    def __init__(self, store_provider: StoreProvider, settings: ServerSettings, *, replica: str = "") -> None:
-        """Read the keys that `settings` name; `replica` names this process in the metrics. Raises UsageError."""
+    def __init__(
+        self,
+        store_provider: StoreProvider,
+        settings: ServerSettings,
+        *,
+        replica: str = "",
+        control: Control | None = None,
+    ) -> None:
+        """Read the keys that `settings` name; `replica` names this process in the metrics. Raises UsageError.
+
+        With a `control` what is served can change while the server runs.
+        """
         self._store_provider = store_provider
+        self.control = control
+        self.replica = replica
+        self.shadows = Shadows()
         self.settings = settings
         self.guard = Guard(Keys.from_settings(settings))
         self.metrics = Metrics(replica)
@@ -66,8 +81,11 @@ class Core:
         seed: int | None = None,
         seq: int | None = None,
         deadline_ms: float | None = None,
+        session: str | None = None,
     ) -> Decision:
         """Decide for `obs`, unless `deadline_ms` have passed since `received` (`time.perf_counter`).
+
+        All requests of a `session` get the same version where a canary runs.
 
         Raises DeadlineError, TooLargeError, UnavailableError and what `PolicyStore.act` raises.
         """
@@ -84,21 +102,30 @@ class Core:
             shape = getattr(store.get(name, version).contract.observation_space, "shape", ())
             if type(obs) is dict or rows != (shape or (0,))[0]:  # not one long observation
                 raise TooLargeError(f"a batch of {rows} observations is too large: at most {self.settings.max_batch}")
-        return store.act(name, version, obs, explore=explore, seed=seed)
+        decision = store.act(name, version, obs, explore=explore, seed=seed, session=session)
+        shadow = store.shadow(name)
+        if shadow is not None and decision.version == shadow.of and not explore:
+            self.shadows.offer(shadow, obs, decision)
+        return decision
 
     def failed(self, protocol: str, name: str, version: str | None, code: str) -> None:
         """Count a request that got no action; names that are not loaded are not told apart."""
         store = self._store_provider()
         if store is None or name not in store.names:
             name = version = ""
-        elif version is not None and version not in store.versions(name):
-            version = ""
+        elif version is not None:  # an alias is counted as the version it leads to
+            version = store.version_of(name, version)
         self.metrics.failed(protocol, name, version or "", code)
 
     def exposition(self) -> bytes:
         """Return the metrics as Prometheus reads them."""
         store = self._store_provider()
-        return self.metrics.exposition({} if store is None else {name: store.versions(name) for name in store.names})
+        versions: dict[str, tuple[str, ...]] = {}
+        for name in store.names if store is not None else ():
+            assert store is not None
+            default = store.default(name)
+            versions[name] = (*(version for version in store.versions(name) if version != default), default)
+        return self.metrics.exposition(versions, self.shadows.families(self.replica))
 
 
 def _rows(obs: Any) -> int:

@@ -18,6 +18,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from rlservo.export.errors import (
     ActionError,
+    ConflictError,
     DeadlineError,
     ForbiddenError,
     MediaTypeError,
@@ -42,6 +43,7 @@ STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; w
     (TooLargeError, 413),
     (RequestError, 400),
     (DeadlineError, 408),
+    (ConflictError, 409),
     (UnavailableError, 503),
     (UnauthenticatedError, 401),
     (ForbiddenError, 403),
@@ -196,6 +198,14 @@ def check_length(headers: list[tuple[bytes, bytes]], max_bytes: int) -> None:
 
 def too_large(limit: int) -> TooLargeError:
     return TooLargeError(f"the request body is larger than {limit} bytes", {"max_body_bytes": limit})
+
+
+def session_of(scope: Scope) -> str | None:
+    """Return the session that the header `x-session-id` names; Ray Serve's own routing knows it, too."""
+    for name, value in scope["headers"]:
+        if name == b"x-session-id":
+            return str(value.decode("latin-1"))
+    return None
 
 
 # Errors: the one table above, and one body for all.

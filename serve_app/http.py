@@ -19,7 +19,9 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from rlservo.export.bundle import Contract, contract_json
 from rlservo.export.errors import MediaTypeError, ObservationError, RequestError, RlservoError
-from rlservo.serve_app import edge, oip, wire
+from rlservo.serve_app import edge, listing, oip, wire
+from rlservo.serve_app.admin import add_admin
+from rlservo.serve_app.control import Control
 from rlservo.serve_app.core import Core, StoreProvider
 from rlservo.serve_app.docs import add_docs
 from rlservo.serve_app.edge import JSON, JSON_HEADERS, BareRoute, Body, Endpoint, Headers
@@ -34,12 +36,19 @@ ACT_VERSION_PATH = "/v1/policies/{name}/versions/{version}/act"
 ACT_PATTERN = re.compile(r"/v1/policies/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/act")
 
 
-def create_app(store_provider: StoreProvider, settings: ServerSettings, *, replica: str = "") -> FastAPI:
+def create_app(
+    store_provider: StoreProvider,
+    settings: ServerSettings,
+    *,
+    replica: str = "",
+    control: Control | None = None,
+) -> FastAPI:
     """Return the application; `store_provider` gives None for as long as the policies are being loaded.
 
+    With a `control` what is served can be administered. The application's `state.core` is the core under it.
     Raises UsageError when the API keys that `settings` name cannot be read.
     """
-    core = Core(store_provider, settings, replica=replica)
+    core = Core(store_provider, settings, replica=replica, control=control)
     act = Endpoint("json", _Act(core), _check_headers, core)
     infer = oip.endpoint(core)
     app = PolicyApp(
@@ -51,10 +60,12 @@ def create_app(store_provider: StoreProvider, settings: ServerSettings, *, repli
         docs_url=None,
         redoc_url=None,
     )
-    app.state.core = core  # for gRPC, which is no part of the application
+    app.state.core = core  # for gRPC and the replica, which are no part of the application
     _add_act(app, act)
     _add_policies(app, core)
     _add_health(app, core)
+    if control is not None:
+        add_admin(app, core, control)
     oip.add_routes(app, core, infer)
     if settings.docs:
         add_docs(app)
@@ -127,6 +138,7 @@ class _Act:
                 seed=request.seed,
                 seq=request.seq,
                 deadline_ms=request.deadline_ms,
+                session=request.session or edge.session_of(scope),
             )
         except ObservationError as error:
             if request.non_finite:
@@ -139,8 +151,8 @@ class _Act:
 
 def _add_act(app: FastAPI, act: ASGIApp) -> None:
     for path, operation, summary in (
-        (ACT_PATH, "act", "Act with the newest version"),
-        (ACT_VERSION_PATH, "act_version", "Act with one version"),
+        (ACT_PATH, "act", "Act with the default version"),
+        (ACT_VERSION_PATH, "act_version", "Act with one version, or with what an alias leads to"),
     ):
         app.router.routes.append(
             BareRoute(
@@ -159,26 +171,14 @@ def _add_act(app: FastAPI, act: ASGIApp) -> None:
 def _add_policies(app: FastAPI, core: Core) -> None:
     store = core.store
 
-    @app.get("/v1/policies", tags=["policies"], summary="What is served", response_model=wire.PolicyList)
+    @app.get("/v1/policies", tags=["policies"], summary="What is served", response_model=listing.PolicyList)
     async def list_policies() -> Response:
-        policies = []
-        for name in store().names:
-            contract = store().get(name).contract
-            policies.append(
-                {
-                    "name": name,
-                    "version": contract.version,
-                    "versions": list(store().versions(name)),
-                    "description": contract.description,
-                    "control_rate_hz": contract.control_rate_hz,
-                }
-            )
-        return _json(200, {"policies": policies})
+        return _json(200, listing.describe(core))
 
     @app.get(
         "/v1/policies/{name}",
         tags=["policies"],
-        summary="A policy's contract (the newest version)",
+        summary="A policy's contract (the default version)",
         response_model=Contract,
         responses=edge.error_models(404, 503),
     )
@@ -188,7 +188,7 @@ def _add_policies(app: FastAPI, core: Core) -> None:
     @app.get(
         "/v1/policies/{name}/versions/{version}",
         tags=["policies"],
-        summary="One version's contract",
+        summary="The contract of a version, or of what an alias leads to",
         response_model=Contract,
         responses=edge.error_models(404, 503),
     )

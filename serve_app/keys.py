@@ -61,6 +61,8 @@ class Keys:
     """The keys a server accepts; none at all means that it asks for none."""
 
     keys: tuple[Key, ...] = ()
+    operator: Key | None = None
+    """For administration; a server with this one alone still asks nobody for a key who only wants actions."""
 
     @classmethod
     def from_settings(cls, settings: ServerSettings) -> Self:
@@ -83,13 +85,14 @@ class Keys:
             raise UsageError(
                 "the key settings name no key, and would leave the server open: add one, or leave them out"
             )
-        return cls(tuple(keys))
+        digest = settings.operator_key.removeprefix("sha256:")
+        return cls(tuple(keys), Key("operator", Role.admin, bytes.fromhex(digest)) if digest else None)
 
     def find(self, presented: bytes) -> Key | None:
         """Return the key that was presented. Every kept digest is compared, each in constant time."""
         digest = hashlib.sha256(presented).digest()
         found = None
-        for key in self.keys:
+        for key in self.keys if self.operator is None else (*self.keys, self.operator):
             if hmac.compare_digest(digest, key.digest):
                 found = key
         return found
@@ -104,10 +107,10 @@ class Guard:
     def check(self, scope: Scope, path: str) -> None:
         """Raise UnauthenticatedError or ForbiddenError unless this request may go on.
 
-        Without keys everything may but administration, which always needs an admin key.
+        Without keys everything may but administration, which always needs an admin key, or the operator's.
         """
         admin = ADMIN.fullmatch(path) is not None
-        if not self._keys.keys:
+        if not self._keys.keys and not (admin and self._keys.operator):
             if admin:
                 raise ForbiddenError(
                     "administration needs an admin key, and this server has none: see 'rlservo key --help'"
@@ -117,7 +120,8 @@ class Guard:
             return
         presented = _presented(scope["headers"])
         if presented is None:
-            raise UnauthenticatedError("this server wants an API key: send 'Authorization: Bearer KEY'")
+            what = "administration needs an admin" if admin else "this server wants an API"
+            raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
         key = self._keys.find(presented)
         if key is None:
             raise UnauthenticatedError("this API key is not known to the server")

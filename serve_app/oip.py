@@ -27,7 +27,18 @@ from rlservo.export.bundle import Contract, TensorSpec
 from rlservo.export.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.serve_app import wire
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.edge import JSON_HEADERS, BareRoute, Body, Endpoint, Headers, error_models, read_body, too_large
+from rlservo.serve_app.edge import (
+    JSON_HEADERS,
+    BareRoute,
+    Body,
+    Endpoint,
+    Headers,
+    error_models,
+    read_body,
+    session_of,
+    too_large,
+)
+from rlservo.serve_app.listing import states_of
 from rlservo.serve_app.store import Decision
 from rlservo.serve_app.tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor
 
@@ -44,6 +55,7 @@ TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
 IGNORED = frozenset({"priority", TIMEOUT, "headers", "content_type"})
 SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits one packet either way
 COMPRESSION_LEVEL = 1  # numbers of a robot hardly compress; a control loop waits for them
+STATES = {"ready": "READY", "loading": "LOADING", "failed": "UNAVAILABLE"}
 SUCH_AS = '{"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [...]}]}'
 
 
@@ -141,7 +153,13 @@ class _Infer:
         else:
             document, inputs, non_finite = _read_request(view, length)
         decision, seq, binary = decide(
-            self._core, params["name"], params.get("version"), document, inputs, received=received
+            self._core,
+            params["name"],
+            params.get("version"),
+            document,
+            inputs,
+            received=received,
+            session=session_of(scope),
         )
         if non_finite:
             wire.refuse_non_finite()
@@ -160,6 +178,7 @@ def decide(
     *,
     received: float,
     deadline_ms: float | None = None,
+    session: str | None = None,
 ) -> tuple[Decision, int | None, bool]:
     """Return (decision, seq, whether the output is to be binary) for a request of either transport.
 
@@ -172,7 +191,15 @@ def decide(
     binary = _wants_binary(document, parameters)
     obs = _observation(core.store().get(name, version).contract, inputs)
     decision = core.act(
-        name, version, obs, received=received, explore=explore, seed=seed, seq=seq, deadline_ms=deadline_ms
+        name,
+        version,
+        obs,
+        received=received,
+        explore=explore,
+        seed=seed,
+        seq=seq,
+        deadline_ms=deadline_ms,
+        session=session,
     )
     return decision, seq, binary
 
@@ -348,8 +375,12 @@ def add_routes(app: FastAPI, core: Core, infer: Endpoint) -> None:
     _add_health(app, core)
     _add_models(app, core)
     for path, operation, summary in (
-        ("/v2/models/{name}/infer", "infer", "Infer with the newest version"),
-        ("/v2/models/{name}/versions/{version}/infer", "infer_version", "Infer with one version"),
+        ("/v2/models/{name}/infer", "infer", "Infer with the default version"),
+        (
+            "/v2/models/{name}/versions/{version}/infer",
+            "infer_version",
+            "Infer with one version, or with what an alias leads to",
+        ),
     ):
         app.router.routes.append(
             BareRoute(
@@ -428,10 +459,11 @@ def _add_models(app: FastAPI, core: Core) -> None:
     async def index(request: Request) -> Response:
         settings = core.settings
         body = await read_body(request.receive, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+        ready = False
         if body:
             document, _ = wire.read_json(body, such_as='{"ready": true}')
-            flag(document, "ready")  # all that are here are ready
-        return _json(repository_index(core))
+            ready = bool(flag(document, "ready"))
+        return _json(repository_index(core, ready=ready))
 
 
 # What can be asked, as the protocol's documents; gRPC's messages have the same fields.
@@ -442,13 +474,14 @@ def server_metadata() -> dict[str, Any]:
     return {"name": "rlservo", "version": _version(), "extensions": EXTENSIONS}
 
 
-def repository_index(core: Core) -> list[dict[str, str]]:
-    """Return every version of every model."""
-    store = core.store()
+def repository_index(core: Core, *, ready: bool = False) -> list[dict[str, str]]:
+    """Return every version of every model and how it stands; `ready` leaves the others out."""
+    core.store()
     return [
-        {"name": name, "version": version, "state": "READY", "reason": ""}
-        for name in store.names
-        for version in store.versions(name)
+        {"name": name, "version": version, "state": STATES[state.state], "reason": state.reason}
+        for name, versions in states_of(core).items()
+        for version, state in versions.items()
+        if state.state == "ready" or not ready
     ]
 
 

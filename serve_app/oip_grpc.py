@@ -187,8 +187,9 @@ class Grpc:
         asked = _parse(messages.ModelMetadataRequest, request[0])
         return messages.ModelMetadataResponse(**oip.model_metadata(self._core, asked.name, asked.version or None))
 
-    def _index(self, _request: Incoming) -> Any:
-        return messages.RepositoryIndexResponse(models=oip.repository_index(self._core))
+    def _index(self, request: Incoming) -> Any:
+        asked = _parse(messages.RepositoryIndexRequest, request[0])
+        return messages.RepositoryIndexResponse(models=oip.repository_index(self._core, ready=asked.ready))
 
     def _infer(self, request: Incoming) -> Any:
         content, remaining_s = request

@@ -56,6 +56,9 @@ class ServerSettings(BaseModel):
     api_keys: str = Field("", repr=False)
     """The same lines, separated by commas, for where a variable is easier to set than a file."""
 
+    operator_key: str = Field("", repr=False, pattern=r"^(sha256:[0-9a-f]{64})?$")
+    """`sha256:<hash>` of a key for administration alone; unlike `api_keys` it asks nobody else for a key."""
+
     allow_unauthenticated: bool = False
     """Listen beyond this machine without any key: whoever reaches the port can ask for actions."""
 

@@ -1,10 +1,13 @@
-"""The policies a server holds: names, versions, and the one call every protocol makes, `PolicyStore.act`.
+"""The policies a server holds: names, versions, aliases, and the one call every protocol makes, `PolicyStore.act`.
 
+A store does not change: what should be served otherwise is another store, and whoever began with one ends with it.
 It knows nothing of HTTP, gRPC or WebSockets; each of those is a thin file over it.
 """
 
 from __future__ import annotations
 
+import hashlib
+import random
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -21,6 +24,7 @@ from rlservo.export.errors import (
     UsageError,
 )
 from rlservo.serve_app.acting import Observation
+from rlservo.serve_app.plan import PolicyPlan
 from rlservo.serve_app.policy import Policy
 
 
@@ -36,11 +40,31 @@ class Decision:
     batch: int | None = None  # how many observations there were; None for one that came alone
 
 
-class PolicyStore:
-    """Several policies in several versions; the newest version of a name is its default."""
+@dataclass(frozen=True, slots=True)
+class _Canary:
+    policy: Policy
+    share: float
+    needs_session: bool  # a policy with a memory cannot change in the middle of an episode
 
-    def __init__(self, policies: Iterable[Policy]) -> None:
-        """Take loaded policies. Raises UsageError when two have the same name and version, or when there is none."""
+
+@dataclass(frozen=True, slots=True)
+class Shadow:
+    """A version that computes along with the default one."""
+
+    of: str  # the default version
+    version: str
+    policy: Policy
+
+
+class PolicyStore:
+    """Several policies in several versions; a name's default is its `production` alias, else its newest version."""
+
+    def __init__(self, policies: Iterable[Policy], plans: Mapping[str, PolicyPlan] | None = None) -> None:
+        """Take loaded policies, and by name which are to do what.
+
+        A plan may name versions that are not among the policies; where it leads to one, that part of it is left out.
+        Raises UsageError when two have the same name and version, or, without plans, when there is none.
+        """
         self._policies: dict[str, dict[str, Policy]] = {}
         for policy in policies:
             name, version = policy.contract.name, policy.contract.version
@@ -53,13 +77,16 @@ class PolicyStore:
                     "serve one of them, or export one under another name or version"
                 )
             versions[version] = policy
-        if not self._policies:
+        if not self._policies and plans is None:
             raise UsageError("no policy to serve: give at least one bundle folder")
         for name, versions in self._policies.items():
             self._policies[name] = dict(sorted(versions.items(), key=lambda item: version_key(item[0])))
-        self._newest = {
-            name: (list(versions)[-1], list(versions.values())[-1]) for name, versions in self._policies.items()
-        }
+        self._aliases: dict[str, dict[str, Policy]] = {}
+        self._default: dict[str, Policy] = {}
+        self._canary: dict[str, _Canary] = {}
+        self._shadow: dict[str, Shadow] = {}
+        for name, versions in self._policies.items():
+            self._arrange(name, versions, (plans or {}).get(name) or PolicyPlan(versions=dict.fromkeys(versions, "")))
 
     @classmethod
     def load(cls, paths: Iterable[str | Path], *, threads: int = 1) -> PolicyStore:
@@ -94,32 +121,71 @@ class PolicyStore:
         return tuple(sorted(self._policies))
 
     def versions(self, name: str) -> tuple[str, ...]:
-        """The versions of a policy, oldest first; the last one is the default. Raises UnknownPolicyError."""
+        """The versions of a policy, oldest first. Raises UnknownPolicyError."""
         return tuple(self._versions(name))
 
+    def default(self, name: str) -> str:
+        """The version of whoever asks for none. Raises UnknownPolicyError."""
+        return self.get(name).contract.version
+
     def get(self, name: str, version: str | None = None) -> Policy:
-        """Return a policy; None is its newest version. Raises UnknownPolicyError or UnknownVersionError."""
+        """Return a policy by version or alias; None is its default.
+
+        Raises UnknownPolicyError or UnknownVersionError.
+        """
         if version is None:
-            newest = self._newest.get(name)
-            if newest is not None:
-                return newest[1]
+            default = self._default.get(name)
+            if default is not None:
+                return default
         versions = self._versions(name)
-        policy = versions.get(version or "")
+        policy = versions.get(version or "") or self._aliases[name].get(version or "")
         if policy is None:
+            aliases = self._aliases[name]
+            also = f", aliases are {', '.join(aliases)}" if aliases else ""
             raise UnknownVersionError(
-                f"policy '{name}' has no version '{str(version)[:32]}': loaded are {', '.join(versions)}",
-                {"policy": name, "versions": list(versions)},
+                f"policy '{name}' has no version '{str(version)[:32]}': loaded are {', '.join(versions)}{also}",
+                {"policy": name, "versions": list(versions), "aliases": list(aliases)},
             )
         return policy
 
+    def version_of(self, name: str, reference: str) -> str:
+        """Return the version that a version or an alias means, '' where there is none."""
+        try:
+            return self.get(name, reference).contract.version
+        except UnknownPolicyError:
+            return ""
+
+    def choose(self, name: str, version: str | None, session: str | None) -> Policy:
+        """Return the policy that a request gets: as `get`, but where a canary runs, a share of the sessions get that.
+
+        All requests of a session get the same one, on every replica, for as long as the share does not change; a larger
+        share keeps those it had. Raises what `get` raises.
+        """
+        if version is None and self._canary:
+            canary = self._canary.get(name)
+            if canary is not None and _draw(name, session, canary.needs_session) < canary.share:
+                return canary.policy
+        return self.get(name, version)
+
+    def shadow(self, name: str) -> Shadow | None:
+        """Return the version that computes along, if there is one."""
+        return self._shadow.get(name)
+
     def act(
-        self, name: str, version: str | None, obs: Observation, *, explore: bool = False, seed: int | None = None
+        self,
+        name: str,
+        version: str | None,
+        obs: Observation,
+        *,
+        explore: bool = False,
+        seed: int | None = None,
+        session: str | None = None,
     ) -> Decision:
         """Decide for `obs`: an action for one observation, a batch for a batch.
 
         Raises UnknownPolicyError, UnknownVersionError and what `Policy.act` raises.
         """
-        policy = self.get(name, version)
+        policy = self.choose(name, version, session)
         if policy.contract.state:  # its memory belongs to one episode, and a server has many callers
             raise RequestError(
                 f"policy '{name}' remembers its episode (state {', '.join(s.name for s in policy.contract.state)}), "
@@ -138,11 +204,30 @@ class PolicyStore:
             for policy in versions.values():
                 policy.close()
 
+    def _arrange(self, name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> None:
+        self._aliases[name] = {alias: versions[v] for alias, v in sorted(plan.aliases.items()) if v in versions}
+        default = versions.get(plan.default or "") or list(versions.values())[-1]
+        self._default[name] = default
+        canary = plan.canary and versions.get(plan.version_of(plan.canary.version) or "")
+        if canary and plan.canary:
+            self._canary[name] = _Canary(canary, plan.canary.share, bool(canary.contract.state))
+        shadow = versions.get((plan.shadow and plan.version_of(plan.shadow)) or "")
+        if shadow is not None and shadow is not default:
+            self._shadow[name] = Shadow(default.contract.version, shadow.contract.version, shadow)
+
     def _versions(self, name: str) -> Mapping[str, Policy]:
         versions = self._policies.get(name)
         if versions is None:
             raise UnknownPolicyError(
-                f"no policy '{name[:64]}' is loaded: this server has {', '.join(self.names)}",
+                f"no policy '{name[:64]}' is loaded: this server has {', '.join(self.names) or 'none'}",
                 {"policies": list(self.names)},
             )
         return versions
+
+
+def _draw(name: str, session: str | None, needs_session: bool) -> float:
+    """Return a number in [0, 1): the session's own, or without one a random one."""
+    if session is None:
+        return 1.0 if needs_session else random.random()
+    digest = hashlib.blake2b(f"{name}/{session}".encode("utf-8", "surrogatepass"), digest_size=8).digest()
+    return (int.from_bytes(digest, "big") >> 11) * 2.0**-53

@@ -15,6 +15,7 @@ import asyncio
 import contextlib
 import logging
 import re
+import secrets
 import sys
 import time
 from collections.abc import Mapping
@@ -28,7 +29,7 @@ from rlservo.serve_app import wire
 from rlservo.serve_app.admission import IdleTimer
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.edge import encode_bug, error_answer, status_of
+from rlservo.serve_app.edge import encode_bug, error_answer, session_of, status_of
 from rlservo.serve_app.keys import check_origin
 
 logger = logging.getLogger(__name__)
@@ -68,7 +69,8 @@ class Stream:
         try:
             with self._core.admission.streaming():
                 await send(_binary(pack(_metadata(contract))))
-                await self._answer(name, version, receive, send, idle)
+                session = session_of(scope) or secrets.token_hex(8)
+                await self._answer(name, version, session, receive, send, idle)
         except asyncio.CancelledError:
             if not idle.expired:
                 raise
@@ -89,7 +91,9 @@ class Stream:
             idle.stop()
             self._core.metrics.stream(name, -1)
 
-    async def _answer(self, name: str, version: str | None, receive: Receive, send: Send, idle: IdleTimer) -> None:
+    async def _answer(
+        self, name: str, version: str | None, session: str, receive: Receive, send: Send, idle: IdleTimer
+    ) -> None:
         previous_ms: float | None = None
         while True:
             message = await receive()
@@ -100,7 +104,15 @@ class Stream:
             obs, options = self._read(message)
             explore, seed, seq, deadline_ms = wire.read_options(options) if options else (False, None, None, None)
             decision = self._core.act(
-                name, version, obs, received=received, explore=explore, seed=seed, seq=seq, deadline_ms=deadline_ms
+                name,
+                version,
+                obs,
+                received=received,
+                explore=explore,
+                seed=seed,
+                seq=seq,
+                deadline_ms=deadline_ms,
+                session=session,
             )
             timing = {"infer_ms": decision.infer_ms}
             if previous_ms is not None:

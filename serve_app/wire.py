@@ -42,7 +42,9 @@ class ActRequest(BaseModel):
         "not done: 408.",
     )
     state: Any = Field(None, description="Recurrent state. Refused: the policies this server runs are stateless.")
-    session_id: str | None = Field(None, description="Server-held state. Refused, as `state` is.")
+    session_id: str | None = Field(
+        None, description="All requests of a session get the same version where a canary runs (or header x-session-id)."
+    )
 
 
 class ActReply(BaseModel):
@@ -63,20 +65,6 @@ class ErrorReply(BaseModel):
     details: dict[str, Any] | None = None
 
 
-class PolicySummary(BaseModel):
-    """A line of `GET /v1/policies`."""
-
-    name: str
-    version: str = Field(description="The default: the newest.")
-    versions: list[str] = Field(description="Oldest first.")
-    description: str
-    control_rate_hz: float | None
-
-
-class PolicyList(BaseModel):
-    policies: list[PolicySummary]
-
-
 @dataclass(frozen=True, slots=True)
 class Act:
     """An act request whose form has been checked; the observation itself is the policy's to judge."""
@@ -87,11 +75,12 @@ class Act:
     seq: int | None
     deadline_ms: float | None
     non_finite: bool = False  # the body held NaN or Infinity, which JSON does not have
+    session: str | None = None
 
 
 KNOWN = frozenset(ActRequest.model_fields)
 OPTIONS = ("explore", "seed", "seq", "deadline_ms")
-STATEFUL = ("state", "session_id")
+STATEFUL = ("state",)
 
 
 def read_request(body: bytes | bytearray) -> Act:
@@ -106,7 +95,10 @@ def read_request(body: bytes | bytearray) -> Act:
     if len(document) == 1 and not non_finite:  # the usual request
         return Act(document["obs"], False, None, None, None)
     _check_fields(document)
-    return Act(document["obs"], *read_options(document), non_finite)
+    session = document.get("session_id")
+    if session is not None and type(session) is not str:
+        raise RequestError(f"'session_id' must be a string, got {json_type(session)}")
+    return Act(document["obs"], *read_options(document), non_finite, session)
 
 
 def read_json(body: bytes | bytearray | memoryview, *, such_as: str) -> tuple[dict[str, Any], bool]:

@@ -135,7 +135,7 @@ def test_exploring_is_repeatable_by_seed(ask: Ask) -> None:
         ({"obs": OBS, "observation": OBS}, 400, "bad-request", "unknown field 'observation': known are deadline_ms"),
         ({"observation": OBS}, 400, "bad-request", "unknown field 'observation'"),
         ({"obs": OBS, "state": {}}, 400, "bad-request", "'state' is for recurrent policies"),
-        ({"obs": OBS, "session_id": "a"}, 400, "bad-request", "'session_id' is for recurrent policies"),
+        ({"obs": OBS, "session_id": 7}, 400, "bad-request", "'session_id' must be a string"),
         ({"obs": OBS, "explore": 1}, 400, "bad-request", "'explore' must be true or false"),
         ({"obs": OBS, "seed": -1}, 400, "bad-request", "'seed' must be in 0"),
         ({"obs": OBS, "seed": True}, 400, "bad-request", "'seed' must be an integer, got true"),

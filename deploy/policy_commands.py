@@ -1,0 +1,293 @@
+"""The commands `rlservo policy ...`, and the options of `rlservo serve` about versions; the work is in serve_app."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from rlservo.export.errors import UsageError
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.admin_client import AdminClient
+
+policy = typer.Typer(
+    help="Say what a running server serves: versions, aliases, rollback, canary, shadow; on all of its replicas.",
+    no_args_is_help=True,
+)
+_out = Console()
+
+Url = Annotated[str, typer.Option(help="The server.")]
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(help="File with the admin key; else RLSERVO_ADMIN_KEY, else the one 'rlservo serve' wrote here."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document for programs.")]
+Name = Annotated[str, typer.Argument(help="Policy name.")]
+LOCAL = "http://127.0.0.1:8000"
+
+
+@policy.command("list")
+def list_policies(url: Url = LOCAL, key_file: KeyFile = None, as_json: Json = False) -> None:
+    """Show what every replica serves, since when, and what was refused.
+
+    Example: `rlservo policy list`
+    """
+    with _client(url, key_file) as client:
+        replicas = client.replicas()
+    if as_json:
+        print(json.dumps(replicas, indent=2))
+        return
+    for replica in replicas:
+        _out.print(_table(replica))
+        for sentence in replica["behind"]:
+            _out.print(f"behind: {sentence}", style="red", markup=False, highlight=False, soft_wrap=True)
+        if replica["refused"] is not None:
+            refused = f"refused: {replica['refused']['change']} at {replica['refused']['at']}: "
+            _out.print(refused + replica["refused"]["reason"], style="red", markup=False, highlight=False)
+
+
+@policy.command()
+def load(
+    name: Name,
+    version: Annotated[str | None, typer.Argument(help="The repository's newest by default.")] = None,
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    as_json: Json = False,
+) -> None:
+    """Load a version and prove it, so that an alias may lead there.
+
+    Example: `rlservo policy load ur5 4`
+    """
+    with _client(url, key_file) as client:
+        _show(client.load(name, version), as_json)
+
+
+@policy.command()
+def unload(
+    name: Name,
+    version: Annotated[str | None, typer.Argument(help="The whole policy by default.")] = None,
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    as_json: Json = False,
+) -> None:
+    """Drop a version that nothing leads to, or a whole policy.
+
+    Example: `rlservo policy unload ur5 3`
+    """
+    with _client(url, key_file) as client:
+        _show(client.unload(name, version), as_json)
+
+
+@policy.command()
+def alias(
+    name: Name,
+    pair: Annotated[str, typer.Argument(metavar="ALIAS=VERSION", help="ALIAS= removes it.")],
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    as_json: Json = False,
+) -> None:
+    """Let an alias lead to a loaded version; `production` is what clients get that ask for none.
+
+    Example: `rlservo policy alias ur5 production=4`
+    """
+    key, version = _pair(pair, "production=4")
+    with _client(url, key_file) as client:
+        _show(client.alias(name, key, version or None), as_json)
+
+
+@policy.command()
+def rollback(
+    name: Name,
+    alias: Annotated[str, typer.Option(help="Which alias.")] = "production",
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    as_json: Json = False,
+) -> None:
+    """Let an alias lead where it led before; once more goes one further back.
+
+    Example: `rlservo policy rollback ur5`
+    """
+    with _client(url, key_file) as client:
+        _show(client.rollback(name, alias), as_json)
+
+
+@policy.command()
+def canary(
+    name: Name,
+    pair: Annotated[str, typer.Argument(metavar="VERSION=SHARE|off", help="A version or alias, and 0 < share <= 1.")],
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    as_json: Json = False,
+) -> None:
+    """Send a share of the sessions to another version, or end that.
+
+    Example: `rlservo policy canary ur5 candidate=0.1`
+    """
+    version, share = (None, None) if pair == "off" else _share(pair)
+    with _client(url, key_file) as client:
+        _show(client.canary(name, version, share), as_json)
+
+
+@policy.command()
+def shadow(
+    name: Name,
+    version: Annotated[str, typer.Argument(metavar="VERSION|off", help="A version or alias.")],
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    as_json: Json = False,
+) -> None:
+    """Let another version compute along and record how its actions differ, or end that.
+
+    Example: `rlservo policy shadow ur5 candidate`
+    """
+    with _client(url, key_file) as client:
+        _show(client.shadow(name, None if version == "off" else version), as_json)
+
+
+# What `rlservo serve` says of versions.
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", help="YAML or JSON file of versions, aliases, canary and shadow, as in serve.yaml."),
+]
+VersionsOption = Annotated[
+    list[str] | None,
+    typer.Option("--versions", metavar="NAME=VERSION,...", help="Versions to load; all of the repository by default."),
+]
+AliasOption = Annotated[
+    list[str] | None, typer.Option("--alias", metavar="NAME:ALIAS=VERSION", help="ur5:production=3, say; repeat it.")
+]
+CanaryOption = Annotated[
+    list[str] | None,
+    typer.Option("--canary", metavar="NAME:VERSION=SHARE", help="Share of the sessions for another version."),
+]
+ShadowOption = Annotated[
+    list[str] | None,
+    typer.Option("--shadow", metavar="NAME=VERSION", help="Version that computes along, only to be compared."),
+]
+
+
+def served_config(
+    file: Path | None,
+    versions: list[str] | None,
+    aliases: list[str] | None,
+    canaries: list[str] | None,
+    shadows: list[str] | None,
+) -> dict[str, Any]:
+    """Return the configuration that the file and the options of `rlservo serve` mean; options win.
+
+    Raises UsageError.
+    """
+    document = _read_config(file) if file is not None else {}
+    policies = document.setdefault("policies", {})
+
+    def of(name: str) -> dict[str, Any]:
+        entry: dict[str, Any] = policies.setdefault(name, {})
+        return entry
+
+    for given in versions or ():
+        name, listed = _pair(given, "ur5=3,4")
+        of(name)["versions"] = listed.split(",")
+    for given in aliases or ():
+        name, pair = _of_policy(given, "ur5:production=3")
+        key, version = _pair(pair, "ur5:production=3")
+        of(name).setdefault("aliases", {})[key] = version
+    for given in canaries or ():
+        name, pair = _of_policy(given, "ur5:candidate=0.1")
+        version, share = _share(pair)
+        of(name)["canary"] = {"version": version, "share": share}
+    for given in shadows or ():
+        name, version = _pair(given, "ur5=candidate")
+        of(name)["shadow"] = version
+    return document
+
+
+def _read_config(file: Path) -> dict[str, Any]:
+    text = file.read_text(encoding="utf-8", errors="replace")
+    try:
+        document = json.loads(text) if file.suffix == ".json" else _read_yaml(text)
+    except ValueError as error:
+        raise UsageError(f"{file} cannot be read: {' '.join(str(error).split())[:300]}") from None
+    if not isinstance(document, dict) or not isinstance(document.get("policies", {}), dict):
+        raise UsageError(f"{file}: expected a map with 'policies', as user_config in deploy/serve.yaml")
+    return document
+
+
+def _read_yaml(text: str) -> Any:
+    try:
+        import yaml
+    except ModuleNotFoundError:
+        raise UsageError("reading YAML needs the Python package 'pyyaml'; a .json file needs nothing") from None
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from None
+
+
+def _pair(given: str, example: str) -> tuple[str, str]:
+    left, equals, right = given.partition("=")
+    if not left or not equals:
+        raise UsageError(f"{given!r}: expected for example {example}")
+    return left, right
+
+
+def _of_policy(given: str, example: str) -> tuple[str, str]:
+    name, colon, rest = given.partition(":")
+    if not name or not colon:
+        raise UsageError(f"{given!r}: expected for example {example}")
+    return name, rest
+
+
+def _share(pair: str) -> tuple[str, float]:
+    version, share = _pair(pair, "candidate=0.1")
+    try:
+        return version, float(share)
+    except ValueError:
+        raise UsageError(f"{pair!r}: expected a share such as 0.1 after '='") from None
+
+
+@contextlib.contextmanager
+def _client(url: str, key_file: Path | None) -> Iterator[AdminClient]:
+    try:
+        from rlservo.serve_app.admin_client import AdminClient, find_key
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"this command needs the Python package {error.name!r}: pip install 'rlservo[client]'"
+        ) from error
+    with AdminClient(url, api_key=find_key(url, key_file)) as client:
+        yield client
+
+
+def _show(reply: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(reply, indent=2))
+        return
+    aliases = ", ".join(f"{alias}={version}" for alias, version in reply["aliases"].items()) or "none"
+    lines = [f"{reply['policy']}: default {reply['default']}, loaded {', '.join(reply['versions']) or 'none'}"]
+    lines.append(f"aliases {aliases}")
+    if reply["canary"] is not None:
+        lines.append(f"canary {reply['canary']['version']} gets {reply['canary']['share']:g} of the sessions")
+    if reply["shadow"] is not None:
+        lines.append(f"shadow {reply['shadow']}")
+    _out.print("; ".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def _table(replica: dict[str, Any]) -> Table:
+    table = Table(title=f"replica {replica['replica']}, generation {replica['generation']} ({replica['changed_by']})")
+    for column in ("policy", "version", "state", "aliases", "since", "requests", "reason"):
+        table.add_column(column)
+    for each in replica["policies"]:
+        for version in each["version_states"]:
+            marks = [*version["aliases"]]
+            if version["version"] == each["version"] and "production" not in marks:
+                marks.append("(default)")
+            state = (version["version"], version["state"], ", ".join(marks), version["loaded_at"] or "")
+            table.add_row(each["name"], *state, str(version["requests"]), version["reason"])
+    return table

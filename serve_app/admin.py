@@ -1,0 +1,177 @@
+"""Administration over HTTP: load, unload, aliases, rollback, canary, shadow, on every replica at once.
+
+Every command answers when all replicas serve the change, or says which do not and why. `keys.Guard` lets nobody in
+without an admin key. The Open Inference Protocol's `load` and `unload` are two of these under other names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import orjson
+from fastapi import Body, FastAPI
+from fastapi.responses import Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from rlservo.export.errors import RequestError
+from rlservo.serve_app import listing, plan, wire
+from rlservo.serve_app.control import Change, Control
+from rlservo.serve_app.core import Core
+from rlservo.serve_app.edge import error_models
+from rlservo.serve_app.library import digest_of
+from rlservo.serve_app.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
+
+Route = TypeVar("Route", bound=Callable[..., Any])
+
+
+class _Command(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class LoadCommand(_Command):
+    version: Version | None = Field(None, description="The repository's newest when left out.")
+
+
+class UnloadCommand(_Command):
+    version: Version | None = Field(None, description="The whole policy when left out.")
+
+
+class AliasCommand(_Command):
+    alias: Alias = Field(description="`production` is the default version.")
+    version: Version | None = Field(description="A loaded version; null removes the alias.")
+
+
+class RollbackCommand(_Command):
+    alias: Alias = PRODUCTION
+
+
+class CanaryCommand(_Command):
+    version: Reference | None = Field(description="A loaded version or an alias; null ends the canary.")
+    share: float | None = Field(None, ge=0, le=1, description="Of the sessions; 0 ends the canary.")
+
+
+class ShadowCommand(_Command):
+    version: Reference | None = Field(description="A loaded version or an alias; null ends the shadow.")
+
+
+class RepositoryCommand(BaseModel):
+    """Triton's clients send parameters of their own, which mean nothing here."""
+
+    parameters: dict[str, Any] | None = None
+
+
+class Changed(BaseModel):
+    """A change that every replica serves."""
+
+    generation: int
+    policy: str
+    default: str | None = Field(description="The default version; null when the policy is no longer served.")
+    versions: list[str]
+    aliases: dict[str, str]
+    canary: Canary | None
+    shadow: str | None
+
+
+def add_admin(app: FastAPI, core: Core, control: Control) -> None:
+    """Add /v1/admin and the repository extension's load and unload to the application."""
+    errors = error_models(400, 401, 403, 404, 409, 503)
+
+    def command(path: str, summary: str) -> Callable[[Route], Route]:
+        return app.post(
+            f"/v1/admin/policies/{{name}}/{path}",
+            tags=["admin"],
+            summary=summary,
+            response_model=Changed,
+            responses=errors,
+        )
+
+    async def changed(name: str, what: str, change: Change) -> Response:
+        return _answer(name, await control.change(change, what=what))
+
+    @app.get(
+        "/v1/admin/policies",
+        tags=["admin"],
+        summary="What every replica serves",
+        response_model=list[listing.PolicyList],
+        responses=errors,
+    )
+    async def status() -> Response:
+        replies = [listing.describe(core)] if control.gather is None else await control.gather()
+        return Response(orjson.dumps(replies), media_type="application/json")
+
+    @command("load", "Load a version, prove it, and keep it ready")
+    async def load(name: str, given: LoadCommand) -> Response:
+        return await changed(name, f"load {name} {given.version or 'newest'}", _load(control, name, given.version))
+
+    @command("unload", "Drop a version, or the policy")
+    async def unload(name: str, given: UnloadCommand) -> Response:
+        version = given.version
+        return await changed(name, f"unload {name} {version or ''}", lambda p: plan.unload(p, name, version))
+
+    @command("alias", "Let an alias lead to a loaded version")
+    async def alias(name: str, given: AliasCommand) -> Response:
+        what = f"alias {name} {given.alias}={given.version or ''}"
+        return await changed(name, what, lambda p: plan.set_alias(p, name, given.alias, given.version))
+
+    @command("rollback", "Let an alias lead where it led before")
+    async def rollback(name: str, given: RollbackCommand) -> Response:
+        def change(before: Plan) -> dict[str, PolicyPlan]:
+            return plan.roll_back(before, name, given.alias, lambda n, v: digest_of(control.repository.find(n, v)[1]))
+
+        return await changed(name, f"rollback {name} {given.alias}", change)
+
+    @command("canary", "Send a share of the sessions to another version")
+    async def canary(name: str, given: CanaryCommand) -> Response:
+        if given.version is not None and given.share is None:
+            raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
+        ended = given.version is None or not given.share
+        chosen = None if ended else Canary(version=str(given.version), share=given.share or 0)
+        what = f"canary {name} {given.version or 'off'} {given.share or ''}"
+        return await changed(name, what, lambda p: plan.set_canary(p, name, chosen))
+
+    @command("shadow", "Let another version compute along")
+    async def shadow(name: str, given: ShadowCommand) -> Response:
+        what = f"shadow {name} {given.version or 'off'}"
+        return await changed(name, what, lambda p: plan.set_shadow(p, name, given.version))
+
+    def repository(path: str, summary: str) -> Callable[[Route], Route]:
+        return app.post(
+            f"/v2/repository/models/{{name}}/{path}",
+            tags=["open inference protocol"],
+            summary=summary,
+            response_class=Response,
+            responses=errors,
+        )
+
+    @repository("load", "Load a model's newest version")
+    async def load_model(name: str, _given: RepositoryCommand | None = Body(None)) -> Response:  # noqa: B008  # FastAPI's way
+        await control.change(_load(control, name, None), what=f"load {name} newest")
+        return Response(b"{}", media_type="application/json")
+
+    @repository("unload", "Unload a model, all its versions")
+    async def unload_model(name: str, _given: RepositoryCommand | None = Body(None)) -> Response:  # noqa: B008
+        await control.change(lambda p: plan.unload(p, name, None), what=f"unload {name}")
+        return Response(b"{}", media_type="application/json")
+
+
+def _load(control: Control, name: str, version: str | None) -> Change:
+    def change(before: Plan) -> dict[str, PolicyPlan]:
+        found, folder = control.repository.find(name, version)
+        return plan.load(before, name, found, digest_of(folder))
+
+    return change
+
+
+def _answer(name: str, after: Plan) -> Response:
+    policy = after.policies.get(name) or PolicyPlan(versions={})
+    document = {
+        "generation": after.generation,
+        "policy": name,
+        "default": policy.default,
+        "versions": list(policy.versions),
+        "aliases": policy.aliases,
+        "canary": policy.canary and policy.canary.model_dump(),
+        "shadow": policy.shadow,
+    }
+    return Response(wire.encode_json(document), media_type="application/json")
