@@ -133,3 +133,8 @@ class UsageError(RlservoError):
     """An argument, or something already running on the machine, prevents the start."""
 
     code = "bad-usage"
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an exception's text, or its type where it has none: the reason in a sentence of ours."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:300]

@@ -17,14 +17,15 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
-from gymnasium.spaces import Box, MultiDiscrete
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from rlservo.export.bundle import FormatParity, Parity
-from rlservo.export.errors import ParityError, UnsupportedError
-from rlservo.export.recipe import Recipe, StateLeaf, parameter_count
+from rlservo.export.errors import ParityError, UnsupportedError, first_line
+from rlservo.export.recipe import Recipe, StateLeaf
 from rlservo.export.samples import BATCH_SIZES, Batch, Inputs
-from rlservo.export.unpickle import first_line
+from rlservo.export.scores import split_scores
+from rlservo.export.spaces import space_spec
 
 RTOL = 1e-5
 ATOL = 1e-6
@@ -276,16 +277,7 @@ def choice_scores(recipe: Recipe, outputs: Outputs) -> dict[str, list[NDArray[np
     if recipe.mode == "given":
         return {}
     scores = outputs["q_values" if "q_values" in outputs else "action_dist_inputs"].astype(np.float64)
-    found: dict[str, list[NDArray[np.float64]]] = {}
-    begin = 0
-    for name, space in recipe.action_leaves.items():
-        part = scores[:, begin : begin + parameter_count(space)]
-        begin += parameter_count(space)
-        if isinstance(space, MultiDiscrete):
-            found[name] = np.split(part, np.cumsum(space.nvec.ravel())[:-1], axis=1)
-        elif not isinstance(space, Box):
-            found[name] = [part]
-    return found
+    return split_scores(scores, space_spec(recipe.action_space, action=True))
 
 
 def _columns(choices: NDArray[Any]) -> list[NDArray[Any]]:
