@@ -2,11 +2,10 @@
 
     python benchmarks/export_policy.py [--rounds 15]
 
-The shipped UR5 checkpoint (27-256-256-6) is exported by the command line in a fresh process: wall time with all imports,
-CPU time and peak memory. Then the bundle acts in this process, `Policy.act` and the session's own `run` (asked for the
-action only, as `act` asks) taking turns; a round's ratio is of wall times a moment apart, and the median of the rounds
-counts. CPU times are measured beside them: on a machine that others use too they say more. Written to
-bench/export_policy.json as well.
+The shipped UR5 checkpoint (27-256-256-6) is exported by the command line in a fresh process: wall time with all
+imports, CPU time and peak memory. Then the bundle acts in this process, `Policy.act` and the session's own `run` (asked
+for the action only, as `act` asks) taking turns; a round's ratio is of times a moment apart, and the median of the
+rounds counts. The ratio of CPU times says more on a machine that others use too. Written to bench/export_policy.json.
 """
 
 from __future__ import annotations

@@ -292,6 +292,7 @@ class Parity(_Model):
     batch_sizes: tuple[Size, ...]
     rtol: Tolerance
     atol: Tolerance
+    rule: str = Field(default="", description="How the two tolerances are applied")
     formats: dict[str, FormatParity]
 
 

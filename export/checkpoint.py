@@ -346,9 +346,10 @@ def _action_rule(
         )
     kind = module.get_inference_action_dist_cls()
     mode = find_mode(lambda probe: kind.from_logits(probe).to_deterministic().sample(), kind.__name__, action_space)
-    distribution = _distribution_kind(kind)
+    exploring = module.get_exploration_action_dist_cls()
+    distribution = _distribution_kind(exploring)
     if distribution is None:
-        notify(f"the action distribution {kind.__name__} is not one of RLlib's: the export cannot explore with it")
+        notify(f"the action distribution {exploring.__name__} is not one of RLlib's: the export cannot explore with it")
     return distribution, mode, ("action_dist_inputs",)
 
 

@@ -235,10 +235,11 @@ def _unequal(lists: Sequence[Any]) -> str:
     first = form(lists[0])
     for index, one in enumerate(lists):
         found = form(one)
-        if found is None:
-            return f"observation {index} of the batch is made of lists that are not of equal length"
-        if found != first:
-            return f"its parts are not of equal length: observation {index} of the batch is of shape {found}, the first one of {first}"
+        if found is None or found != first:
+            shape = "has lists that are not of equal length" if found is None else f"is of shape {found}"
+            return (
+                f"its parts are not of equal length: observation {index} of the batch {shape}, the first is of {first}"
+            )
     return "its lists are not of equal length"
 
 
