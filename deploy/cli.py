@@ -188,7 +188,7 @@ def export(
 
 @app.command()
 def prune(
-    checkpoint: Annotated[Path, typer.Argument(help="RLlib checkpoint folder.")],
+    checkpoint: Annotated[str, typer.Argument(help="RLlib checkpoint folder or URI.")],
     out: Annotated[Path, typer.Option(help="Folder to make; it must not exist.")],
     module_id: Annotated[str | None, typer.Option(help="Which RLModule; needed when there are several.")] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
@@ -226,7 +226,7 @@ def inspect(
 @app.command()
 def verify(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
-    checkpoint: Annotated[Path, typer.Option(help="The RLlib checkpoint to compare with.")],
+    checkpoint: Annotated[str, typer.Option(help="The RLlib checkpoint to compare with; a folder or a URI.")],
     env: Annotated[str | None, typer.Option(help="Environment id for a closed-loop comparison.")] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Episodes of the closed loop.")] = 20,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.")] = 0,
@@ -241,9 +241,17 @@ def verify(
         from rlservo.export.report import verification_report
         from rlservo.export.verify import verify_bundle
 
-    result = verify_bundle(
-        bundle, checkpoint, env_id=env, episodes=episodes, first_seed=seed, app_dir=app_dir, notify=_note
-    )
+    with _err.status("reading the bundle") as status:
+        result = verify_bundle(
+            bundle,
+            checkpoint,
+            env_id=env,
+            episodes=episodes,
+            first_seed=seed,
+            app_dir=app_dir,
+            notify=_note,
+            progress=status.update,
+        )
     if as_json:
         _print_json(
             {

@@ -18,6 +18,7 @@ import hashlib
 import json
 import math
 import re
+import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from rlservo.export.errors import BundleError, BundleTamperedError
 
@@ -35,9 +36,17 @@ TORCHSCRIPT_FILE = "policy.ts"
 CONTRACT_FILE = "contract.json"
 GOLDEN_FILE = "golden.npz"
 SUMS_FILE = "SHA256SUMS"
+CONTRACT_KEY = "rlservo.contract"
+"""Where the graph's own metadata repeat the contract."""
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
+
+
+Size: TypeAlias = Annotated[int, Field(ge=1)]
+Shape: TypeAlias = tuple[Size, ...]
+Tolerance: TypeAlias = Annotated[float, Field(ge=0.0, le=1e-2)]
+"""Beyond it a difference is no rounding, whatever a contract says."""
 
 
 class _Model(BaseModel):
@@ -58,7 +67,7 @@ class BoxSpec(_Model):
     """
 
     kind: Literal["box"] = "box"
-    shape: tuple[int, ...]
+    shape: Shape
     dtype: str
     low: float | tuple[float | None, ...] | None
     high: float | tuple[float | None, ...] | None
@@ -106,8 +115,8 @@ class MultiDiscreteSpec(_Model):
     """A Gymnasium MultiDiscrete: element i is one of `nvec[i]` integers from `start[i]` on, in row-major order."""
 
     kind: Literal["multi_discrete"] = "multi_discrete"
-    shape: tuple[int, ...]
-    nvec: tuple[int, ...]
+    shape: Shape
+    nvec: tuple[Size, ...]
     start: tuple[int, ...]
     dtype: str = "int64"
     elements: tuple[Element, ...] = ()
@@ -126,7 +135,7 @@ class MultiBinarySpec(_Model):
     """A Gymnasium MultiBinary: every element is 0 or 1."""
 
     kind: Literal["multi_binary"] = "multi_binary"
-    shape: tuple[int, ...]
+    shape: Shape
     dtype: str = "int8"
     elements: tuple[Element, ...] = ()
 
@@ -139,46 +148,38 @@ class MultiBinarySpec(_Model):
         return np.zeros(self.shape), np.ones(self.shape)
 
 
-class DictSpec(_Model):
+class _NestedSpec(_Model):
+    """What the contract's Dict and Tuple share."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """A nested space is no array."""
+        return ()
+
+    @property
+    def size(self) -> int:
+        """The elements of all leaves."""
+        assert isinstance(self, DictSpec | TupleSpec)
+        return sum(leaf.size for leaf in leaf_specs(self, "").values())
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """Only leaves name elements."""
+        return ()
+
+
+class DictSpec(_NestedSpec):
     """A Gymnasium Dict; its leaves are tensors of their own, called `obs.<key>` or `action.<key>`."""
 
     kind: Literal["dict"] = "dict"
     spaces: dict[str, SpaceSpec]
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """A nested space is no array."""
-        return ()
 
-    @property
-    def size(self) -> int:
-        return sum(leaf.size for leaf in leaf_specs(self, "").values())
-
-    @property
-    def elements(self) -> tuple[Element, ...]:
-        """Only leaves name elements."""
-        return ()
-
-
-class TupleSpec(_Model):
+class TupleSpec(_NestedSpec):
     """A Gymnasium Tuple; its leaves are tensors of their own, called `obs.<index>` or `action.<index>`."""
 
     kind: Literal["tuple"] = "tuple"
     spaces: tuple[SpaceSpec, ...]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """A nested space is no array."""
-        return ()
-
-    @property
-    def size(self) -> int:
-        return sum(leaf.size for leaf in leaf_specs(self, "").values())
-
-    @property
-    def elements(self) -> tuple[Element, ...]:
-        """Only leaves name elements."""
-        return ()
 
 
 LeafSpec: TypeAlias = BoxSpec | DiscreteSpec | MultiDiscreteSpec | MultiBinarySpec
@@ -207,13 +208,20 @@ class TensorSpec(_Model):
     dtype: str
     shape: tuple[int, ...]
 
+    @field_validator("shape")
+    @classmethod
+    def _has_a_batch_axis(cls, shape: tuple[int, ...]) -> tuple[int, ...]:
+        if not shape or shape[0] != -1 or any(size < 1 for size in shape[1:]):
+            raise ValueError(f"expected -1 for the batch, then positive sizes, got {list(shape)}")
+        return shape
+
 
 class StateSpec(_Model):
     """A policy's memory: graph input `state_in.<name>`, output `state_out.<name>`; `initial` starts an episode."""
 
     name: str
     dtype: str
-    shape: tuple[int, ...] = Field(description="Without the batch axis")
+    shape: Shape = Field(description="Without the batch axis")
     initial: float | tuple[float, ...] = Field(0.0, description="One number, or one per element in row-major order")
     kind: Literal["recurrent", "frames", "previous_actions", "previous_rewards"] = Field(
         "recurrent",
@@ -256,7 +264,7 @@ class Provenance(_Model):
     algorithm: str
     api_stack: Literal["new", "old"]
     module_id: str
-    agent_id: str | None = Field(default=None, description="For which agent of a multi-agent environment")
+    agents: tuple[str, ...] = Field(default=(), description="For which agents of a multi-agent environment")
     module_class: str
     checkpoint_sha256: str = Field(description="Hash over the checkpoint files that were read")
     training_iterations: int | None = None
@@ -272,18 +280,19 @@ class Provenance(_Model):
 class FormatParity(_Model):
     """The largest differences between one written format and RLlib's own pipeline."""
 
-    max_abs: float
-    max_rel: float
+    max_abs: float = Field(ge=0.0)
+    max_rel: float = Field(ge=0.0, description="Relative to the scale that the gate measures with")
 
 
 class Parity(_Model):
     """How the export was proven equal to what RLlib itself would send to env.step."""
 
     reference: str
-    samples: int
-    batch_sizes: tuple[int, ...]
-    rtol: float
-    atol: float
+    samples: Size
+    batch_sizes: tuple[Size, ...]
+    rtol: Tolerance
+    atol: Tolerance
+    rule: str = Field(default="", description="How the two tolerances are applied")
     formats: dict[str, FormatParity]
 
 
@@ -291,7 +300,7 @@ class Evaluation(_Model):
     """One closed-loop run of exported policy and checkpoint on the same seeds."""
 
     env_id: str
-    episodes: int
+    episodes: Size
     first_seed: int
     return_bundle: float
     return_checkpoint: float
@@ -314,7 +323,7 @@ class Contract(_Model):
     state: tuple[StateSpec, ...] = ()
     distribution: Distribution | None
     baked_in: tuple[BakedStep, ...]
-    control_rate_hz: float | None = Field(None, description="The rate the environment asks for actions at")
+    control_rate_hz: float | None = Field(None, gt=0.0, description="The rate the environment asks for actions at")
     provenance: Provenance
     parity: Parity
     evaluations: tuple[Evaluation, ...] = ()
@@ -473,10 +482,27 @@ def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapp
 
 
 def write_contract(folder: Path, contract: Contract) -> None:
-    """Write contract.json and, with it, SHA256SUMS over all four files, which must already exist."""
-    (folder / CONTRACT_FILE).write_text(contract_json(contract) + "\n", encoding="utf-8")
-    lines = [f"{sha256(folder / name)}  {name}\n" for name in (CONTRACT_FILE, GOLDEN_FILE, ONNX_FILE, TORCHSCRIPT_FILE)]
-    (folder / SUMS_FILE).write_text("".join(lines), encoding="ascii")
+    """Write contract.json and, with it, SHA256SUMS over all four files, of which the other three must exist.
+
+    Both are written beside the old ones and then take their names: whatever fails before leaves the bundle as it was.
+    """
+    with tempfile.TemporaryDirectory(prefix=".contract-", dir=folder) as name:
+        beside = Path(name)
+        (beside / CONTRACT_FILE).write_text(contract_json(contract) + "\n", encoding="utf-8")
+        files = [beside / CONTRACT_FILE, *(folder / other for other in (GOLDEN_FILE, ONNX_FILE, TORCHSCRIPT_FILE))]
+        sums = "".join(f"{sha256(file)}  {file.name}\n" for file in files)
+        (beside / SUMS_FILE).write_text(sums, encoding="ascii")
+        for file in (CONTRACT_FILE, SUMS_FILE):
+            (beside / file).replace(folder / file)
+
+
+def embedded_contract(text: str, where: Path) -> Contract:
+    """Parse the copy of the contract that the graph's metadata hold under CONTRACT_KEY."""
+    try:
+        return Contract.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise BundleError(f"{where}: the contract inside it is malformed: {first['msg']}") from error
 
 
 def contract_json(contract: Contract) -> str:

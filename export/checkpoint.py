@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module.env_to_module_pipeline import EnvToModulePipeline
@@ -29,7 +28,7 @@ from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from torch import Tensor, nn
 
 from rlservo.export.connectors import check_spaces, read_action_steps, read_observation_steps
-from rlservo.export.errors import CheckpointError, UnsupportedError
+from rlservo.export.errors import CheckpointError, UnsupportedError, first_line
 from rlservo.export.facts import read_config
 from rlservo.export.heads import replace_heads
 from rlservo.export.location import CTOR_FILE, STATE_STEMS, CheckpointFiles
@@ -37,8 +36,9 @@ from rlservo.export.modes import find_mode
 from rlservo.export.pipelines import Pipelines, find_seat, own_copy, pipelines_of
 from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.samples import Inputs, draw_batches
+from rlservo.export.steps import surprises
 from rlservo.export.trees import Tree, build, build_like, is_nested, map_tree, named_leaves, space_leaves, tree_leaves
-from rlservo.export.unpickle import explain, first_line, unpickle
+from rlservo.export.unpickle import explain, unpickle
 
 DISTRIBUTIONS: dict[str, DistributionKind] = {
     "TorchDiagGaussian": "diag_gaussian",
@@ -186,7 +186,7 @@ class Checkpoint:
     network: Network
     module_class: str
     pipelines: Pipelines
-    agent_id: str | None = None
+    agents: tuple[str, ...] = ()
 
     def reference(self, inputs: Inputs) -> dict[str, NDArray[Any]]:
         """Return what RLlib computes for a batch of raw observations `[batch, ...]` by input name, by output name.
@@ -238,7 +238,8 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
     given = _forward_once(pipelines, asked)
     distribution, mode, names = _action_rule(module, given, action_space, notify)
     recipe = Recipe(observation_space, action_space, steps, mode, transform, distribution, state, action_steps)
-    _tell(recipe, notify)
+    for surprise in surprises(recipe):
+        notify(surprise)
     if value and isinstance(module, ValueFunctionAPI):
         if no_value:
             notify(f"the checkpoint holds no value head ({no_value}): the export has no output 'value'")
@@ -249,22 +250,7 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
     given_leaves = len(recipe.action_leaves) if mode == "given" else 0
     rule = _deterministic(module) if Columns.ACTION_DIST_INPUTS in names else None
     network = Network(traced, names, given_leaves, rule)
-    return Checkpoint(recipe, network, f"{type(module).__module__}.{name}", pipelines, seat.name)
-
-
-def _tell(recipe: Recipe, notify: Callable[[str], None]) -> None:
-    """Say what a person may not expect."""
-    if recipe.filter is not None and recipe.filter.count == 0:
-        notify("the observation filter has seen nothing yet: RLlib divides by 1e-6 and clips, and so does the export")
-    for name, space in recipe.action_leaves.items():
-        if isinstance(space, Discrete) and space.start != 0:
-            which = "the action space" if name == "action" else name
-            notify(
-                f"{which} starts at {space.start}, but RLlib sends 0..{space.n - 1} to env.step: the export does the "
-                "same"
-            )
-    if recipe.needs_reward:
-        notify("the policy was trained with previous rewards: the graph has an input 'reward', 0 at an episode's start")
+    return Checkpoint(recipe, network, f"{type(module).__module__}.{name}", pipelines, seat.agents)
 
 
 def _build_pipelines(files: CheckpointFiles, module: Any, notify: Callable[[str], None]) -> tuple[Any, Any]:
@@ -366,9 +352,10 @@ def _action_rule(
         )
     kind = module.get_inference_action_dist_cls()
     mode = find_mode(_deterministic(module), kind.__name__, action_space, given[Columns.ACTION_DIST_INPUTS])
-    distribution = _distribution_kind(kind)
+    exploring = module.get_exploration_action_dist_cls()
+    distribution = _distribution_kind(exploring)
     if distribution is None:
-        notify(f"the action distribution {kind.__name__} is not one of RLlib's: the export cannot explore with it")
+        notify(f"the action distribution {exploring.__name__} is not one of RLlib's: the export cannot explore with it")
     return distribution, mode, ("action_dist_inputs",)
 
 

@@ -55,11 +55,8 @@ class Seat:
 
     agent: Any = None
     module: str = ""
-
-    @property
-    def name(self) -> str | None:
-        """The agent's id as text."""
-        return None if self.agent is None else str(self.agent)
+    agents: tuple[str, ...] = ()
+    """All agents for whom this one stands."""
 
     def part(self, space: Any) -> Any:
         """Return the agent's own part of a space, which behind the mapping is its module's."""

@@ -18,8 +18,8 @@ from gymnasium.spaces import Box
 from pydantic import ValidationError
 
 from rlservo.export.bundle import Element
+from rlservo.export.errors import first_line
 from rlservo.export.recipe import Recipe
-from rlservo.export.unpickle import first_line
 
 
 @dataclass(frozen=True)

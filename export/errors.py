@@ -173,3 +173,8 @@ class ForbiddenError(RlservoError):
     """The key, or the page the request comes from, may not do this."""
 
     code = "forbidden"
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an exception's text, or its type where it has none: the reason in a sentence of ours."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:300]

@@ -21,6 +21,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from rlservo.export.bundle import (
+    CONTRACT_KEY,
     ONNX_FILE,
     TORCHSCRIPT_FILE,
     Contract,
@@ -304,7 +305,7 @@ def _provenance(files: Files, facts: CheckpointFacts, restored: Restored) -> Pro
         algorithm=facts.algorithm,
         api_stack=files.api_stack,
         module_id=files.module_id,
-        agent_id=restored.agent_id,
+        agents=restored.agents,
         module_class=restored.module_class,
         checkpoint_sha256=files.sha256(),
         training_iterations=facts.training_iterations,
@@ -329,7 +330,7 @@ def _own_version() -> str:
 
 def _write_rest(folder: Path, contract: Contract, golden: _Golden) -> None:
     """Write golden vectors, contract and hashes, and check that the finished files are what was proven."""
-    from rlservo.export.onnx import CONTRACT_KEY, add_metadata, run_onnx
+    from rlservo.export.onnx import add_metadata, run_onnx
 
     add_metadata(folder / ONNX_FILE, {CONTRACT_KEY: contract_json(contract)})
     write_golden(folder, golden.inputs, golden.outputs)

@@ -13,10 +13,9 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from rlservo.export.errors import UnsupportedError
+from rlservo.export.errors import UnsupportedError, first_line
 from rlservo.export.recipe import Mode, parameter_count
 from rlservo.export.trees import Tree, space_leaves, tree_leaves
-from rlservo.export.unpickle import first_line
 
 
 def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: Any, given: Tensor) -> Mode:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from ray.rllib.algorithms.dqn.dqn_torch_model import DQNTorchModel
 from ray.rllib.evaluation.env_runner_v2 import _batch_inference_sample_batches
@@ -39,7 +39,7 @@ from ray.rllib.utils.typing import ActionConnectorDataType, AgentConnectorDataTy
 from torch import Tensor, nn
 
 from rlservo.export.connectors import check_spaces
-from rlservo.export.errors import CheckpointError, UnsupportedError
+from rlservo.export.errors import CheckpointError, UnsupportedError, first_line
 from rlservo.export.heads import replace_bias_layers
 from rlservo.export.modes import find_mode
 from rlservo.export.old_connectors import check_connectors, read_old_steps, read_old_transform
@@ -47,8 +47,9 @@ from rlservo.export.old_location import OldStackFiles
 from rlservo.export.old_models import register_custom_model
 from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.samples import Inputs
+from rlservo.export.steps import surprises
 from rlservo.export.trees import build, named_leaves, space_leaves, tree_leaves
-from rlservo.export.unpickle import explain, first_line, unpickle, user_folder
+from rlservo.export.unpickle import explain, unpickle, user_folder
 
 DISTRIBUTIONS: dict[type, DistributionKind] = {
     TorchDiagGaussian: "diag_gaussian",
@@ -159,7 +160,7 @@ class OldStackCheckpoint:
     network: OldStackNetwork
     module_class: str
     _policy: Any
-    agent_id: None = None
+    agents: tuple[str, ...] = ()
 
     def reference(self, inputs: Inputs) -> dict[str, NDArray[Any]]:
         """Return what RLlib computes for a batch of raw observations `[batch, ...]` by input name, by output name.
@@ -190,7 +191,8 @@ def load_old_stack(files: OldStackFiles, notify: Callable[[str], None], *, value
     state = _network_state(policy)
     distribution, mode, names = _action_rule(policy, action_space, notify)
     recipe = Recipe(observation_space, action_space, steps, mode, transform, distribution, state)
-    _tell(recipe, notify)
+    for surprise in surprises(recipe):
+        notify(surprise)
     if value and _has_value(policy, notify):
         names = (*names, "value")
     # A second policy to trace: a model keeps tensors of its last forward pass, which the reference needs for itself.
@@ -202,19 +204,6 @@ def load_old_stack(files: OldStackFiles, notify: Callable[[str], None], *, value
     return OldStackCheckpoint(
         recipe, OldStackNetwork(traced, names, given), f"{model.__module__}.{model.__qualname__}", policy
     )
-
-
-def _tell(recipe: Recipe, notify: Callable[[str], None]) -> None:
-    """Say what a person may not expect."""
-    if recipe.filter is not None and recipe.filter.count == 0:
-        notify("the observation filter has seen nothing yet: RLlib divides by 1e-6, and so does the export")
-    for name, space in recipe.action_leaves.items():
-        if isinstance(space, Discrete) and space.start != 0:
-            which = "the action space" if name == "action" else name
-            notify(
-                f"{which} starts at {space.start}, but RLlib sends 0..{space.n - 1} to env.step: the export does the "
-                "same"
-            )
 
 
 def _network_state(policy: Any) -> tuple[StateLeaf, ...]:

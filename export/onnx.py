@@ -24,15 +24,14 @@ import torch
 from numpy.typing import NDArray
 
 from rlservo.export.actor import PolicyGraph
-from rlservo.export.errors import UnsupportedError
+from rlservo.export.errors import UnsupportedError, first_line
 from rlservo.export.parity import Runner
 from rlservo.export.samples import Inputs
-from rlservo.export.unpickle import first_line
+from rlservo.export.session import open_session
 
 TORCHSCRIPT_OPSET = 17
 DYNAMO_OPSET = 18  # its lowest
 IR_VERSION = 8
-CONTRACT_KEY = "rlservo.contract"
 
 
 def write_onnx(graph: PolicyGraph, example: Inputs, file: Path) -> None:
@@ -123,15 +122,7 @@ def add_metadata(file: Path, properties: Mapping[str, str]) -> None:
 
 def run_onnx(file: Path) -> Runner:
     """Return a function that runs the file in onnxruntime on one thread, as a server does."""
-    # onnxruntime's Linux wheels report use from the moment they are imported unless this is set. An exporter calls
-    # nobody; whoever wants it may set the variable to 0.
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # errors arrive as exceptions; it would print them as well
-    session = onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
+    session = open_session(file)
     names = [output.name for output in session.get_outputs()]
 
     def run(inputs: Inputs) -> dict[str, NDArray[Any]]:

@@ -7,6 +7,7 @@ ray.rllib, as checkpoint.py.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -169,7 +170,7 @@ def find_seat(files: CheckpointFiles, env_to_module: Any, module_to_env: Any) ->
             "observation filters differ: name the one to export for with --agent-id",
             {"agents": [str(agent) for agent in agents]},
         )
-    return seats[0]
+    return dataclasses.replace(seats[0], agents=tuple(str(agent) for agent in agents))
 
 
 def _served(mapping: Any, module_id: str) -> list[Any]:

@@ -13,7 +13,8 @@ from pathlib import Path
 from rlservo.export.errors import UsageError
 from rlservo.export.exporter import LOADING_RUNS_CODE
 from rlservo.export.facts import read_facts
-from rlservo.export.location import FACTS_FILE, locate_checkpoint
+from rlservo.export.location import FACTS_FILE, Files, locate_checkpoint
+from rlservo.export.remote import fetched
 from rlservo.export.unpickle import user_code
 
 # Beside the class and its arguments (class_and_ctor_args.pkl) and the state, metadata.json names the Ray version.
@@ -36,8 +37,11 @@ def prune_checkpoint(
     Returns the files kept, relative to `dst`. `notify` is told what was kept, and of any file that names the home
     folder. Raises CheckpointError or UnsupportedError for `src`, UsageError when `dst` exists.
     """
-    files = locate_checkpoint(src, module_id)
-    target = Path(dst)
+    with fetched(src, lambda _: None) as local:
+        return _prune(locate_checkpoint(local, module_id), Path(dst), app_dir, notify)
+
+
+def _prune(files: Files, target: Path, app_dir: str | Path, notify: Callable[[str], None]) -> list[Path]:
     if target.exists():
         raise UsageError(f"{target} exists already: give a folder that does not, to prune into")
     notify(LOADING_RUNS_CODE.format(path=files.root))

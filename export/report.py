@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import resource
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.console import Group, RenderableType
+import numpy as np
+from numpy.typing import NDArray
+from rich.box import SIMPLE_HEAD
+from rich.console import Group, JustifyMethod, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -18,7 +21,6 @@ from rlservo.export.bundle import (
     BakedStep,
     Contract,
     DiscreteSpec,
-    Element,
     Evaluation,
     LeafSpec,
     Parity,
@@ -91,6 +93,7 @@ def _summary(contract: Contract) -> Table:
     rows = {
         "description": contract.description,
         "algorithm": f"{origin.algorithm} ({origin.api_stack} API stack), module {origin.module_id}",
+        "agents": ", ".join(origin.agents),
         "environment": origin.env_id or "not known",
         "environment arguments": ", ".join(f"{key}={value}" for key, value in origin.env_config.items()),
         "trained for": ", ".join(progress) or "not known",
@@ -111,57 +114,83 @@ def _exploration(contract: Contract) -> str:
         return "nothing: this policy has no action distribution"
     transform = {"none": "", "unsquash": ", then unsquashed and clipped", "clip": ", then clipped"}
     kind = contract.distribution.kind.replace("_", " ")
+    if contract.distribution.kind == "multi":
+        kind = "Gaussian for each box and a choice for each other part"
     return f"sampling a {kind}{transform[contract.distribution.transform]}"
 
 
-def _space_tables(title: str, root: str, space: SpaceSpec, frozen: BakedStep | None) -> list[Table]:
+def _space_tables(title: str, root: str, space: SpaceSpec, frozen: BakedStep | None) -> list[RenderableType]:
+    """Return one table of all leaves, then one of the elements of each leaf of which more is known than its bounds."""
     leaves = leaf_specs(space, root)
-    return [
-        _space_table(title if len(leaves) == 1 else f"{title}, {name}", leaf, frozen) for name, leaf in leaves.items()
-    ]
+    told = [name for name, leaf in leaves.items() if leaf.elements or _seen(frozen, leaf.size)[0]]
+    parts: list[RenderableType] = []
+    if len(leaves) > 1 or not told:
+        parts.append(_overview(title if len(leaves) == 1 else f"{title}, in {len(leaves)} parts", leaves))
+    parts += [_elements(title if len(leaves) == 1 else name, leaves[name], frozen) for name in told]
+    return parts
 
 
-def _space_table(title: str, space: LeafSpec, frozen: BakedStep | None) -> Table:
+def _table(
+    title: str, *columns: str, right: Sequence[str] = (), fold: Sequence[str] = ()
+) -> tuple[Table, RenderableType]:
+    """Return (a table, what to print): the title stands above it, whose width it would be broken to otherwise."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for column in columns:
+        justify: JustifyMethod = "right" if column in right else "left"
+        table.add_column(column, justify=justify, no_wrap=column not in fold, overflow="fold")
+    return table, Group(Text(title, style="italic", overflow="fold"), table)
+
+
+def _overview(title: str, leaves: Mapping[str, LeafSpec]) -> RenderableType:
+    table, shown = _table(title, "name", "what", "type", "low", "high", right=("low", "high"), fold=("what",))
+    for name, leaf in leaves.items():
+        low, high = leaf.bounds()
+        what = f"one of {leaf.n} choices" if isinstance(leaf, DiscreteSpec) else _count(leaf.size)
+        if len(leaf.shape) > 1:
+            what += f", {_shape(leaf.shape)}"
+        table.add_row(name, what, leaf.dtype, _span(low), _span(high))
+    return shown
+
+
+def _count(size: int) -> str:
+    return "1 number" if size == 1 else f"{size:,} numbers"
+
+
+def _span(bound: NDArray[np.float64]) -> str:
+    """Return one bound where all elements share it, else its range."""
+    least, most = float(bound.min()), float(bound.max())
+    return _number(least) if least == most else f"{_number(least)} .. {_number(most)}"
+
+
+def _shape(shape: Sequence[int]) -> str:
+    return "x".join(str(size) for size in shape) or "scalar"
+
+
+def _elements(title: str, space: LeafSpec, frozen: BakedStep | None) -> RenderableType:
     """Return one row an element: index, name, unit, bounds and, behind a filter, its numbers."""
-    if isinstance(space, DiscreteSpec):
-        table = Table(title=f"{title} (one of {space.n} choices)", title_justify="left")
-        table.add_column("value", justify="right")
-        table.add_column("name")
-        table.add_row(
-            f"{space.start} .. {space.start + space.n - 1}", space.elements[0].name if space.elements else "-"
-        )
-        return table
-    shape = "x".join(str(size) for size in space.shape) or "scalar"
-    table = Table(title=f"{title} ({shape}, {space.dtype})", title_justify="left")
-    table.add_column("#", justify="right", no_wrap=True)
-    table.add_column("name", overflow="fold")
-    table.add_column("unit", no_wrap=True)
-    table.add_column("low", justify="right", no_wrap=True)
-    table.add_column("high", justify="right", no_wrap=True)
+    kind = f"one of {space.n} choices" if isinstance(space, DiscreteSpec) else f"{_shape(space.shape)}, {space.dtype}"
     mean, std = _seen(frozen, space.size)
-    if mean:
-        table.add_column("filter mean", justify="right", no_wrap=True)
-        table.add_column("filter std", justify="right", no_wrap=True)
+    named = ["name", "unit"] if space.elements else []
+    seen = ["filter mean", "filter std"] if mean else []
+    columns = ["#", *named, "low", "high", *seen]
+    table, shown = _table(f"{title} ({kind})", *columns, right=("#", "low", "high", *seen))
     low, high = (bound.ravel().tolist() for bound in space.bounds())
     for index in _shown(space.size):
         if index is None:
-            table.add_row("...", f"{space.size - 2 * ENDS} more")
+            table.add_row("...", *([f"{space.size - 2 * ENDS:,} more"] if named else []))
             continue
-        element = space.elements[index] if space.elements else Element(name="-", unit="")
-        row = [str(index), element.name, element.unit or "-", _number(low[index]), _number(high[index])]
+        element = [space.elements[index].name, space.elements[index].unit or "-"] if named else []
+        row = [str(index), *element, _number(low[index]), _number(high[index])]
         table.add_row(*row, *([_number(mean[index]), _number(std[index])] if mean else []))
-    return table
+    return shown
 
 
-def _state_table(state: Sequence[StateSpec]) -> Table:
-    table = Table(title="Remembered from step to step", title_justify="left")
-    for column in ("name", "kind", "type", "shape", "at an episode's start"):
-        table.add_column(column, overflow="fold")
+def _state_table(state: Sequence[StateSpec]) -> RenderableType:
+    table, shown = _table("Remembered from step to step", "name", "kind", "type", "shape", "at first")
     for one in state:
-        shape = "x".join(str(size) for size in one.shape) or "scalar"
         start = _number(one.initial) if isinstance(one.initial, float) else "as in contract.json"
-        table.add_row(one.name, one.kind.replace("_", " "), one.dtype, shape, start)
-    return table
+        table.add_row(one.name, one.kind.replace("_", " "), one.dtype, _shape(one.shape), start)
+    return shown
 
 
 def _shown(size: int) -> list[int | None]:
@@ -189,32 +218,25 @@ def _number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, int | float) else str(value)
 
 
-def _baked_table(steps: Sequence[BakedStep]) -> Table:
-    table = Table(title="Baked in, in this order", title_justify="left")
-    table.add_column("#", justify="right")
-    table.add_column("step", no_wrap=True)
-    table.add_column("what it does", overflow="fold")
+def _baked_table(steps: Sequence[BakedStep]) -> RenderableType:
+    table, shown = _table("Baked in, in this order", "#", "step", "what it does", right=("#",), fold=("what it does",))
     for number, step in enumerate(steps, start=1):
         table.add_row(str(number), step.step, Text(step.detail))
-    return table
+    return shown
 
 
-def _tensor_table(contract: Contract) -> Table:
-    table = Table(title="Tensors of the graph", title_justify="left")
-    for column in ("direction", "name", "type", "shape"):
-        table.add_column(column, no_wrap=True)
+def _tensor_table(contract: Contract) -> RenderableType:
+    table, shown = _table("Tensors of the graph", "", "name", "type", "shape")
     for direction, tensors in (("in", contract.inputs), ("out", contract.outputs)):
         for tensor in tensors:
             shape = ", ".join("batch" if size == -1 else str(size) for size in tensor.shape)
             table.add_row(direction, tensor.name, tensor.dtype, Text(f"[{shape}]"))
-    return table
+    return shown
 
 
 def _proof(parity: Parity) -> RenderableType:
-    table = Table(title="Proven", title_justify="left")
-    table.add_column("format", no_wrap=True)
-    table.add_column("largest difference", justify="right", no_wrap=True)
-    table.add_column("relative", justify="right", no_wrap=True)
+    columns = ("largest difference", "relative")
+    table, shown = _table("Proven", "format", *columns, right=columns)
     for name, result in parity.formats.items():
         table.add_row(name, f"{result.max_abs:.2e}", f"{result.max_rel:.2e}")
     sizes = ", ".join(str(size) for size in parity.batch_sizes)
@@ -222,14 +244,15 @@ def _proof(parity: Parity) -> RenderableType:
         f"{parity.samples:,} observations in batches of {sizes}, against {parity.reference}; "
         f"allowed: {parity.rtol:g} relative, {parity.atol:g} absolute"
     )
-    return Group(table, Text(how))
+    if parity.rule:
+        how += f" ({parity.rule})"
+    return Group(shown, Text(how))
 
 
-def _evaluation_table(evaluations: Sequence[Evaluation]) -> Table:
-    table = Table(title="Closed loop on the same seeds: bundle / checkpoint", title_justify="left")
-    table.add_column("environment", overflow="fold")
-    for column in ("episodes", "first seed", "return", "success"):
-        table.add_column(column, justify="right", no_wrap=True)
+def _evaluation_table(evaluations: Sequence[Evaluation]) -> RenderableType:
+    right = ("episodes", "first seed", "return", "success")
+    title = "Closed loop on the same seeds: bundle / checkpoint"
+    table, shown = _table(title, "environment", *right, right=right, fold=("environment",))
     for one in evaluations:
         table.add_row(
             one.env_id,
@@ -238,7 +261,7 @@ def _evaluation_table(evaluations: Sequence[Evaluation]) -> Table:
             f"{one.return_bundle:.4g} / {one.return_checkpoint:.4g}",
             f"{_rate(one.success_rate_bundle)} / {_rate(one.success_rate_checkpoint)}",
         )
-    return table
+    return shown
 
 
 def _rate(rate: float | None) -> str:

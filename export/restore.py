@@ -39,8 +39,8 @@ class Restored(Protocol):
     def module_class(self) -> str: ...
 
     @property
-    def agent_id(self) -> str | None:
-        """For which agent of several; None where there is one."""
+    def agents(self) -> tuple[str, ...]:
+        """Which agents of an environment with several it is for; empty where there is one, or all are alike."""
         ...
 
     def reference(self, inputs: Inputs) -> dict[str, NDArray[Any]]:

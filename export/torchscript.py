@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from torch.jit._trace import TracerWarning
 
 from rlservo.export.actor import PolicyGraph
-from rlservo.export.errors import UnsupportedError
+from rlservo.export.errors import UnsupportedError, first_line
 from rlservo.export.parity import Runner
 from rlservo.export.samples import Inputs
-from rlservo.export.unpickle import first_line
 
 
 def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> None:

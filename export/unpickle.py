@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.errors import CheckpointError, UsageError
+from rlservo.export.errors import CheckpointError, UsageError, first_line
 
 
 @contextmanager
@@ -69,8 +69,3 @@ def searched() -> str:
     """Return the import path as a person reads it: without the standard library, which holds no user code."""
     own = [entry or "." for entry in sys.path if "lib/python" not in entry and not entry.endswith(".zip")]
     return ", ".join(dict.fromkeys([*own, "the installed packages"]))
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of an exception's text, or its type where it has none."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:300]

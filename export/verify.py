@@ -17,15 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.bundle import Bundle, Contract, Evaluation, Parity, leaf_specs, load_bundle, write_contract
-from rlservo.export.errors import BundleError, UsageError
+from rlservo.export.errors import BundleError, UsageError, first_line
 from rlservo.export.exporter import LOADING_RUNS_CODE
-from rlservo.export.location import locate_checkpoint
+from rlservo.export.location import Files, locate_checkpoint
 from rlservo.export.parity import GraphLoop, Loop, prove, record
 from rlservo.export.recipe import Recipe
+from rlservo.export.remote import fetched, is_uri
 from rlservo.export.samples import draw_batches
 from rlservo.export.threads import one_thread
 from rlservo.export.trees import build, named_leaves, space_leaves
-from rlservo.export.unpickle import first_line, user_code
+from rlservo.export.unpickle import user_code
 
 SEED = 20241  # not the export's: other observations
 
@@ -49,6 +50,7 @@ def verify_bundle(
     first_seed: int = 0,
     app_dir: str | Path = ".",
     notify: Callable[[str], None],
+    progress: Callable[[str], None] = lambda _: None,
 ) -> VerifyResult:
     """Compare a bundle with a checkpoint and, given `env_id`, run both for `episodes` seeds from `first_seed`.
 
@@ -60,11 +62,26 @@ def verify_bundle(
     if episodes < 1:
         raise UsageError(f"episodes must be 1 or more, got {episodes}")
     loaded = load_bundle(bundle)
-    files = locate_checkpoint(checkpoint, loaded.contract.provenance.module_id)
-    notify(LOADING_RUNS_CODE.format(path=files.root))
+    with fetched(checkpoint, progress) as local:
+        origin = loaded.contract.provenance
+        files = locate_checkpoint(local, origin.module_id, origin.agents[0] if origin.agents else None)
+        notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else files.root))
+        return _verify(loaded, files, (env_id, episodes, first_seed), app_dir, notify, progress)
+
+
+def _verify(
+    loaded: Bundle,
+    files: Files,
+    driven: tuple[str | None, int, int],
+    app_dir: str | Path,
+    notify: Callable[[str], None],
+    progress: Callable[[str], None],
+) -> VerifyResult:
+    env_id, episodes, first_seed = driven
     same = files.sha256() == loaded.contract.provenance.checkpoint_sha256
     if not same:
         notify("the bundle was exported from another checkpoint: expect a difference")
+    progress("importing torch and RLlib")
     with user_code(app_dir), one_thread():
         from rlservo.export.restore import restore
 
@@ -73,11 +90,13 @@ def verify_bundle(
         _check_spaces(loaded.contract, restored.recipe)
         formats = _formats(loaded)
         labels = [element.name for element in loaded.contract.action_space.elements]
+        progress("comparing both formats with RLlib's actions")
         recorded = record(restored.reference, draw_batches(restored.recipe, SEED), restored.loop)
         parity = prove(restored.recipe, recorded, formats, labels, files.api_stack)
         evaluation = None
         if env_id is not None:
             run, recipe = formats["onnx"], restored.recipe
+            progress(f"running {episodes} episodes with each")
             drivers = (lambda: GraphLoop(run, recipe.state), restored.loop)
             evaluation = _evaluate(loaded.contract, recipe, env_id, drivers, episodes, first_seed)
             contract = loaded.contract.model_copy(update={"evaluations": (*loaded.contract.evaluations, evaluation)})

@@ -22,6 +22,7 @@ from rlservo.export.bundle import (
     TupleSpec,
     leaf_specs,
 )
+from rlservo.export.scores import parameter_count, split_parameters
 
 # RLlib clamps the log of a squashed Gaussian's scale to this range: ray/rllib/utils/numpy.py, ray 2.60.
 MIN_LOG_STD = -5.0
@@ -35,7 +36,7 @@ def distribution_size(distribution: Distribution, space: SpaceSpec) -> int:
     nested = isinstance(space, DictSpec | TupleSpec)
     if nested != (distribution.kind == "multi") or (not nested and kinds != {distribution.kind}):
         return 0
-    return sum(_leaf_size(leaf) for leaf in leaves)
+    return sum(parameter_count(leaf) for leaf in leaves)
 
 
 def sample_action(
@@ -75,27 +76,10 @@ def sample_leaves(
     inputs: NDArray[np.floating], distribution: Distribution, space: SpaceSpec, rng: np.random.Generator
 ) -> dict[str, NDArray[Any]]:
     """Draw every leaf of the action by tensor name, in the leaf's own dtype."""
-    drawn: dict[str, NDArray[Any]] = {}
-    begin = 0
-    for name, leaf in leaf_specs(space, "action").items():
-        part = inputs[:, begin : begin + _leaf_size(leaf)]
-        begin += _leaf_size(leaf)
-        drawn[name] = sample_action(part, distribution, leaf, rng).astype(leaf.dtype)
-    return drawn
-
-
-def split_scores(scores: NDArray[Any], space: SpaceSpec) -> dict[str, list[NDArray[Any]]]:
-    """Return each discrete leaf's scores `[batch, choices]`, one array an element, by tensor name."""
-    found: dict[str, list[NDArray[Any]]] = {}
-    begin = 0
-    for name, leaf in leaf_specs(space, "action").items():
-        part = scores[:, begin : begin + _leaf_size(leaf)]
-        begin += _leaf_size(leaf)
-        if isinstance(leaf, DiscreteSpec):
-            found[name] = [part]
-        elif isinstance(leaf, MultiDiscreteSpec):
-            found[name] = np.split(part, np.cumsum(leaf.nvec)[:-1], axis=-1)
-    return found
+    return {
+        name: sample_action(part, distribution, leaf, rng).astype(leaf.dtype)
+        for name, leaf, part in split_parameters(inputs, space)
+    }
 
 
 def _choose(logits: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.int64]:
@@ -108,9 +92,3 @@ def _leaf_kind(leaf: LeafSpec, distribution: Distribution) -> str:
     if isinstance(leaf, MultiDiscreteSpec):
         return "multi_categorical"
     return "squashed_gaussian" if distribution.kind == "squashed_gaussian" else "diag_gaussian"
-
-
-def _leaf_size(leaf: LeafSpec) -> int:
-    if isinstance(leaf, DiscreteSpec):
-        return leaf.n
-    return sum(leaf.nvec) if isinstance(leaf, MultiDiscreteSpec) else 2 * leaf.size

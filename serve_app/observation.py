@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.bundle import BoxSpec, LeafSpec, iter_elements
-from rlservo.export.errors import ObservationError
+from rlservo.export.errors import ObservationError, first_line
 
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
 SMALL = 128  # elements up to which Python's own sum is faster than numpy's isfinite(...).all()
@@ -79,7 +79,7 @@ class ObservationReader:
         try:
             array = np.asarray(obs)
         except (ValueError, TypeError, OverflowError, RecursionError) as error:
-            self._refuse(f"its lists are not of equal length: {error}" if isinstance(obs, list | tuple) else str(error))
+            self._refuse(_unequal(obs) if isinstance(obs, list | tuple) else first_line(error))
         if array.dtype.kind not in NUMBER_KINDS:
             self._refuse_values(obs, array)
         return array
@@ -221,6 +221,26 @@ def _first_non_number(value: Any, where: tuple[int, ...]) -> tuple[tuple[int, ..
     if isinstance(value, int) and -(2**63) <= value < 2**64:
         return None
     return where, value
+
+
+def _unequal(lists: Sequence[Any]) -> str:
+    """Say which of the lists is not like the first one."""
+
+    def form(value: Any) -> tuple[int, ...] | None:
+        try:
+            return tuple(np.shape(value))
+        except (ValueError, TypeError, OverflowError, RecursionError):
+            return None
+
+    first = form(lists[0])
+    for index, one in enumerate(lists):
+        found = form(one)
+        if found is None or found != first:
+            shape = "has lists that are not of equal length" if found is None else f"is of shape {found}"
+            return (
+                f"its parts are not of equal length: observation {index} of the batch {shape}, the first is of {first}"
+            )
+    return "its lists are not of equal length"
 
 
 def _describe(value: Any) -> str:

@@ -7,7 +7,6 @@ nothing of the web, ray, torch or gymnasium. The server is a thin edge over it (
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +18,7 @@ from typing_extensions import Self
 
 from rlservo.export.bundle import (
     CONTRACT_FILE,
+    CONTRACT_KEY,
     GOLDEN_FILE,
     BoxSpec,
     Bundle,
@@ -27,12 +27,23 @@ from rlservo.export.bundle import (
     Distribution,
     LeafSpec,
     MultiDiscreteSpec,
+    embedded_contract,
     leaf_specs,
     load_bundle,
 )
-from rlservo.export.errors import ActionError, BundleError, GoldenMismatchError, RequestError, UsageError
+from rlservo.export.errors import (
+    ActionError,
+    BundleError,
+    BundleTamperedError,
+    GoldenMismatchError,
+    RequestError,
+    UsageError,
+    first_line,
+)
+from rlservo.export.scores import split_scores
+from rlservo.export.session import open_session
 from rlservo.serve_app.acting import Observation
-from rlservo.serve_app.exploring import distribution_size, sample_leaves, split_scores
+from rlservo.serve_app.exploring import distribution_size, sample_leaves
 from rlservo.serve_app.guard import ActionGuard
 from rlservo.serve_app.memory import REWARD, Memory, State
 from rlservo.serve_app.observation import ObservationReader
@@ -47,6 +58,12 @@ GOLDEN_RTOL = (
     1e-4  # machines differ in the last bits of exp and in the order of sums; a wrong graph differs in the first
 )
 GOLDEN_ATOL = 1e-5  # the same for actions near zero
+
+# onnxruntime's names of the types a policy's tensors have.
+ONNX_TYPES = {
+    "tensor(float)": "float32", "tensor(double)": "float64", "tensor(float16)": "float16", "tensor(bool)": "bool",
+    **{f"tensor({name})": name for size in (8, 16, 32, 64) for name in (f"int{size}", f"uint{size}")},
+}  # fmt: skip
 
 _Run = Callable[[list[str], dict[str, NDArray[Any]]], Any]
 
@@ -94,8 +111,9 @@ class Policy:
             raise UsageError(f"threads must be 1 or more, got {threads}")
         bundle = load_bundle(path)
         _check_contract(bundle)
-        session = _open_session(bundle, threads)
+        session = _open(bundle, threads)
         _check_graph(bundle, session)
+        _check_copy(bundle, session)
         if check_golden:
             check_golden_vectors(bundle, session.run)
         return cls(bundle, session)
@@ -249,14 +267,24 @@ def _check_contract(bundle: Bundle) -> None:
     outputs = {tensor.name: tensor for tensor in contract.outputs}
     if missing := [name for name in actions if name not in outputs]:
         raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no output {_quoted(missing)}")
+    tensors_of = {"inputs": observations, "outputs": actions}
+    for side, listed_tensors in (("inputs", contract.inputs), ("outputs", contract.outputs)):
+        for tensor in listed_tensors:
+            space = tensors_of[side].get(tensor.name)
+            if space is not None and (tensor.dtype, tensor.shape) != (space.dtype, (-1, *space.shape)):
+                raise BundleError(
+                    f"{bundle.path}: the space of '{tensor.name}' is {space.dtype} of shape {space.shape}, the tensor "
+                    f"{tensor.dtype} of shape {tensor.shape}"
+                )
     for state in contract.state:
         shape = (-1, *state.shape)
         for name, tensors in (
             (f"state_in.{state.name}", contract.inputs),
             (f"state_out.{state.name}", contract.outputs),
         ):
-            if not any(tensor.name == name and tensor.shape == shape for tensor in tensors):
-                raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no '{name}' of shape {shape}")
+            wanted = (name, state.dtype, shape)
+            if not any((tensor.name, tensor.dtype, tensor.shape) == wanted for tensor in tensors):
+                raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no '{name}' of shape {shape} ({state.dtype})")
     for name, space in {**observations, **actions}.items():
         _check_leaf(bundle, name, space)
     expected = contract.distribution and distribution_size(contract.distribution, contract.action_space)
@@ -292,24 +320,11 @@ def _quoted(names: Sequence[str]) -> str:
     return ", ".join(f"'{name}'" for name in names)
 
 
-def _open_session(bundle: Bundle, threads: int) -> onnxruntime.InferenceSession:
-    # onnxruntime 1.31's Linux wheels report use to Microsoft from the moment they are imported unless this is set
-    # (its Privacy.md). What runs a robot calls nobody; whoever wants it may set the variable to 0.
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.log_severity_level = 4  # what goes wrong arrives as an exception; onnxruntime would print it as well
-    # A second thread spinning for work burns a core that a robot's control loop wants.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+def _open(bundle: Bundle, threads: int) -> onnxruntime.InferenceSession:
     try:
-        # From bytes, not from the path: a graph cannot make onnxruntime read other files that way.
-        return onnxruntime.InferenceSession(bundle.onnx.read_bytes(), options, providers=["CPUExecutionProvider"])
+        return open_session(bundle.onnx, threads)
     except Exception as error:  # onnxruntime's own exceptions share no base but Exception
-        raise BundleError(f"{bundle.onnx} is not a graph onnxruntime can run: {_first_line(error)}") from error
+        raise BundleError(f"{bundle.onnx} is not a graph onnxruntime can run: {first_line(error)}") from error
 
 
 def _check_graph(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
@@ -326,6 +341,11 @@ def _check_graph(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
                 f"{CONTRACT_FILE} lists {', '.join(sorted(tensor.name for tensor in listed))}"
             )
         for tensor in listed:
+            actual_type = ONNX_TYPES.get(found[tensor.name].type, found[tensor.name].type)
+            if actual_type != tensor.dtype:
+                raise BundleError(
+                    f"{bundle.onnx}: '{tensor.name}' is {actual_type} in the graph, {tensor.dtype} in {CONTRACT_FILE}"
+                )
             inner = tuple(found[tensor.name].shape[1:])
             # A symbolic axis (a string) fits any size; the golden vectors check the rest.
             fits = len(inner) == len(tensor.shape) - 1 and all(
@@ -336,6 +356,22 @@ def _check_graph(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
                     f"{bundle.onnx}: '{tensor.name}' has shape (batch, {', '.join(map(str, inner))}) in the graph and "
                     f"{tensor.shape} in {CONTRACT_FILE}"
                 )
+
+
+def _check_copy(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
+    """Compare the contract with the copy inside the graph: an edited one may have valid hashes."""
+    text = session.get_modelmeta().custom_metadata_map.get(CONTRACT_KEY)
+    if text is None:
+        return  # a graph that another tool wrote; what of the contract can be seen in it has been compared
+    exported = embedded_contract(text, bundle.onnx)
+    now = bundle.contract.model_copy(update={"evaluations": exported.evaluations})  # `rlservo verify` adds to them
+    if now != exported:
+        changed = [name for name in Contract.model_fields if getattr(now, name) != getattr(exported, name)]
+        raise BundleTamperedError(
+            f"{bundle.path / CONTRACT_FILE} has been edited since the export: its {_quoted(changed)} "
+            f"{'is' if len(changed) == 1 else 'are'} not what {bundle.onnx.name} was proven with",
+            {"fields": changed},
+        )
 
 
 def check_golden_vectors(bundle: Bundle, run: _Run) -> None:
@@ -354,7 +390,7 @@ def check_golden_vectors(bundle: Bundle, run: _Run) -> None:
         computed = dict(zip(names, run(names, feed), strict=True))
     except Exception as error:  # onnxruntime's own exceptions share no base but Exception
         raise BundleError(
-            f"{bundle.path}: the graph does not run on its golden vectors: {_first_line(error)}"
+            f"{bundle.path}: the graph does not run on its golden vectors: {first_line(error)}"
         ) from error
     rtol = max(bundle.contract.parity.rtol, GOLDEN_RTOL)
     atol = max(bundle.contract.parity.atol, GOLDEN_ATOL)
@@ -418,7 +454,3 @@ def _ties(
         b = part[rows, np.where(valid, there, 0)[:, column]]
         tied[:, column] = valid[:, column] & (np.abs(a - b) <= rtol * np.abs(b) + atol)
     return tied.reshape(expected.shape)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:300]

@@ -46,7 +46,7 @@ def trained(script: str) -> Iterator[Path]:
     environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
     command = [sys.executable, "-W", "ignore", str(HERE / script), str(folder)]
     try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=580)
         assert done.returncode == 0, done.stderr[-3000:]
         yield folder
     finally:

@@ -12,13 +12,21 @@ import onnx
 import onnxruntime
 import pytest
 
-from rlservo.export import exporter, parity
-from rlservo.export.bundle import DiscreteSpec, contract_json, load_bundle
-from rlservo.export.errors import CheckpointError, ParityError, RlservoError, UnsupportedError, UsageError
+from rlservo.export import bundle, exporter, parity
+from rlservo.export.bundle import DiscreteSpec, contract_json, load_bundle, write_contract
+from rlservo.export.errors import (
+    BundleTamperedError,
+    CheckpointError,
+    ParityError,
+    RlservoError,
+    UnsupportedError,
+    UsageError,
+)
 from rlservo.export.exporter import export_checkpoint
 from rlservo.export.naming import default_name
 from rlservo.export.onnx import run_onnx
 from rlservo.export.torchscript import run_torchscript
+from rlservo.serve_app.policy import Policy
 
 EXPORTED = [
     "pendulum", "cart_pole", "clipped", "shared", "free_std", "relu", "unbounded", "mixed", "half_bounded", "double",
@@ -108,6 +116,34 @@ def test_versions_count_up_and_are_never_overwritten(zoo: Path, tmp_path: Path, 
     assert (first.path.name, second.path.name) == ("7", "8")
     with pytest.raises(UsageError, match=r"balance/7 exists already"):
         export_checkpoint(zoo / "cart_pole", tmp_path, name="balance", version="7", notify=notices.append)
+
+
+def test_an_edited_contract_with_valid_hashes_is_refused_at_load(zoo: Path, tmp_path: Path, notices: list[str]) -> None:
+    result = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
+    space = result.contract.action_space
+    assert space.kind == "box"
+    wider = space.model_copy(update={"low": -200.0, "high": 200.0})  # a robot would be let through
+    write_contract(result.path, result.contract.model_copy(update={"action_space": wider}))
+    with pytest.raises(BundleTamperedError, match="has been edited since the export: its 'action_space' is not what"):
+        Policy.load(result.path)
+    write_contract(result.path, result.contract)
+    Policy.load(result.path)
+
+
+def test_a_contract_is_replaced_whole_or_not_at_all(
+    zoo: Path, tmp_path: Path, notices: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = export_checkpoint(zoo / "cart_pole", tmp_path, notify=notices.append)
+    before = {file.name: file.read_bytes() for file in result.path.iterdir()}
+
+    def full(_path: Path) -> str:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bundle, "sha256", full)  # after the new contract has been written, before its hash
+        with pytest.raises(OSError, match="No space left"):
+            write_contract(result.path, result.contract.model_copy(update={"description": "another"}))
+    assert {file.name: file.read_bytes() for file in result.path.iterdir()} == before
 
 
 def test_the_value_head_can_be_left_out(zoo: Path, tmp_path: Path, notices: list[str]) -> None:

@@ -12,7 +12,7 @@ import gymnasium
 import pytest
 from rich.console import Console
 
-from rlservo.export.bundle import Element, load_bundle, read_contract
+from rlservo.export.bundle import BoxSpec, Element, load_bundle, read_contract
 from rlservo.export.elements import read_elements
 from rlservo.export.errors import BundleError, ParityError, UsageError
 from rlservo.export.exporter import export_checkpoint
@@ -29,6 +29,15 @@ def toy(app: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     gymnasium.register("zoo/Toy-v0", entry_point="zoo_parts:Toy")
     yield "zoo/Toy-v0"
     gymnasium.registry.pop("zoo/Toy-v0")
+
+
+@pytest.fixture
+def spaces(app: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The wide zoo's environment, which pays for the actions it is given."""
+    monkeypatch.syspath_prepend(str(app))
+    gymnasium.register("zoo/Spaces-v0", entry_point="zoo_spaces:Spaces", disable_env_checker=True)
+    yield "zoo/Spaces-v0"
+    gymnasium.registry.pop("zoo/Spaces-v0")
 
 
 def test_verify_runs_both_on_the_same_seeds_and_writes_it_into_the_bundle(
@@ -51,6 +60,22 @@ def test_verify_reports_success_where_the_environment_tells(
     result = verify_bundle(exported.path, zoo / "mixed", env_id=toy, episodes=3, first_seed=5, notify=notices.append)
     assert result.evaluation is not None and result.evaluation.success_rate_bundle == 1.0
     assert result.evaluation.return_bundle == pytest.approx(result.evaluation.return_checkpoint, rel=1e-5)
+
+
+@pytest.mark.parametrize(("name", "action"), [("lstm_box", "box"), ("act_nested", "nested"), ("previous", "discrete")])
+def test_verify_drives_recurrent_and_nested_policies(
+    wide_zoo: Path, app: Path, tmp_path: Path, notices: list[str], spaces: str, name: str, action: str
+) -> None:
+    exported = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append)
+    assert exported.contract.provenance.env_config["action"] == action
+    result = verify_bundle(
+        exported.path, wide_zoo / name, env_id=spaces, episodes=3, app_dir=app, notify=notices.append
+    )
+    evaluation = result.evaluation
+    assert evaluation is not None and evaluation.episodes == 3 and evaluation.return_bundle != 0.0
+    assert evaluation.return_bundle == pytest.approx(evaluation.return_checkpoint, rel=1e-4)
+    assert load_bundle(exported.path).contract.evaluations == (evaluation,)
+    assert not [file for file in exported.path.iterdir() if file.name.startswith(".")]
 
 
 def test_verify_catches_another_checkpoint(zoo: Path, tmp_path: Path, notices: list[str]) -> None:
@@ -151,3 +176,40 @@ def test_the_report_shows_names_bounds_baked_steps_and_proof(
         assert words in shown, words
     assert max(len(line) for line in shown.splitlines()) <= width
     assert "-8 " in shown and "gaussian" in shown
+
+
+ROBOT_NAMES = [f"{joint}_joint_{what}" for joint in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2")
+               for what in ("position", "velocity")]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["act_nested", "lstm_previous", "image", "obs_tuple"])
+def test_the_report_of_any_policy_fits_a_terminal_and_breaks_no_name(
+    wide_zoo: Path, app: Path, tmp_path: Path, notices: list[str], name: str
+) -> None:
+    contract = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append).contract
+    file = io.StringIO()
+    Console(width=80, file=file).print(contract_report(contract))
+    shown = file.getvalue()
+    assert max(len(line.rstrip()) for line in shown.splitlines()) <= 80
+    words = shown.split()
+    for tensor in (*contract.inputs, *contract.outputs):
+        assert tensor.name in words, tensor.name
+    assert all(state.name in words for state in contract.state)
+    assert "…" not in shown and len(shown.splitlines()) < 90
+
+
+def test_long_element_names_with_units_and_a_filter_fit_eighty_columns(
+    zoo: Path, tmp_path: Path, notices: list[str]
+) -> None:
+    contract = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append).contract
+    size = len(ROBOT_NAMES)
+    space = BoxSpec(shape=(size,), dtype="float32", low=-6.283185307, high=6.283185307,
+                    elements=tuple(Element(name=one, unit="rad/s") for one in ROBOT_NAMES))  # fmt: skip
+    frozen = contract.baked_in[0].model_copy(update={"values": {"mean": [-123.456] * size, "std": [0.001234] * size}})
+    changed = contract.model_copy(update={"observation_space": space, "baked_in": (frozen, *contract.baked_in[1:])})
+    file = io.StringIO()
+    Console(width=80, file=file).print(contract_report(changed))
+    shown = file.getvalue()
+    for one in (*ROBOT_NAMES, "-123.5", "0.001234", "6.283", "rad/s"):
+        assert one in shown, one
+    assert max(len(line.rstrip()) for line in shown.splitlines()) <= 80

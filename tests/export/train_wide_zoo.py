@@ -29,6 +29,7 @@ from ray.rllib.connectors.env_to_module.frame_stacking import FrameStackingEnvTo
 from ray.rllib.connectors.learner.frame_stacking import FrameStackingLearner
 from ray.rllib.core import COMPONENT_RL_MODULE
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.env import INPUT_ENV_SPACES
 from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
@@ -39,7 +40,8 @@ from ray.rllib.offline.offline_prelearner import OfflinePreLearner
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "app"), str(HERE)]
 import zoo_spaces  # noqa: E402  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
-from train_zoo import record  # noqa: E402  # pyright: ignore[reportMissingImports]
+import zoo_team  # noqa: E402  # pyright: ignore[reportMissingImports]
+from train_zoo import leaves, record  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 SMALL = DefaultModelConfig(fcnet_hiddens=[16])
 LSTM = DefaultModelConfig(fcnet_hiddens=[8], use_lstm=True, lstm_cell_size=8, max_seq_len=10)
@@ -153,6 +155,55 @@ def offline(config: Any, data: str, action: str, **training: Any) -> Any:
     return config.rl_module(model_config=SMALL)
 
 
+def team(*before: Any, together: Any = None) -> Any:
+    """Two arms that share a module, and a base whose module has a memory."""
+    specs = {"arms": RLModuleSpec(model_config=SMALL), "wheels": RLModuleSpec(model_config=LSTM)}
+    given = {"multi_rl_module_class": together} if together else {}
+    config = PPOConfig().environment("team").env_runners(num_env_runners=0)
+    if before:
+        config.env_runners(env_to_module_connector=pieces(*before))
+    config.training(train_batch_size=32, minibatch_size=16, num_epochs=1)
+    config.rl_module(rl_module_spec=MultiRLModuleSpec(rl_module_specs=specs, **given))
+    return config.multi_agent(policies=set(specs), policy_mapping_fn=zoo_team.module_of)
+
+
+def filtered_each() -> Any:
+    return MeanStdFilter(multi_agent=True)
+
+
+def record_team(algorithm: Any, out: Path, name: str) -> None:
+    """Let RLlib roll out by itself and write down what each agent saw and did."""
+    runner = algorithm.env_runner
+    for piece in runner._env_to_module.connectors:
+        if isinstance(piece, MeanStdFilter):
+            piece._update_stats = False
+    runner.sample(num_timesteps=1, explore=False, force_reset=True)  # drops observations filtered before the freeze
+    env = runner.env.envs[0].unwrapped
+    seen: dict[str, list[dict[str, Any]]] = {agent: [] for agent in zoo_team.OBSERVATIONS}
+    last: dict[str, Any] = {}
+    real_reset, real_step = env.reset, env.step
+
+    def reset(**kwargs: Any) -> Any:
+        obs, info = real_reset(**kwargs)
+        last.update(obs=leaves(obs, "obs"), restart=True)
+        return obs, info
+
+    def step(action: Any) -> Any:
+        for agent, rows in seen.items():
+            if last:
+                chosen = np.copy(action[agent])
+                rows.append({"obs": last["obs"][f"obs.{agent}"], "action": chosen, "restart": last["restart"]})
+        result = real_step(action)
+        last.update(obs=leaves(result[0], "obs"), restart=False)
+        return result
+
+    env.reset, env.step = reset, step
+    runner.sample(num_timesteps=60, explore=False, force_reset=True)
+    for agent, rows in seen.items():
+        assert len(rows) >= 50, len(rows)
+        np.savez(out / f"{name}_{agent}.npz", **{key: np.stack([row[key] for row in rows]) for key in rows[0]})
+
+
 def configurations(out: Path) -> dict[str, Any]:
     flat = FlattenObservations
     choices, numbers = (recorded(out, action) for action in ("discrete", "box"))
@@ -202,12 +253,16 @@ def configurations(out: Path) -> dict[str, Any]:
         "dqn_plain": off_policy(DQNConfig(), "vector", "discrete", dueling=False, double_q=False),
         "dqn_distributional": off_policy(DQNConfig(), "dict", "discrete", flat, num_atoms=5, v_min=-3.0, v_max=3.0),
         "dqn_distributional_plain": off_policy(DQNConfig(), "vector", "discrete", dueling=False, num_atoms=5),
+        "team": team(filtered_each),
+        "plain_team": team(),
+        "committee": team(together=zoo_team.Committee),
         "dqn_lstm": off_policy(DQNConfig(), "vector", "discrete", model=LSTM, replay_buffer_config=episodes),
     }  # fmt: skip
 
 
 def main(out: Path, only: list[str]) -> None:
     tune.register_env("spaces", zoo_spaces.Spaces)
+    tune.register_env("team", zoo_team.Team)
     ray.init(num_cpus=1, include_dashboard=False, _temp_dir=str(out / "ray"), configure_logging=False)
     try:
         for name, config in configurations(out).items():
@@ -219,7 +274,10 @@ def main(out: Path, only: list[str]) -> None:
             # An environment runner may lag behind its learner, and the checkpoint holds the learner's weights.
             if algorithm.env_runner is not None:
                 algorithm.restore_from_path(str(out / name))
-            record(algorithm, out / f"{name}.npz")
+            if "team" in name:
+                record_team(algorithm, out, name)
+            elif name != "committee":
+                record(algorithm, out / f"{name}.npz")
             algorithm.stop()
             print(name, flush=True)
     finally:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import shutil
 import subprocess
@@ -241,6 +243,7 @@ def test_a_contract_the_runtime_cannot_honour_is_refused(
     folder = box_policy(tmp_path)
     good = read_contract(folder)
     narrow = good.observation_space.model_copy(update={"shape": (26,), "elements": ()})
+    double = good.observation_space.model_copy(update={"dtype": "float64"})
     cases: list[tuple[dict[str, object], str]] = [
         ({"state": (StateSpec(name="h", dtype="float32", shape=(4,)),)}, r"lists no 'state_in.h' of shape \(-1, 4\)"),
         ({"inputs": ()}, "no input 'obs'"),
@@ -248,6 +251,11 @@ def test_a_contract_the_runtime_cannot_honour_is_refused(
         ({"distribution": Distribution(kind="categorical", transform="none")}, "needs the output 'action_dist_inputs'"),
         ({"outputs": (good.outputs[0].model_copy(update={"shape": (-1, 7)}), good.outputs[1])}, "shape"),
         ({"observation_space": narrow, "inputs": (good.inputs[0].model_copy(update={"shape": (-1, 26)}),)}, "shape"),
+        ({"observation_space": narrow}, r"the space of 'obs' is float32 of shape \(26,\), the tensor float32 of shape"),
+        (
+            {"observation_space": double, "inputs": (good.inputs[0].model_copy(update={"dtype": "float64"}),)},
+            "'obs' is float32 in the graph, float64 in contract.json",
+        ),
     ]
     for changes, sentence in cases:
         rewrite_contract(folder, **changes)
@@ -278,3 +286,41 @@ def test_loading_a_policy_starts_no_telemetry(ur5: Path, tmp_path: Path) -> None
     code = f"from rlservo.serve_app.policy import Policy; Policy.load({str(ur5)!r}).act([0.0] * 27)"
     subprocess.run([sys.executable, "-c", code], check=True, env={**environment, "TMPDIR": str(tmp_path)})
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("control_rate_hz", 0.0, "control_rate_hz: Input should be greater than 0"),
+        ("parity.rtol", 0.5, "parity.rtol: Input should be less than or equal to 0.01"),
+        ("parity.atol", -1.0, "parity.atol: Input should be greater than or equal to 0"),
+        ("observation_space.shape", [0], "observation_space.box.shape.0: Input should be greater than or equal to 1"),
+        ("inputs.0.shape", [27], r"inputs.0.shape: .*expected -1 for the batch, then positive sizes, got \[27\]"),
+        ("inputs.0.shape", [-1, -1], "expected -1 for the batch"),
+    ],
+)
+def test_a_contract_with_numbers_that_cannot_be_is_refused(
+    box_policy: Callable[..., Path], tmp_path: Path, field: str, value: object, words: str
+) -> None:
+    folder = box_policy(tmp_path)
+    document = json.loads((folder / "contract.json").read_text())
+    *path, last = field.split(".")
+    inside = document
+    for key in path:
+        inside = inside[int(key)] if isinstance(inside, list) else inside[key]
+    inside[last] = value
+    (folder / "contract.json").write_text(json.dumps(document))
+    sums = [line for line in (folder / "SHA256SUMS").read_text().splitlines() if "contract.json" not in line]
+    digest = hashlib.sha256((folder / "contract.json").read_bytes()).hexdigest()
+    (folder / "SHA256SUMS").write_text("\n".join([*sums, f"{digest}  contract.json"]) + "\n")
+    with pytest.raises(BundleError, match=words):
+        Policy.load(folder)
+
+
+@pytest.mark.parametrize("ragged", [[[0.0] * 27, [0.0] * 26], [[0.0] * 27, 1.0]])
+def test_a_ragged_batch_is_refused_in_our_own_words(
+    box_policy: Callable[..., Path], tmp_path: Path, ragged: list[object]
+) -> None:
+    with pytest.raises(ObservationError, match="observation 1 of the batch") as caught:
+        Policy.load(box_policy(tmp_path)).act(ragged)
+    assert "array" not in caught.value.message and "inhomogeneous" not in caught.value.message

@@ -75,8 +75,15 @@ class Spaces(gym.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.steps += 1
-        reward = float(self.np_random.standard_normal())
+        reward = float(self.np_random.standard_normal()) + worth(action)
         return self._observe(), reward, self.steps >= self.length, False, {}
+
+
+def worth(action: Any) -> float:
+    """Return a number that another action changes."""
+    if isinstance(action, dict | tuple):
+        return sum(worth(part) for part in (action.values() if isinstance(action, dict) else action))
+    return float(np.sum(action)) / 10.0
 
 
 class DictModule(TorchRLModule, ValueFunctionAPI):

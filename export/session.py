@@ -1,0 +1,34 @@
+"""Open a graph in onnxruntime, alike for the exporter's gate and for whatever acts with it later.
+
+It needs onnxruntime only; it knows nothing of policies, torch or ray.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+
+def open_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSession:
+    """Return a session on the CPU with so many threads; one is fastest for networks of a policy's size.
+
+    Raises onnxruntime's own exceptions, which share no base but Exception.
+    """
+    # onnxruntime 1.31's Linux wheels report use to Microsoft from the moment they are imported unless this is set
+    # (its Privacy.md). What exports or runs a robot's policy calls nobody; whoever wants it may set the variable to 0.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.log_severity_level = 4  # what goes wrong arrives as an exception; onnxruntime would print it as well
+    # A second thread spinning for work burns a core that a robot's control loop wants.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # From bytes, not from the path: a graph cannot make onnxruntime read other files that way.
+    return onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])

@@ -1,0 +1,52 @@
+"""An environment with three agents for the zoo: two arms that share a module, and a base with one of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule
+from ray.rllib.env.multi_agent_env import MultiAgentEnv
+
+OBSERVATIONS = {
+    "left": Box(-3.0, 3.0, (4,), np.float32),
+    "right": Box(-3.0, 3.0, (4,), np.float32),
+    "base": Box(-1.0, 1.0, (2,), np.float32),
+}
+ARM = Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 5.0], np.float32))
+ACTIONS = {"left": ARM, "right": ARM, "base": Discrete(3)}
+MODULES = {"left": "arms", "right": "arms", "base": "wheels"}
+
+
+def module_of(agent: str, *_: Any, **__: Any) -> str:
+    return MODULES[agent]
+
+
+class Team(MultiAgentEnv):
+    """The arms see other ranges, so that their filters differ; episodes end after seven steps."""
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__()
+        self.observation_spaces, self.action_spaces = OBSERVATIONS, ACTIONS
+        self.agents = self.possible_agents = list(OBSERVATIONS)
+        self.rng = np.random.default_rng(0)
+        self.time = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.time = 0
+        return self._observe(), {}
+
+    def step(self, action: Any) -> Any:
+        self.time += 1
+        done = {"__all__": self.time >= 7}
+        return self._observe(), dict.fromkeys(self.agents, 1.0), done, {"__all__": False}, {}
+
+    def _observe(self) -> dict[str, Any]:
+        drawn = {agent: self.rng.uniform(space.low, space.high) for agent, space in OBSERVATIONS.items()}
+        drawn["right"] = drawn["right"] / 3.0 + 1.0
+        return {agent: values.astype(np.float32) for agent, values in drawn.items()}
+
+
+class Committee(MultiRLModule):
+    """Modules that might decide together: nobody can tell from outside."""
