@@ -12,6 +12,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,8 +39,8 @@ from rlservo.export.facts import CheckpointFacts, read_facts
 from rlservo.export.location import CheckpointFiles, locate_checkpoint
 from rlservo.export.naming import check_names, choose_target, default_name
 from rlservo.export.old_location import OldStackFiles
-from rlservo.export.parity import GraphLoop, Outputs, Recorded, Runner, prove, record, replay, ties
-from rlservo.export.recipe import Recipe
+from rlservo.export.parity import GraphLoop, Outputs, Recorded, Runner, prove, record, record_moved, replay, ties
+from rlservo.export.recipe import Recipe, loose_bounds
 from rlservo.export.samples import BATCH_SIZES, Inputs, draw_batches
 from rlservo.export.spaces import space_spec, state_spec
 from rlservo.export.steps import baked_steps
@@ -93,6 +94,8 @@ def export_checkpoint(
         name = name or default_name(facts.env_id, files.root)
         target = choose_target(Path(out), name, version)
         restored = _load(files, notify, value)
+        for warning in loose_bounds(restored.recipe):
+            notify(warning)
         elements = read_elements(facts.env_id, facts.env_config, restored.recipe, notify)
         with _temporary_folder(target) as folder, one_thread():
             labels = [element.name for element in elements.action]
@@ -156,19 +159,26 @@ def _write_graphs(folder: Path, restored: Restored, labels: list[str], api_stack
     """Write both formats, prove them, and return the proof and the golden vectors."""
     from rlservo.export.actor import PolicyGraph
     from rlservo.export.onnx import run_onnx, write_onnx
+    from rlservo.export.suspects import why_different
     from rlservo.export.torchscript import run_torchscript, write_torchscript
 
     recipe = restored.recipe
     graph = PolicyGraph(recipe, restored.network)
     batches = draw_batches(recipe, SEED)
-    recorded = record(restored.reference, batches, restored.loop)
+    recorded = record(restored.reference, batches, restored.loop, recipe.observation_leaves)
     pair = next(batch for batch in batches if len(batch) == BATCH_SIZES[1])
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(len(pair), np.bool_))
-    write_torchscript(graph, example, folder / TORCHSCRIPT_FILE)
+    frozen = write_torchscript(graph, example, folder / TORCHSCRIPT_FILE)
     write_onnx(graph, example, folder / ONNX_FILE)
     onnx = run_onnx(folder / ONNX_FILE)
     script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
-    parity = prove(recipe, recorded, {"onnx": onnx, "torchscript": script}, labels, api_stack)
+    moved = partial(record_moved, restored.reference, recorded, restored.loop)
+    try:
+        parity = prove(recipe, recorded, {"onnx": onnx, "torchscript": script}, labels, api_stack, moved)
+    except ParityError as error:
+        if why := why_different(restored.reference, recorded, frozen):
+            raise ParityError(f"{error.message}; {why}", error.details) from error
+        raise
     inputs = _golden_inputs(recipe, recorded, onnx)
     outputs = onnx(inputs)
     ordered = {name: inputs[name] for name in graph.input_names}

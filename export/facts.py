@@ -112,7 +112,7 @@ def read_config(ctor_args_and_kwargs: Any) -> Mapping[str, Any]:
 def _as_mapping(config: Any) -> Mapping[str, Any]:
     if isinstance(config, Mapping):
         return config
-    return dict(vars(config))
+    return dict(getattr(config, "__dict__", {}))
 
 
 def _env_name(env: Any) -> str | None:

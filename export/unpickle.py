@@ -14,6 +14,8 @@ from typing import Any
 
 from rlservo.export.errors import CheckpointError, UsageError
 
+TRUNCATED = "the file is truncated or damaged ({})"
+
 
 @contextmanager
 def user_code(app_dir: str | Path) -> Iterator[None]:
@@ -45,11 +47,13 @@ def unpickle(file: Path) -> Any:
     except OSError as error:
         raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from error
     except Exception as error:  # a damaged pickle raises almost anything, and so does the code it runs
-        raise CheckpointError(f"{file} cannot be loaded: {explain(error)}") from error
+        damaged = isinstance(error, UnicodeDecodeError | IndexError | KeyError | MemoryError)
+        reason = TRUNCATED.format(first_line(error)) if damaged else explain(error)
+        raise CheckpointError(f"{file} cannot be loaded: {reason}") from error
 
 
 def explain(error: BaseException) -> str:
-    """Return in one clause why loading failed."""
+    """Return in one clause why loading failed: the file, the code it names, or what that code raised."""
     if isinstance(error, ModuleNotFoundError) and error.name:
         return (
             f"it needs the Python module '{error.name}', which was not found in {searched()}; "
@@ -60,8 +64,8 @@ def explain(error: BaseException) -> str:
             f"its code does not fit what is installed ({first_line(error)}); looked in {searched()}, and --app-dir "
             "names another folder"
         )
-    if isinstance(error, EOFError | pickle.UnpicklingError | UnicodeDecodeError | IndexError | KeyError | MemoryError):
-        return f"the file is truncated or damaged ({first_line(error)})"
+    if isinstance(error, EOFError | pickle.UnpicklingError):
+        return TRUNCATED.format(first_line(error))
     return first_line(error)
 
 
@@ -72,5 +76,6 @@ def searched() -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an exception's text, or its type where it has none."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:300]
+    """Return the first line of an exception's text, with its type where the text alone says little."""
+    text = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
+    return f"{type(error).__name__}: {text}" if isinstance(error, LookupError) else text
