@@ -71,7 +71,8 @@ def explain(error: BaseException) -> str:
 
 def searched() -> str:
     """Return the import path as a person reads it: without the standard library, which holds no user code."""
-    own = [entry or "." for entry in sys.path if "lib/python" not in entry and not entry.endswith(".zip")]
+    hidden = ("lib/python", "__editable__", ".zip")
+    own = [entry or "." for entry in sys.path if not any(part in entry for part in hidden)]
     return ", ".join(dict.fromkeys([*own, "the installed packages"]))
 
 
