@@ -58,6 +58,11 @@ PIPELINE_SETTINGS = (
     "action_space",
 )
 """What of an algorithm's configuration decides its connector pipelines (ray 2.60)."""
+REFUSED_MODULES = {
+    "DreamerV3TorchRLModule": "DreamerV3 draws its world model's state at random in every step, exploring or not, so "
+    "there is no one action to prove an export with",
+}
+"""Modules of RLlib's own that can be restored and not exported, and why."""
 QF_PREDS = "qf_preds"  # DQN's key for the Q-values, in ray/rllib/algorithms/dqn/default_dqn_rl_module.py
 
 
@@ -223,6 +228,8 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
     name = type(module).__name__
     if not isinstance(module, TorchRLModule):
         raise UnsupportedError(f"module {name} is not a torch RLModule: only torch modules are exported")
+    if why := REFUSED_MODULES.get(name):
+        raise UnsupportedError(f"module {name} is not exported: {why}")
     module.eval().requires_grad_(False)
     no_value = _check_weights(files, module)
     seat = find_seat(files, env_to_module, module_to_env)
@@ -245,12 +252,20 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
             notify(f"the checkpoint holds no value head ({no_value}): the export has no output 'value'")
         else:
             names = (*names, "value")
-    traced = copy.deepcopy(module)
+    traced = _twin(module, files)
     replace_heads(traced)
     given_leaves = len(recipe.action_leaves) if mode == "given" else 0
     rule = _deterministic(module) if Columns.ACTION_DIST_INPUTS in names else None
     network = Network(traced, names, given_leaves, rule)
     return Checkpoint(recipe, network, f"{type(module).__module__}.{name}", pipelines, seat.agents)
+
+
+def _twin(module: Any, files: CheckpointFiles) -> Any:
+    """Return a second module of the same weights, to trace: the first is the reference's."""
+    try:
+        return copy.deepcopy(module)
+    except Exception:  # a module that keeps tensors of its last forward pass (an old ModelV2 inside) has no copy
+        return _restore(RLModule, files.module).eval().requires_grad_(False)
 
 
 def _build_pipelines(files: CheckpointFiles, module: Any, notify: Callable[[str], None]) -> tuple[Any, Any]:
@@ -308,8 +323,9 @@ def _check_weights(files: CheckpointFiles, module: Any) -> str:
     RLlib ignores weights that are missing and leaves them random. Raises CheckpointError where an action needs them,
     and where a weight is not a finite number.
     """
+    unneeded = module.get_non_inference_attributes() if isinstance(module, InferenceOnlyAPI) else []
     for key, weights in module.state_dict().items():
-        if not torch.isfinite(weights).all():
+        if not torch.isfinite(weights).all() and not any(key.startswith(f"{prefix}.") for prefix in unneeded):
             raise CheckpointError(f"{files.module}: the weights '{key}' are not all finite: training diverged")
     if module.inference_only:
         return "it was saved for inference only"
@@ -317,7 +333,6 @@ def _check_weights(files: CheckpointFiles, module: Any) -> str:
     if type(module).get_state is not TorchRLModule.get_state or not state_file.is_file():
         return ""  # a custom layout, which only the module itself can judge, or msgpack
     missing = set(module.state_dict()) - set(unpickle(state_file))
-    unneeded = module.get_non_inference_attributes() if isinstance(module, InferenceOnlyAPI) else []
     if needed := sorted(key for key in missing if not any(key.startswith(f"{prefix}.") for prefix in unneeded)):
         raise CheckpointError(f"{state_file} lacks weights that {type(module).__name__} needs: {', '.join(needed[:3])}")
     return f"{len(missing)} weights are missing" if missing else ""

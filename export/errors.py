@@ -176,5 +176,6 @@ class ForbiddenError(RlservoError):
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an exception's text, or its type where it has none: the reason in a sentence of ours."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:300]
+    """Return the first line of an exception's text, with its type where the text alone says little."""
+    text = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
+    return f"{type(error).__name__}: {text}" if isinstance(error, LookupError) else text

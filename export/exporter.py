@@ -13,6 +13,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -39,8 +40,8 @@ from rlservo.export.errors import CheckpointError, ParityError, UsageError
 from rlservo.export.facts import CheckpointFacts, read_facts
 from rlservo.export.location import Files, locate_checkpoint, locate_modules
 from rlservo.export.naming import bundle_name, check_names, choose_target, default_name
-from rlservo.export.parity import GraphLoop, Outputs, Recorded, Runner, prove, record, replay, ties
-from rlservo.export.recipe import Recipe
+from rlservo.export.parity import GraphLoop, Outputs, Recorded, Runner, prove, record, record_moved, replay, ties
+from rlservo.export.recipe import Recipe, loose_bounds
 from rlservo.export.remote import fetched, is_uri
 from rlservo.export.samples import BATCH_SIZES, Inputs, draw_batches
 from rlservo.export.spaces import space_spec, state_spec
@@ -173,6 +174,8 @@ def _build(
     """Return the finished bundle in a folder that only wants its name."""
     order.progress(f"restoring '{files.module_id}' (importing torch and RLlib takes seconds)")
     restored = _load(files, order.notify, order.value)
+    for warning in loose_bounds(restored.recipe):
+        order.notify(warning)
     elements = read_elements(facts.env_id, facts.env_config, restored.recipe, order.notify)
     folder = folders.enter_context(_temporary_folder(target))
     with one_thread():
@@ -238,22 +241,29 @@ def _write_graphs(
     """Write both formats, prove them, and return the proof and the golden vectors."""
     from rlservo.export.actor import PolicyGraph
     from rlservo.export.onnx import run_onnx, write_onnx
+    from rlservo.export.suspects import why_different
     from rlservo.export.torchscript import run_torchscript, write_torchscript
 
     recipe = restored.recipe
     graph = PolicyGraph(recipe, restored.network)
     batches = draw_batches(recipe, SEED)
     progress(f"asking RLlib itself for {sum(len(batch) for batch in batches):,} actions")
-    recorded = record(restored.reference, batches, restored.loop)
+    recorded = record(restored.reference, batches, restored.loop, recipe.observation_leaves)
     pair = next(batch for batch in batches if len(batch) == BATCH_SIZES[1])
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(len(pair), np.bool_))
     progress("writing TorchScript and ONNX")
-    write_torchscript(graph, example, folder / TORCHSCRIPT_FILE)
+    frozen = write_torchscript(graph, example, folder / TORCHSCRIPT_FILE)
     write_onnx(graph, example, folder / ONNX_FILE)
     onnx = run_onnx(folder / ONNX_FILE)
     script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
     progress("proving both against RLlib's actions")
-    parity = prove(recipe, recorded, {"onnx": onnx, "torchscript": script}, labels, api_stack)
+    moved = partial(record_moved, restored.reference, recorded, restored.loop)
+    try:
+        parity = prove(recipe, recorded, {"onnx": onnx, "torchscript": script}, labels, api_stack, moved)
+    except ParityError as error:
+        if why := why_different(restored.reference, recorded, frozen):
+            raise ParityError(f"{error.message}; {why}", error.details) from error
+        raise
     inputs = _golden_inputs(recipe, recorded, onnx)
     outputs = onnx(inputs)
     ordered = {name: inputs[name] for name in graph.input_names}

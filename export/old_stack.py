@@ -44,7 +44,7 @@ from rlservo.export.heads import replace_bias_layers
 from rlservo.export.modes import find_mode
 from rlservo.export.old_connectors import check_connectors, read_old_steps, read_old_transform
 from rlservo.export.old_location import OldStackFiles
-from rlservo.export.old_models import register_custom_model
+from rlservo.export.old_models import register_custom_parts
 from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.samples import Inputs
 from rlservo.export.steps import surprises
@@ -144,7 +144,7 @@ class OldStackLoop:
             if "value" in self._names:
                 found["value"] = self._policy.model.value_function().numpy().copy()
             parameters = fetches[SampleBatch.ACTION_DIST_INPUTS]
-            if self._names[0] == Q_VALUES:  # a temperature divides them in place: compute them again
+            if not states:  # a temperature, DQN's or the user's own, divides them in place: compute them again
                 parameters = _distribution(self._policy, seen, [])[0].numpy()
         found[self._names[0]] = np.asarray(parameters)
         for leaf, state in zip(self._recipe.network_state, states, strict=True):
@@ -224,7 +224,7 @@ def _restore(files: OldStackFiles) -> Any:
     _check_config(files, state["policy_spec"].get("policy_class"), config)
     check_connectors(state)
     for part in ("model", "policy_model_config", "q_model_config"):  # the last two are SAC's
-        register_custom_model(config.get(part) or {}, user_folder())
+        register_custom_parts(config.get(part) or {}, user_folder())
     config.update({"num_gpus": 0, "num_gpus_per_env_runner": 0})
     state.pop("_optimizer_variables", None)
     chatty = logging.getLogger("ray._common.deprecation")
@@ -277,6 +277,13 @@ def _check_policy(files: OldStackFiles, policy: Any) -> None:
     )
     if samples_itself:
         raise UnsupportedError(f"policy {name} samples its actions itself (action_sampler_fn), which is not exported")
+    for method in ("compute_actions_from_input_dict", "_compute_action_helper"):
+        owner = next(kind for kind in type(policy).__mro__ if method in vars(kind))
+        if not owner.__module__.startswith("ray.rllib."):
+            raise UnsupportedError(
+                f"policy {name} computes its actions in a {method} of its own ({owner.__module__}), which is not "
+                "exported: do it in the model or in its action distribution"
+            )
     if any(isinstance(part, NoisyLayer) for part in policy.model.modules()):
         raise UnsupportedError(
             f"model {model} has noisy layers (noisy=True), which RLlib's old stack draws anew for every action, "

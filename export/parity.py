@@ -9,12 +9,17 @@ may cancel, so the scale is the size that the output reaches for such observatio
 observations of the same kind (likely, wide or extreme), at least 1. The kinds are apart, so that an extreme observation
 excuses nothing in a likely one. A discrete action must be the same, unless RLlib's own scores for the two choices are
 that close.
+
+Far outside the usual, a network takes the small difference of huge terms, and no two orders of adding them agree. What
+is still rounding there, RLlib itself tells: a difference also passes when it is at most ROUNDING times what RLlib's own
+numbers for that sample move by when every floating-point observation moves by its last bit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
@@ -30,6 +35,7 @@ from rlservo.export.spaces import space_spec
 
 RTOL = 1e-5
 ATOL = 1e-6
+ROUNDING = 8.0
 MASKED = 1e30
 """A score beyond this stands for 'not allowed' (RLlib's action masks add -3.4e38); it measures nothing."""
 SCORES = ("q_values", "action_dist_inputs")
@@ -92,30 +98,75 @@ class Recorded:
     outputs: Outputs
 
 
-def record(reference: Runner, batches: Sequence[Batch], loop: Callable[[], Loop] | None = None) -> list[Recorded]:
+def record(
+    reference: Runner,
+    batches: Sequence[Batch],
+    loop: Callable[[], Loop] | None = None,
+    spaces: Mapping[str, Any] | None = None,
+) -> list[Recorded]:
     """Run RLlib on every batch; sequences need `loop`, which starts RLlib's own.
+
+    The gate's wide and extreme observations leave the space, where RLlib's own pipeline may fail (the logarithm of an
+    action mask below zero): then all of them are cut back into the bounds of `spaces`, which are by input name.
 
     The observations are copied: a connector may write into what it is given. Raises UnsupportedError when RLlib's own
     pipeline fails on an observation of the policy's own space.
     """
+    try:
+        return _record(reference, batches, loop)
+    except Exception:  # RLlib's own connectors and the user's raise anything
+        inside = [replace(batch, inputs=_inside(batch.inputs, spaces or {})) for batch in batches]
+    try:
+        return _record(reference, inside, loop)
+    except Exception as error:
+        raise UnsupportedError(
+            f"RLlib's own pipeline fails on an observation of the policy's space: {first_line(error)}"
+        ) from error
+
+
+def _record(reference: Runner, batches: Sequence[Batch], loop: Callable[[], Loop] | None) -> list[Recorded]:
     recorded: list[Recorded] = []
     running: Loop | None = None
     for batch in batches:
         inputs = _copied(batch.inputs)
-        try:
-            if batch.restart is None:
-                outputs = reference(inputs)
-            else:
-                assert loop is not None, "a policy with a memory needs a reference that remembers"
-                if running is None or len(recorded[-1].batch) != len(batch):
-                    running = loop()
-                outputs = running.step(inputs, batch.restart)
-        except Exception as error:  # RLlib's own connectors and the user's raise anything
-            raise UnsupportedError(
-                f"RLlib's own pipeline fails on an observation of the policy's space: {first_line(error)}"
-            ) from error
+        if batch.restart is None:
+            outputs = reference(inputs)
+        else:
+            assert loop is not None, "a policy with a memory needs a reference that remembers"
+            if running is None or len(recorded[-1].batch) != len(batch):
+                running = loop()
+            outputs = running.step(inputs, batch.restart)
         recorded.append(Recorded(batch, outputs))
     return recorded
+
+
+def record_moved(
+    reference: Runner, recorded: Sequence[Recorded], loop: Callable[[], Loop] | None = None
+) -> list[Recorded]:
+    """Return what RLlib computes when every floating-point observation is moved up or down by its last bit."""
+    rng = np.random.default_rng(0)
+    moved = [
+        replace(one.batch, inputs={name: _by_last_bit(values, rng) for name, values in one.batch.inputs.items()})
+        for one in recorded
+    ]
+    return _record(reference, moved, loop)
+
+
+def _by_last_bit(values: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
+    if values.dtype.kind != "f":
+        return values
+    single = values.astype(np.float32)  # what the network computes with
+    towards = np.where(rng.random(values.shape) < 0.5, np.float32(np.inf), np.float32(-np.inf))
+    return np.asarray(np.nextafter(single, towards), values.dtype)
+
+
+def _inside(inputs: Inputs, spaces: Mapping[str, Any]) -> Inputs:
+    """Return the observations within their Box's bounds."""
+    boxes = {name: space for name, space in spaces.items() if isinstance(space, Box)}
+    return {
+        name: np.clip(values, boxes[name].low, boxes[name].high).astype(values.dtype) if name in boxes else values
+        for name, values in inputs.items()
+    }
 
 
 def replay(recorded: Sequence[Recorded], run: Runner, state: Sequence[StateLeaf]) -> Iterator[tuple[Inputs, Outputs]]:
@@ -137,13 +188,16 @@ def prove(
     formats: Mapping[str, Runner],
     labels: Sequence[str] = (),
     api_stack: str = "new",
+    moved: Callable[[], list[Recorded]] | None = None,
 ) -> Parity:
     """Compare every format with what was recorded and return the largest differences.
 
-    `labels` name the action's elements for the message. Raises ParityError at the first output that differs, saying
+    `labels` name the action's elements for the message; `moved` is asked, once and only where a difference is too
+    large, for what `record_moved` gives. Raises ParityError at the first output that differs, saying
     which element of which sample by how much.
     """
-    results = {name: _prove_format(name, recipe, recorded, run, labels) for name, run in formats.items()}
+    rounding = _Rounding(recorded, moved)
+    results = {name: _prove_format(name, recipe, recorded, run, labels, rounding) for name, run in formats.items()}
     return Parity(
         reference=REFERENCES[api_stack],
         samples=sum(len(one.batch) for one in recorded),
@@ -155,8 +209,33 @@ def prove(
     )
 
 
+class _Rounding:
+    """How far RLlib's own numbers move when the observations move by their last bit; asked for when first needed."""
+
+    def __init__(self, recorded: Sequence[Recorded], moved: Callable[[], list[Recorded]] | None) -> None:
+        self._recorded = recorded
+        self._ask = moved
+        self._moved: list[Recorded] | None = None
+
+    def of(self, number: int, output: str) -> NDArray[np.float64] | float:
+        """Return the largest movement in each row of an output, broadcastable to it."""
+        if self._ask is None:
+            return 0.0
+        if self._moved is None:
+            self._moved = self._ask()
+        before, after = (one[number].outputs[output].astype(np.float64) for one in (self._recorded, self._moved))
+        with np.errstate(invalid="ignore"):
+            by = np.nan_to_num(np.abs(after - before), nan=0.0, posinf=0.0)
+        return np.asarray(by.max(axis=tuple(range(1, by.ndim)), keepdims=True) if by.ndim > 1 else by)
+
+
 def _prove_format(
-    name: str, recipe: Recipe, recorded: Sequence[Recorded], run: Runner, labels: Sequence[str]
+    name: str,
+    recipe: Recipe,
+    recorded: Sequence[Recorded],
+    run: Runner,
+    labels: Sequence[str],
+    rounding: _Rounding,
 ) -> FormatParity:
     max_abs = max_rel = 0.0
     sizes = _sizes(recorded)
@@ -174,10 +253,12 @@ def _prove_format(
             space = actions.get(output)
             _check_form(where, output, got.get(output), expected, space)
             if space is not None and not isinstance(space, Box):
-                _check_choices(where, output, got[output], one, recipe, sizes)
+                which = next((score for score in SCORES if score in one.outputs), SCORES[-1])
+                _check_choices(where, output, got[output], one, recipe, sizes, partial(rounding.of, number, which))
                 continue
             least = sizes[one.batch.kind, output]
-            difference, scale = _compare(where, output, got[output], expected, space, one, labels, least)
+            moves = partial(rounding.of, number, output)
+            difference, scale = _compare(where, output, got[output], expected, space, one, labels, least, moves)
             max_abs = max(max_abs, float(difference.max(initial=0.0)))
             max_rel = max(max_rel, float((difference / scale).max(initial=0.0)))
     return FormatParity(max_abs=max_abs, max_rel=max_rel)
@@ -203,6 +284,7 @@ def _compare(
     one: Recorded,
     labels: Sequence[str],
     least_scale: float,
+    moves: Callable[[], NDArray[np.float64] | float],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return (difference, scale), both of the output's shape."""
     a, b = got.astype(np.float64), expected.astype(np.float64)
@@ -212,6 +294,9 @@ def _compare(
     scale = np.maximum(np.where(np.isfinite(b), np.abs(b), 1.0), _scale(space, least_scale))
     allowed = RTOL * scale + ATOL
     bad = ~(difference <= allowed)
+    if bad.any():
+        allowed = allowed + ROUNDING * moves()
+        bad = ~(difference <= allowed)
     if bad.any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         row, element = index[0], int(np.ravel_multi_index(index[1:], b.shape[1:])) if b.ndim > 1 else 0
@@ -259,24 +344,36 @@ def _row(batch: Batch, row: int) -> Any:
     return rows["obs"] if set(rows) == {"obs"} else rows
 
 
-def _check_choices(where: str, output: str, got: NDArray[Any], one: Recorded, recipe: Recipe, sizes: Sizes) -> None:
+def _check_choices(
+    where: str,
+    output: str,
+    got: NDArray[Any],
+    one: Recorded,
+    recipe: Recipe,
+    sizes: Sizes,
+    moves: Callable[[], NDArray[np.float64] | float],
+) -> None:
     """Compare discrete actions; a tie in RLlib's scores excuses a difference, and so do scores that are no numbers."""
     columns = _columns(one.outputs[output])
     scored = choice_scores(recipe, one.outputs).get(output) or [np.full((len(c), 1), np.inf) for c in columns]
     for part, (exported, wanted, scores) in enumerate(zip(_columns(got), columns, scored, strict=True)):
         size = max(sizes.get((one.batch.kind, name), 1.0) for name in SCORES)
-        excused, width = _tied(scores, size), _tie_width(scores, size)
+        width = _tie_width(scores, size)
         for row in np.flatnonzero(exported != wanted):
             chosen, right = int(exported[row]), int(wanted[row])
             if np.isnan(scores[row]).any():
                 continue
-            tied = 0 <= chosen < scores.shape[1] and excused[row]
-            if not tied or abs(scores[row, chosen] - scores[row, right]) > width[row]:
+            apart = abs(scores[row, chosen] - scores[row, right]) if 0 <= chosen < scores.shape[1] else np.inf
+            if not apart <= width[row] and not apart <= width[row] + ROUNDING * _at(moves(), int(row)):
                 element = f", element {part}" if len(columns) > 1 else ""
                 raise ParityError(
                     f"{where}: output '{output}'{element}, sample {row}: the export chooses {chosen}, RLlib {right}",
                     {"output": output, "sample": int(row), "exported": chosen, "reference": right},
                 )
+
+
+def _at(by_row: NDArray[np.float64] | float, row: int) -> float:
+    return by_row if isinstance(by_row, float) else float(by_row[row].max())
 
 
 def ties(recipe: Recipe, outputs: Outputs) -> NDArray[np.bool_]:

@@ -193,3 +193,15 @@ def leaf_transform(space: Any, transform: Transform) -> Transform:
     if transform == "unsquash" and not bool((space.bounded_below & space.bounded_above).all()):
         return "none"
     return transform
+
+
+def loose_bounds(recipe: Recipe) -> list[str]:
+    """Return a sentence for each action leaf whose bounds RLlib does not enforce."""
+    return [
+        f"{name}: RLlib sends the network's own numbers to env.step, whether inside {space} or not, and so does the "
+        "graph; rlservo's runtime refuses an action outside"
+        for name, space in recipe.action_leaves.items()
+        if isinstance(space, Box)
+        and bool((space.bounded_below | space.bounded_above).any())
+        and leaf_transform(space, recipe.transform) == "none"
+    ]

@@ -19,17 +19,19 @@ from rlservo.export.actor import PolicyGraph
 from rlservo.export.errors import UnsupportedError, first_line
 from rlservo.export.parity import Runner
 from rlservo.export.samples import Inputs
+from rlservo.export.suspects import frozen_by_tracing
 
 
-def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> None:
+def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> list[str]:
     """Write `graph` to `file`: its inputs in order, a tuple of its outputs; freezing drops what inference does not use.
 
-    Raises UnsupportedError when the network cannot be traced.
+    Returns where in the user's own code a number left torch, and is therefore a constant in the graph. Raises
+    UnsupportedError when the network cannot be traced.
     """
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(record=True) as caught:
+        # A constant baked in by tracing is what the parity gate is there to find; these say where it comes from.
+        warnings.simplefilter("always", TracerWarning)
         _ignore_deprecation()
-        # A constant baked in by tracing is what the parity gate is there to find.
-        warnings.filterwarnings("ignore", category=TracerWarning)
         try:
             with torch.no_grad():
                 traced = torch.jit.trace(  # type: ignore[no-untyped-call]  # torch annotates it only in part
@@ -38,6 +40,7 @@ def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> None:
                 torch.jit.freeze(traced).save(str(file))
         except Exception as error:  # the network's own forward may raise anything
             raise UnsupportedError(f"the network cannot be traced: {first_line(error)}") from error
+    return frozen_by_tracing(caught)
 
 
 def run_torchscript(file: Path, inputs: Sequence[str], outputs: Sequence[str]) -> Runner:

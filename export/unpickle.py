@@ -14,6 +14,8 @@ from typing import Any
 
 from rlservo.export.errors import CheckpointError, UsageError, first_line
 
+TRUNCATED = "the file is truncated or damaged ({})"
+
 
 @contextmanager
 def user_code(app_dir: str | Path) -> Iterator[None]:
@@ -45,11 +47,13 @@ def unpickle(file: Path) -> Any:
     except OSError as error:
         raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from error
     except Exception as error:  # a damaged pickle raises almost anything, and so does the code it runs
-        raise CheckpointError(f"{file} cannot be loaded: {explain(error)}") from error
+        damaged = isinstance(error, UnicodeDecodeError | IndexError | KeyError | MemoryError)
+        reason = TRUNCATED.format(first_line(error)) if damaged else explain(error)
+        raise CheckpointError(f"{file} cannot be loaded: {reason}") from error
 
 
 def explain(error: BaseException) -> str:
-    """Return in one clause why loading failed."""
+    """Return in one clause why loading failed: the file, the code it names, or what that code raised."""
     if isinstance(error, ModuleNotFoundError) and error.name:
         return (
             f"it needs the Python module '{error.name}', which was not found in {searched()}; "
@@ -60,12 +64,13 @@ def explain(error: BaseException) -> str:
             f"its code does not fit what is installed ({first_line(error)}); looked in {searched()}, and --app-dir "
             "names another folder"
         )
-    if isinstance(error, EOFError | pickle.UnpicklingError | UnicodeDecodeError | IndexError | KeyError | MemoryError):
-        return f"the file is truncated or damaged ({first_line(error)})"
+    if isinstance(error, EOFError | pickle.UnpicklingError):
+        return TRUNCATED.format(first_line(error))
     return first_line(error)
 
 
 def searched() -> str:
     """Return the import path as a person reads it: without the standard library, which holds no user code."""
-    own = [entry or "." for entry in sys.path if "lib/python" not in entry and not entry.endswith(".zip")]
+    hidden = ("lib/python", "__editable__", ".zip")
+    own = [entry or "." for entry in sys.path if not any(part in entry for part in hidden)]
     return ", ".join(dict.fromkeys([*own, "the installed packages"]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import pickle
 import shutil
@@ -26,7 +27,7 @@ from rlservo.export.old_location import OldStackFiles
 from rlservo.export.old_models import Registration, find_registrations
 from rlservo.export.old_stack import OldStackCheckpoint, load_old_stack
 from rlservo.export.onnx import run_onnx, write_onnx
-from rlservo.export.parity import GraphLoop, Loop, prove, record
+from rlservo.export.parity import GraphLoop, Loop, prove, record, record_moved
 from rlservo.export.prune import prune_checkpoint
 from rlservo.export.recipe import ObservationFilter, Preprocess, Recipe, StateLeaf
 from rlservo.export.samples import draw_batches
@@ -40,7 +41,7 @@ EXPORTED = [
     "mixed", "double", "started", "grid", "beams", "filtered_beams", "picture", "offset", "dqn", "plain_dqn",
     "distributional_dqn", "sac", "unnormalized_sac", "discrete_sac", "appo", "impala", "marwil", "cloned", "cql",
     "user_model", "named_model", "lstm", "continuous_lstm", "user_recurrent", "choice", "shifted", "dials", "nested",
-    "filtered_nested", "camera", "levers", "limbs",
+    "filtered_nested", "camera", "levers", "limbs", "masked", "named_distribution", "tempered",
 ]  # fmt: skip
 SEVERAL = ["several_arm", "several_cart"]
 
@@ -253,7 +254,8 @@ def prove_as(restored: OldStackCheckpoint, recipe: Recipe, tmp_path: Path) -> Pa
     last = recorded[-1].batch
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(last.inputs, np.ones(len(last), np.bool_))
     write_onnx(graph, example, tmp_path / "policy.onnx")
-    return prove(restored.recipe, recorded, {"onnx": run_onnx(tmp_path / "policy.onnx")}, (), "old")
+    moved = functools.partial(record_moved, restored.reference, recorded, restored.loop)
+    return prove(restored.recipe, recorded, {"onnx": run_onnx(tmp_path / "policy.onnx")}, (), "old", moved)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "unbounded", "offset", "grid", "double", "sac", "filtered_beams"])
@@ -316,6 +318,11 @@ def test_the_old_stack_reference_does_not_drift(load: Callable[..., OldStackChec
             "previous_action",
             UnsupportedError,
             r"OldPreviousAction of policy PPOTorchPolicy .*\('prev_actions', shift -1",
+        ),
+        (
+            "own_policy",
+            UnsupportedError,
+            r"OldOwnPolicy computes .* compute_actions_from_input_dict of its own \(old_zoo",
         ),
         ("clock_reader", UnsupportedError, r"OldClockReader reads 't' besides the observation"),
         ("clipped_limbs", UnsupportedError, r"parts that are unsquashed and parts that are only clipped"),
@@ -433,6 +440,11 @@ def filter_of(state: dict[str, Any]) -> dict[str, Any]:
             CheckpointError,
             r"names its custom model 'unheard_of' but does not hold the class: .*register_custom_model",
         ),
+        (
+            lambda state: spec_of(state)["model"].update(custom_action_dist="unheard_of"),
+            CheckpointError,
+            r"names its custom action distribution 'unheard_of' .*register_custom_action_dist\('unheard_of', \.\.\.\)",
+        ),
     ],
 )
 def test_a_state_that_cannot_be_trusted_is_refused(
@@ -446,6 +458,28 @@ def test_a_state_that_cannot_be_trusted_is_refused(
     rewrite(damaged / STATE, change)
     with pytest.raises(error, match=words):
         load("pendulum", damaged.parent)
+
+
+def test_a_policys_own_folder_tells_its_facts_without_the_algorithm(
+    old_zoo: Path, tmp_path: Path, notices: list[str]
+) -> None:
+    alone = Path(shutil.copytree(old_zoo / "pendulum" / "policies" / "default_policy", tmp_path / "lone"))
+    provenance = export_checkpoint(alone, tmp_path / "out", notify=notices.append).contract.provenance
+    assert (provenance.algorithm, provenance.env_id, provenance.api_stack) == ("PPO", "Pendulum-v1", "old")
+
+
+def test_what_a_users_constructor_lacks_is_not_called_a_damaged_file(
+    load: Callable[..., OldStackCheckpoint], app: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(app)
+    import old_zoo_parts  # pyright: ignore[reportMissingImports]  # in app/
+
+    def build(*_: Any, **__: Any) -> None:
+        raise KeyError("gear_ratio")
+
+    monkeypatch.setattr(old_zoo_parts.OldModel, "__init__", build)
+    with pytest.raises(CheckpointError, match=r"cannot be restored: KeyError: 'gear_ratio'"):
+        load("user_model")
 
 
 def test_a_truncated_policy_state_is_named(
@@ -525,6 +559,10 @@ def test_the_users_own_old_models_are_found_in_the_app_dir_and_only_there(
         (
             "from pkg import nets\nModelCatalog.register_custom_model(model_name='mine', model_class=nets.M)",
             [Registration("pkg.nets", "M")],
+        ),
+        (
+            "import nets\nregister_custom_model('mine', nets.T if framework == 'torch' else nets.F)",
+            [Registration("nets", "T"), Registration("nets", "F")],
         ),
         ("ModelCatalog.register_custom_model('other', M)", []),
         ("ModelCatalog.register_custom_model(NAME, M)", []),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from rlservo.export.checkpoint import Checkpoint, load_checkpoint
 from rlservo.export.errors import ParityError
 from rlservo.export.location import locate_checkpoint
 from rlservo.export.onnx import run_onnx, write_onnx
-from rlservo.export.parity import GraphLoop, Outputs, Runner, prove, record
+from rlservo.export.parity import GraphLoop, Outputs, Runner, prove, record, record_moved
 from rlservo.export.recipe import ObservationFilter, Recipe, Transform
 from rlservo.export.samples import BATCH_SIZES, draw_batches
 from rlservo.export.unpickle import user_code
@@ -43,7 +44,8 @@ def prove_as(checkpoint: Checkpoint, recipe: Recipe, tmp_path: Path) -> Parity:
     pair = next(one.batch for one in recorded if len(one.batch) == 2)
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(2, np.bool_))
     write_onnx(graph, example, tmp_path / "policy.onnx")
-    return prove(checkpoint.recipe, recorded, {"onnx": run_onnx(tmp_path / "policy.onnx")})
+    moved = functools.partial(record_moved, checkpoint.reference, recorded, checkpoint.loop)
+    return prove(checkpoint.recipe, recorded, {"onnx": run_onnx(tmp_path / "policy.onnx")}, moved=moved)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "unbounded", "offset", "grid", "double"])

@@ -35,7 +35,7 @@ STATELESS = [
     "obs_integers_filtered_first", "obs_bytes", "obs_dict", "obs_tuple", "obs_nested", "dict_module", "greedy_module",
     "image", "byte_image", "act_multi_discrete", "act_dict", "act_tuple", "masked", "autoregressive", "scaled",
     "halved", "impala", "sac_discrete", "tqc", "dqn_plain", "dqn_distributional", "dqn_distributional_plain",
-    "bc", "marwil", "cql", "iql",
+    "bc", "marwil", "cql", "iql", "byte_masked", "user_distribution", "old_model_inside",
 ]  # fmt: skip
 # RLlib's own classes and zoo environments, on the way from a checkpoint to the contract.
 pytestmark = pytest.mark.filterwarnings("ignore:.*PPOTorchRLModule.*:DeprecationWarning")
@@ -95,7 +95,10 @@ def test_graphs_and_runtime_act_as_rllib_did_in_its_own_rollout(
 
 @pytest.mark.parametrize(
     ("name", "error", "words"),
-    [("wrongly_scaled", ParityError, r"a batch of 257 likely observations: output 'action")],
+    [
+        ("wrongly_scaled", ParityError, r"a batch of 257 likely observations: output 'action"),
+        ("branching", ParityError, r"another when it is alone: the network's result depends on the other"),
+    ],
 )
 def test_what_does_not_match_leaves_nothing(
     wide_zoo: Path, app: Path, tmp_path: Path, notices: list[str], name: str, error: type[RlservoError], words: str
@@ -103,6 +106,16 @@ def test_what_does_not_match_leaves_nothing(
     with pytest.raises(error, match=words):
         export_checkpoint(wide_zoo / name, tmp_path / "out", app_dir=app, notify=notices.append)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_users_own_distribution_is_in_the_graph_and_cannot_explore(
+    wide_zoo: Path, app: Path, tmp_path: Path, notices: list[str]
+) -> None:
+    result = export_checkpoint(wide_zoo / "user_distribution", tmp_path, app_dir=app, notify=notices.append)
+    assert result.contract.distribution is None
+    assert "BetaDistribution is not one of RLlib's: the export cannot explore" in " ".join(notices)
+    with pytest.raises(RequestError, match="explor"):
+        Policy.load(result.path).act(np.zeros(3, np.float32), explore=True)
 
 
 def test_inputs_and_outputs_are_named_by_the_path_in_the_space(export: Callable[[str], ExportResult]) -> None:

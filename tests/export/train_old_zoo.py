@@ -24,6 +24,7 @@ from ray.rllib.algorithms.impala import IMPALAConfig
 from ray.rllib.algorithms.marwil import MARWILConfig
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.algorithms.sac import SACConfig
+from ray.rllib.examples._old_api_stack.models.action_mask_model import TorchActionMaskModel
 from ray.rllib.policy.policy import PolicySpec
 from ray.rllib.utils.from_config import from_config
 from ray.rllib.utils.replay_buffers import ReplayBuffer
@@ -37,6 +38,7 @@ from train_zoo import leaves  # pyright: ignore[reportMissingImports]
 STEPS = 100  # recorded
 REFUSED = {
     "noisy_dqn", "batch_reader", "previous_action", "clock_reader", "attention", "previous_lstm", "clipped_limbs",
+    "own_policy",
 }  # fmt: skip
 REPLAY = {"type": "MultiAgentPrioritizedReplayBuffer", "capacity": 100}
 
@@ -113,6 +115,11 @@ def several() -> Any:
     return ppo("old_pair").multi_agent(policies=policies, policy_mapping_fn=lambda agent, *_, **__: agent)
 
 
+def own_policy() -> Any:
+    policy = {"default_policy": PolicySpec(old_zoo_parts.OldOwnPolicy, *old_zoo_parts.SPACES["mixed"], {})}
+    return toy("mixed").multi_agent(policies=policy, policy_mapping_fn=lambda *_, **__: "default_policy")
+
+
 def configurations(out: Path) -> dict[str, Any]:
     continuous, discrete = (str(out / f"data_{name}") for name in ("continuous", "discrete"))
     clip = {"normalize_actions": False, "clip_actions": True}
@@ -174,6 +181,10 @@ def configurations(out: Path) -> dict[str, Any]:
         "levers": toy("levers"),
         "limbs": toy("limbs"),
         "clipped_limbs": toy("limbs", clip_actions=True),
+        "masked": toy("masked", model={"custom_model": TorchActionMaskModel}),
+        "named_distribution": toy("mixed", model={"custom_action_dist": "tanh_gaussian"}),
+        "tempered": toy("grid", model={"custom_action_dist": "tempered"}),
+        "own_policy": own_policy(),
         "several": several(),
     }
 

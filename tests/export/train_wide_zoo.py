@@ -34,11 +34,13 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.env import INPUT_ENV_SPACES
 from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
 from ray.rllib.examples.rl_modules.classes.autoregressive_actions_rlm import AutoregressiveActionsRLM
+from ray.rllib.examples.rl_modules.classes.modelv2_to_rlm import ModelV2ToRLModule
 from ray.rllib.offline.offline_data import OfflineData
 from ray.rllib.offline.offline_prelearner import OfflinePreLearner
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "app"), str(HERE)]
+import zoo_rules  # noqa: E402  # pyright: ignore[reportMissingImports]
 import zoo_spaces  # noqa: E402  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
 import zoo_team  # noqa: E402  # pyright: ignore[reportMissingImports]
 from train_zoo import leaves, record  # noqa: E402  # pyright: ignore[reportMissingImports]
@@ -212,6 +214,11 @@ def configurations(out: Path) -> dict[str, Any]:
     gru = RLModuleSpec(module_class=zoo_spaces.GruModule, model_config={"max_seq_len": 10})
     episodes = {"type": "EpisodeReplayBuffer", "capacity": 1000}
     masking = RLModuleSpec(module_class=ActionMaskingTorchRLModule, model_config={"head_fcnet_hiddens": [8]})
+    old = PPOConfig().api_stack(enable_rl_module_and_learner=False, enable_env_runner_and_connector_v2=False)
+    old_inside = RLModuleSpec(
+        module_class=ModelV2ToRLModule,
+        model_config={"old_api_stack_algo_config": old.training(model={"fcnet_hiddens": [8]})},
+    )
     return {
         "lstm_box": ppo("vector", "box", MeanStdFilter, model=LSTM),
         "lstm_discrete": ppo("vector", "discrete", model=LSTM),
@@ -239,6 +246,10 @@ def configurations(out: Path) -> dict[str, Any]:
         "act_tuple": ppo("vector", "tuple"),
         "act_nested": ppo("nested", "nested", flat, model=LSTM),
         "masked": ppo("masked", "discrete", spec=masking),
+        "byte_masked": ppo("byte_masked", "discrete", spec=masking),
+        "user_distribution": ppo("vector", "box", spec=RLModuleSpec(module_class=zoo_rules.BetaModule)),
+        "old_model_inside": ppo("vector", "discrete", spec=old_inside),
+        "branching": ppo("vector", "discrete", spec=RLModuleSpec(module_class=zoo_rules.BranchingModule)),
         "autoregressive": ppo("vector", "autoregressive", spec=RLModuleSpec(module_class=AutoregressiveActionsRLM)),
         "scaled": ppo("vector", "discrete", zoo_spaces.Scaled),
         "wrongly_scaled": ppo("vector", "discrete", zoo_spaces.WronglyScaled),

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete
+from ray.rllib.algorithms.ppo.ppo_torch_policy import PPOTorchPolicy
 from ray.rllib.env.multi_agent_env import MultiAgentEnv
 from ray.rllib.models.torch.recurrent_net import RecurrentNetwork
 from ray.rllib.models.torch.torch_modelv2 import TorchModelV2
@@ -45,6 +46,12 @@ SPACES: dict[str, tuple[gym.Space[Any], gym.Space[Any]]] = {
         Box(-1.0, 1.0, (2,), np.float32),
     ),
     "camera": (Box(0, 255, (10, 10, 3), np.uint8), Discrete(3)),
+    "masked": (
+        gym.spaces.Dict(
+            {"action_mask": Box(0.0, 1.0, (3,), np.float32), "observations": Box(-1.0, 1.0, (4,), np.float32)}
+        ),
+        Discrete(3),
+    ),
     "levers": (Box(-1.0, 1.0, (3,), np.float32), gym.spaces.MultiDiscrete([2, 3])),
     "limbs": (
         Box(-1.0, 1.0, (3,), np.float32),
@@ -170,6 +177,14 @@ class OldPreviousAction(OldModel):
     def forward(self, input_dict: Any, state: Any, seq_lens: Any) -> Any:
         outputs, state = super().forward(input_dict, state, seq_lens)
         return outputs + input_dict["prev_actions"].float().reshape(len(outputs), 1), state
+
+
+class OldOwnPolicy(PPOTorchPolicy):
+    """A policy that changes its actions after the model and its distribution."""
+
+    def compute_actions_from_input_dict(self, *args: Any, **how: Any) -> Any:
+        actions, state, more = super().compute_actions_from_input_dict(*args, **how)
+        return 0.5 * actions, state, more
 
 
 class OldClockReader(OldModel):

@@ -36,6 +36,7 @@ OBSERVATIONS: dict[str, Any] = {
     "tuple": Tuple((Box(-1.0, 1.0, (2,), np.float64), MultiDiscrete([2, 3]))),
     "nested": NESTED,
     "masked": Dict({"action_mask": Box(0.0, 1.0, (4,), np.float32), "observations": VECTOR}),
+    "byte_masked": Dict({"action_mask": Box(0, 1, (4,), np.int8), "observations": VECTOR}),
 }
 ACTIONS: dict[str, Any] = {
     "discrete": Discrete(4),
@@ -58,13 +59,14 @@ class Spaces(gym.Env[Any, Any]):
     def __init__(self, config: dict[str, Any] | None = None, **kwargs: Any) -> None:
         names = {"obs": "vector", "action": "discrete", **(config or {}), **kwargs}
         self.observation_space, self.action_space = OBSERVATIONS[names["obs"]], ACTIONS[names["action"]]
-        self.masked = names["obs"] == "masked"
+        self.masked = names["obs"] in ("masked", "byte_masked")
 
     def _observe(self) -> Any:
         obs = self.observation_space.sample()
         if self.masked:
-            obs["action_mask"] = np.eye(4, dtype=np.float32)[self.np_random.integers(4)]
-            obs["action_mask"][self.np_random.integers(4)] = 1.0
+            kind = self.observation_space["action_mask"].dtype
+            obs["action_mask"] = np.eye(4, dtype=kind)[self.np_random.integers(4)]
+            obs["action_mask"][self.np_random.integers(4)] = 1
         return obs
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
