@@ -60,6 +60,7 @@ def main() -> None:
     if unknown := [stop for stop in args.stops if stop not in stops]:
         parser.error(f"{unknown[0]} is no stop of the tour: expected {', '.join(stops)}")
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws CartPole without a display
+    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # and looks for a sound card
     choose_gl_backend()
     training_run.pickle_by_value(sys.modules[__name__])
     settings = Settings(args.out.resolve(), args.quick, not args.no_video)
@@ -126,7 +127,9 @@ class Mp4(RecordVideo):
 def film(settings: Settings, bundle: Path, env_id: str, **arguments: Any) -> None:
     """Run an episode with the exported policy, recorded."""
     with Policy.load(bundle) as policy:
-        made = gym.make(env_id, render_mode="rgb_array" if settings.video else None, disable_env_checker=True, **arguments)
+        made = gym.make(
+            env_id, render_mode="rgb_array" if settings.video else None, disable_env_checker=True, **arguments
+        )
         env: Any = made
         if settings.video:
             rate = control_rate_of(made, arguments, policy.contract)
@@ -180,7 +183,9 @@ def cartpole(settings: Settings) -> None:
         training_run.report(outcome, run)
         checkpoint = training_run.best_checkpoint_of(outcome)
         print(f"best checkpoint: {checkpoint}")
-        print(f"{outcome.best.best_score:.1f} after {outcome.best.env_steps:,} steps; random actions had {baseline:.1f}")
+        print(
+            f"{outcome.best.best_score:.1f} after {outcome.best.env_steps:,} steps; random actions had {baseline:.1f}"
+        )
 
         heading("CartPole: reload the algorithm, access its policy's state")
         algorithm_state(checkpoint)
@@ -199,8 +204,7 @@ def algorithm_state(checkpoint: Path) -> None:
     """Rebuild the whole algorithm, read its weights here and in every env runner, and write them back."""
     from ray.rllib.algorithms.algorithm import Algorithm
 
-    algorithm = cast(Any, Algorithm.from_checkpoint(str(checkpoint)))
-    try:
+    with training_run.built(Algorithm.from_checkpoint(str(checkpoint))) as algorithm:
         weights = algorithm.get_module().get_state()
         for name, array in weights.items():
             print(f"  {name:40} {np.shape(array)}")
@@ -215,8 +219,6 @@ def algorithm_state(checkpoint: Path) -> None:
         algorithm.get_module().set_state(before)
         evaluated = algorithm.evaluate()["env_runners"]["episode_return_mean"]
         print(f"algorithm.evaluate(): mean return {evaluated:.1f}")
-    finally:
-        algorithm.stop()
 
 
 def distribution_and_value(checkpoint: Path, bundle: Path, obs: Any) -> None:
@@ -261,7 +263,6 @@ def frozen_lake(settings: Settings) -> None:
     """Train with `algorithm.train()`, save, export, and print the Q-value of every field."""
     from ray.rllib.algorithms.dqn import DQNConfig
     from ray.rllib.connectors.env_to_module import FlattenObservations
-    from ray.tune.logger import UnifiedLogger
 
     env_id, arguments = "FrozenLake-v1", {"is_slippery": False}
     heading("FrozenLake: the environment, a few steps by hand, and a random baseline")
@@ -295,17 +296,13 @@ def frozen_lake(settings: Settings) -> None:
     log = settings.out / "runs" / "DQN-FrozenLake-v1"
     shutil.rmtree(log, ignore_errors=True)
     log.mkdir(parents=True)
-    config.debugging(seed=1, logger_creator=lambda values: UnifiedLogger(values, str(log)))
-    with training_run.ray_session(num_cpus=1):
-        algorithm = config.build_algo()
-        try:
-            for iteration in range(2 if settings.quick else 16):
-                result = cast(dict[str, Any], algorithm.train())
-                mean = result["env_runners"].get("episode_return_mean", float("nan"))
-                print(f"iteration {iteration}: {result[STEPS]:,.0f} steps, mean return {mean:.2f}", flush=True)
-            checkpoint = Path(str(algorithm.save_to_path(str(log / "checkpoint"))))
-        finally:
-            algorithm.stop()
+    config.debugging(seed=1)
+    with training_run.ray_session(num_cpus=1), training_run.built(config.build_algo()) as algorithm:
+        for iteration in range(2 if settings.quick else 16):
+            result = algorithm.train()
+            mean = result["env_runners"].get("episode_return_mean", float("nan"))
+            print(f"iteration {iteration}: {result[STEPS]:,.0f} steps, mean return {mean:.2f}", flush=True)
+        checkpoint = Path(str(algorithm.save_to_path(str(log / "checkpoint"))))
     print(f"random actions had {baseline:.2f}")
 
     heading("FrozenLake: export, Q-values of every field, video")
