@@ -37,7 +37,7 @@ class Row:
     vectorize: str
     steps_per_s: float
     iteration_s: float
-    sample_s: float  # waiting for the runners
+    sample_s: float  # waiting for the runners (RLlib's own timer, smoothed over iterations, as the next ones)
     learn_s: float
     rest_s: float  # sending weights and filters, results, evaluation
     env_step_share: float  # of a runner's sampling: the simulators
@@ -74,7 +74,10 @@ def main() -> None:
     print(f"written: {args.out / 'training.json'}, {args.out / 'training.png'}")
 
 
-HEADER = f"{'runners x envs':>16} {'steps/s':>9} {'iteration':>10} {'sampling':>9} {'learning':>9} {'rest':>7}   of sampling: env, network, connectors"
+HEADER = (
+    f"{'runners x envs':>16} {'steps/s':>9} {'iteration':>10} {'sampling':>9} {'learning':>9} {'rest':>7}   "
+    "of sampling: env, network, connectors"
+)
 
 
 def line(row: Row) -> str:
@@ -124,13 +127,11 @@ def measure(env: str, runners: int, envs: int, vectorize: str, iterations: int) 
 
 
 def parts(result: dict[str, Any]) -> dict[str, float]:
-    """Return the shares of a runner's own time: RLlib times each call of the simulator, the network and the pipelines."""
+    """Return the shares of a runner's own time: its simulators, network and pipelines."""
     runner = result["env_runners"]
     pipelines = sum(
-        float(timers.get("connector_pipeline_timer", 0.0))
+        float(runner[name]["connector_pipeline_timer"])
         for name in ("env_to_module_connector", "module_to_env_connector")
-        if isinstance(timers := runner.get(name), dict)
-        for timers in [timers.get("timers", timers)]
     )
     each = {
         "env_step_timer": float(runner["env_step_timer"]),

@@ -288,9 +288,7 @@ def observation_steps(space: Any, kind: str) -> Any:
     flatten = not (isinstance(space, Box) and (len(space.shape) == 1 or _is_known_image(space)))
     filtered = kind == "MeanStdFilter"
     if filtered and (not isinstance(space, Box) or space.dtype.kind != "f"):
-        raise UsageError(
-            f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, the environment observes {space}"
-        )
+        raise UsageError(f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, {space} is none")
     if not (flatten or filtered):
         return None
 

@@ -280,25 +280,29 @@ def frozen_lake(settings: Settings) -> None:
     assert isinstance(config, DQNConfig)
     config.environment(env_id, env_config=arguments)
     # A field is a number; the network sees it one-hot. (RLlib's annotation is narrower than what it takes.)
-    config.env_runners(env_to_module_connector=cast(Any, lambda env, spaces, device: FlattenObservations()))
+    config.env_runners(
+        env_to_module_connector=cast(Any, lambda env, spaces, device: FlattenObservations()),
+        num_envs_per_env_runner=8,
+        rollout_fragment_length=4,  # 32 steps, then one update
+    )
     config.training(
-        lr=1e-3,
+        lr=2e-3,
         gamma=0.95,
-        epsilon=[[0, 1.0], [4000, 0.1]],
-        num_steps_sampled_before_learning_starts=500,
-        target_network_update_freq=200,
+        epsilon=[[0, 1.0], [12_000, 0.1]],
+        num_steps_sampled_before_learning_starts=1000,
+        target_network_update_freq=500,
         dueling=False,
         double_q=True,
-        train_batch_size_per_learner=64,
+        train_batch_size_per_learner=256,
     )
     config.rl_module(model_config={"fcnet_hiddens": [64]})
-    config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=500)
+    config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=1000)
     log = settings.out / "runs" / "DQN-FrozenLake-v1"
     shutil.rmtree(log, ignore_errors=True)
     log.mkdir(parents=True)
     config.debugging(seed=1)
     with training_run.ray_session(num_cpus=1), training_run.built(config.build_algo()) as algorithm:
-        for iteration in range(2 if settings.quick else 16):
+        for iteration in range(2 if settings.quick else 20):
             result = algorithm.train()
             mean = result["env_runners"].get("episode_return_mean", float("nan"))
             print(f"iteration {iteration}: {result[STEPS]:,.0f} steps, mean return {mean:.2f}", flush=True)

@@ -27,7 +27,7 @@ TRAINER = Path(__file__).resolve().parents[2] / "examples" / "simple_trainer.py"
 def main(folder: Path) -> None:
     temporary = tempfile.mkdtemp(prefix="two-", dir="/tmp")
     cluster = Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 2, "_temp_dir": temporary, "include_dashboard": False}
+        initialize_head=True, head_node_args={"num_cpus": 2, "temp_dir": temporary, "include_dashboard": False}
     )
     trainer: subprocess.Popen[str] | None = None
     try:
