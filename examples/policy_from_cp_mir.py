@@ -1,7 +1,7 @@
 """Run MiR100 navigation with the policy of a checkpoint, or with its export.
 
-    python examples/policy_from_cp_mir.py examples/checkpoints/mir100_navigation
-    python examples/policy_from_cp_mir.py --bundle policies/mir100
+python examples/policy_from_cp_mir.py examples/checkpoints/mir100_navigation
+python examples/policy_from_cp_mir.py --bundle policies/mir100
 """
 
 from __future__ import annotations

@@ -69,6 +69,7 @@ def argument_parser() -> argparse.ArgumentParser:
     """Return the parser; its groups are what a person looks for together."""
     parser = argparse.ArgumentParser(
         description="Train any RLlib algorithm on any Gymnasium environment; end in a policy bundle.",
+        usage="%(prog)s [--run PPO] [--name-env CartPole-v1] [--num-cpus N] ...  (--help lists all)",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         allow_abbrev=False,
     )
@@ -105,7 +106,9 @@ def argument_parser() -> argparse.ArgumentParser:
     bool_flag = argparse.BooleanOptionalAction
     faults.add_argument("--restart-failed-env-runners", action=bool_flag, default=True, help="start a lost one anew")
     faults.add_argument("--ignore-env-runner-failures", action=bool_flag, default=False, help="go on with the others")
-    faults.add_argument("--restart-failed-sub-environments", action=bool_flag, default=False, help="remake a crashed one")
+    faults.add_argument(
+        "--restart-failed-sub-environments", action=bool_flag, default=False, help="remake a crashed one"
+    )
     faults.add_argument("--max-num-env-runner-restarts", type=int, default=1000, help="then the training fails")
     faults.add_argument("--max-failures", type=int, default=0, help="times a failed trial goes on from its checkpoint")
 
@@ -115,7 +118,9 @@ def argument_parser() -> argparse.ArgumentParser:
     seen.add_argument("--evaluation-interval", type=int, default=0, help="iterations between evaluations; 0 is none")
     seen.add_argument("--evaluation-duration", type=int, default=10, help="episodes of an evaluation")
     seen.add_argument("--evaluation-num-env-runners", type=int, default=0, help="further cores for it; 0: the driver")
-    seen.add_argument("--log-level", choices=["DEBUG", "INFO", "WARN", "ERROR"], default="ERROR", help="RLlib's and Ray's")
+    seen.add_argument(
+        "--log-level", choices=["DEBUG", "INFO", "WARN", "ERROR"], default="ERROR", help="RLlib's and Ray's"
+    )
     seen.add_argument("--output", type=Path, help="folder for episode traces: what was seen, done and earned")
     seen.add_argument("--export", type=Path, help="folder for the best checkpoint's bundle; default: STORAGE/policies")
     seen.add_argument("--no-export", action="store_true", help="end with the checkpoint")
@@ -227,7 +232,9 @@ def local_gpus() -> float:
     return float(torch.cuda.device_count()) if torch.cuda.is_available() else 0.0
 
 
-def algorithm_config(args: argparse.Namespace, spaces: tuple[Any, Any], env_config: Mapping[str, Any]) -> AlgorithmConfig:
+def algorithm_config(
+    args: argparse.Namespace, spaces: tuple[Any, Any], env_config: Mapping[str, Any]
+) -> AlgorithmConfig:
     """Return the RLlib configuration for these arguments and the environment's spaces (observation, action)."""
     config = training_run.default_config(args.run, args.log_level)
     config.environment(args.name_env, env_config=dict(env_config))
@@ -281,9 +288,7 @@ def observation_steps(space: Any, kind: str) -> Any:
     flatten = not (isinstance(space, Box) and (len(space.shape) == 1 or _is_known_image(space)))
     filtered = kind == "MeanStdFilter"
     if filtered and (not isinstance(space, Box) or space.dtype.kind != "f"):
-        raise UsageError(
-            f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, the environment observes {space}"
-        )
+        raise UsageError(f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, {space} is none")
     if not (flatten or filtered):
         return None
 
@@ -342,7 +347,9 @@ def set_up(args: argparse.Namespace) -> tuple[AlgorithmConfig, Run, list[str]]:
         config.copy(copy_frozen=False).validate()
     except Exception as error:  # RLlib's checks raise ValueError and much else
         raise UsageError(f"RLlib refuses this configuration: {' '.join(str(error).split())}") from error
-    grid = {name: tune.grid_search(values) for name, values in search_space.read_settings(args.sweep, "--sweep").items()}
+    grid = {
+        name: tune.grid_search(values) for name, values in search_space.read_settings(args.sweep, "--sweep").items()
+    }
     space = search_space.read_search_space(args.search_space) if args.search_space else {}
     if twice := sorted((set(grid) | set(space)) & set(fixed)) or sorted(set(grid) & set(space)):
         raise UsageError(f"{twice[0]} is given twice, by --set, --sweep or --search-space: once is enough")
@@ -394,13 +401,14 @@ def main() -> None:
     training_run.pickle_by_value(sys.modules[__name__], episode_traces)
     if args.resume:
         if more := sorted(explicit(sys.argv[1:]) - set(AFTER_RESUME)):
-            raise UsageError(
-                f"--resume goes on with the run as it was set up: leave --{more[0].replace('_', '-')} out"
-            )
+            raise UsageError(f"--resume goes on with the run as it was set up: leave --{more[0].replace('_', '-')} out")
         run, _ = training_run.read_run(args.resume)
-        sys.path.insert(0, run.rest["app_dir"])  # Ray's workers get this process's path
         with training_run.ray_session(
-            num_cpus=run.num_cpus, num_gpus=run.num_gpus, address=args.address, log_level=run.rest["log_level"]
+            num_cpus=run.num_cpus,
+            num_gpus=run.num_gpus,
+            address=args.address,
+            log_level=run.rest["log_level"],
+            app_dir=Path(run.rest["app_dir"]),
         ):
             outcome = training_run.resume(args.resume)
     else:
@@ -414,6 +422,7 @@ def main() -> None:
             num_gpus=run.num_gpus,
             address=args.address,
             log_level=args.log_level,
+            app_dir=args.app_dir,
         ):
             if args.address is not None:
                 check_machine(args, training_run.cores() - 1, training_run.gpus(), f"the cluster at {args.address}")

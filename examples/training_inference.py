@@ -37,7 +37,11 @@ class Task:
 
 def argument_parser(task: Task, description: str) -> argparse.ArgumentParser:
     """Return the parser with the arguments robo-gym's scripts have, and a few of our own."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=description,
+        usage="%(prog)s [--run PPO] [--stop-timesteps N] ...  (--help lists all)",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
     parser.add_argument("--run", default="PPO", help=f"RLlib algorithm: {', '.join(SUPPORTED)}")
     parser.add_argument("--num-cpus", type=int, default=0, help="cores for Ray; 0 is all of the machine's")
     parser.add_argument("--framework", default="torch", help="torch; RLlib's new API stack has no other")
@@ -50,7 +54,9 @@ def argument_parser(task: Task, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--num-envs-per-env-runner", type=int, default=8, help="simulators in each sampling process")
     parser.add_argument("--checkpoint-frequency", type=int, default=20, help="iterations between checkpoints")
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for results and checkpoints")
-    parser.add_argument("--resume", type=Path, metavar="RUN", help="go on with a run that was stopped, as it was set up")
+    parser.add_argument(
+        "--resume", type=Path, metavar="RUN", help="go on with a run that was stopped, as it was set up"
+    )
     return parser
 
 
@@ -107,9 +113,7 @@ def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: floa
     config.training(gamma=task.gamma)
     if args.run == "PPO":
         config.training(**task.training)
-    config.callbacks(
-        on_episode_end=training_run.log_success, on_train_result=training_run.fill_return(RETURN, "max")
-    )
+    config.callbacks(on_episode_end=training_run.log_success, on_train_result=training_run.fill_return(RETURN, "max"))
     config.debugging(seed=args.seed, log_level="ERROR")
     return config
 

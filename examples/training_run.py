@@ -128,45 +128,62 @@ def default_config(algorithm: str, log_level: str = "ERROR") -> AlgorithmConfig:
 
 @contextlib.contextmanager
 def ray_session(
-    *, num_cpus: int = 0, num_gpus: float = 0.0, address: str | None = None, log_level: str = "ERROR"
+    *,
+    num_cpus: int = 0,
+    num_gpus: float = 0.0,
+    address: str | None = None,
+    log_level: str = "ERROR",
+    app_dir: Path | None = None,
 ) -> Iterator[None]:
     """Start a Ray of our own, or join the one at `address`; whatever is started here is gone afterwards.
 
     A private one has its own token and folder, so that neither RAY_ADDRESS nor another cluster on the machine is
-    reached, and nothing is left in the home folder. SIGTERM, as Slurm sends it, does what Ctrl-C does.
+    reached, and nothing is left in the home folder. SIGTERM, as Slurm sends it, does what Ctrl-C does. `app_dir` is
+    where every process finds the user's own modules.
 
     Raises UsageError when the cluster cannot be reached.
     """
     told = log_level in ("DEBUG", "INFO")
     quiet: dict[str, Any] = {"log_to_driver": told, "logging_level": logging.INFO if told else logging.ERROR}
+    logging.getLogger("ray.tune").setLevel(logging.INFO if told else logging.CRITICAL)  # the cause is told at the end
     folder: str | None = None
-    try:
-        if address is None:
-            # A short path: Ray's sockets live below it, and a socket's path may have 107 characters.
-            folder = tempfile.mkdtemp(prefix="train-", dir="/tmp" if Path("/tmp").is_dir() else None)
-            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(16))
-            ray.init(
-                "local",
-                num_cpus=num_cpus or None,
-                num_gpus=num_gpus or None,
-                include_dashboard=False,
-                _temp_dir=folder,
-                **quiet,
-            )
-        else:
-            try:
-                ray.init(address, **quiet)
-            except Exception as error:  # Ray's own tree, RuntimeError, ConnectionError, ValueError: all say the same
-                raise UsageError(
-                    f"--address {address}: no Ray cluster answers there ({_first_line(error)}); start one with "
-                    "'ray start --head', with the same RAY_AUTH_MODE and token as here"
-                ) from error
-        with _sigterm_as_ctrl_c():
+    own = str((app_dir or Path()).resolve())
+    if app_dir is not None and own not in sys.path:
+        sys.path.insert(0, own)
+    path = os.pathsep.join(part for part in (own, os.environ.get("PYTHONPATH", "")) if part)
+    quiet["runtime_env"] = {"env_vars": {"PYTHONPATH": path}}
+    with _sigterm_as_ctrl_c() as take_sigterm:
+        try:
+            if address is None:
+                # A short path: Ray's sockets live below it, and a socket's path may have 107 characters.
+                folder = tempfile.mkdtemp(prefix="train-", dir="/tmp" if Path("/tmp").is_dir() else None)
+                os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(16))
+                ray.init(
+                    "local",
+                    num_cpus=num_cpus or None,
+                    num_gpus=num_gpus or None,
+                    include_dashboard=False,
+                    _temp_dir=folder,
+                    **quiet,
+                )
+            else:
+                _join(address, quiet)
+            take_sigterm()  # Ray has set a handler of its own
             yield
-    finally:
-        ray.shutdown()
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
+        finally:
+            ray.shutdown()
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _join(address: str, quiet: Mapping[str, Any]) -> None:
+    try:
+        ray.init(address, **quiet)
+    except Exception as error:  # Ray's own tree, RuntimeError, ConnectionError, ValueError: all say the same
+        raise UsageError(
+            f"--address {address}: no Ray cluster answers there ({_first_line(error)}); start one with "
+            "'ray start --head', with the same RAY_AUTH_MODE and token as here"
+        ) from error
 
 
 def cores() -> int:
@@ -180,17 +197,36 @@ def gpus() -> float:
 
 
 @contextlib.contextmanager
-def _sigterm_as_ctrl_c() -> Iterator[None]:
+def _sigterm_as_ctrl_c() -> Iterator[Callable[[], None]]:
+    """Let SIGTERM do what Ctrl-C does; gives the function that says so again."""
+
     def forward(number: int, frame: FrameType | None) -> None:
         handler = signal.getsignal(signal.SIGINT)  # Tune's while it runs, Python's otherwise
         if callable(handler):
             handler(signal.SIGINT, frame)
 
-    before = signal.signal(signal.SIGTERM, forward)
+    def take() -> None:
+        signal.signal(signal.SIGTERM, forward)
+
+    before = signal.getsignal(signal.SIGTERM)
+    take()
     try:
-        yield
+        yield take
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def built(algorithm: Any) -> Iterator[Any]:
+    """Stop an algorithm that was built without Tune, and remove the folder it makes in ~/ray_results (ray 2.60)."""
+    try:
+        yield algorithm
+    finally:
+        algorithm.stop()
+        folder = Path(algorithm.logdir)
+        shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):  # others' results are in it
+            folder.parent.rmdir()
 
 
 def pickle_by_value(*modules: ModuleType) -> None:

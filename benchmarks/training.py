@@ -1,0 +1,209 @@
+"""How fast training goes, and where its time goes: env runners x environments each, the learner included.
+
+    python benchmarks/training.py                 # 1 and 2 runners, 1 to 16 environments, UR5
+    python benchmarks/training.py --env CartPole-v1 --iterations 5
+
+Prints a table and writes `bench/training.json` and `bench/training.png`. Each row is the median of `--iterations`
+iterations after one of warm-up: PPO as the UR5 script trains it, a batch of 4,096 steps, 4 epochs. `--vectorised`
+measures the same with Gymnasium's AsyncVectorEnv (a process per simulator), and MuJoCo alone: stepping substep by
+substep (as our simulators do), in one call, and many robots on MuJoCo's own threads (`mujoco.rollout`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
+
+import training_run
+
+UR5 = "rlservo/EndEffectorPositioningURSim-v0"
+BATCH = 4096
+
+
+@dataclass(frozen=True)
+class Row:
+    """One configuration's medians per iteration; the parts of a runner are its means, and fit into `sample_s`."""
+
+    runners: int
+    envs: int
+    vectorize: str
+    steps_per_s: float
+    iteration_s: float
+    sample_s: float  # waiting for the runners (RLlib's own timer, smoothed over iterations, as the next ones)
+    learn_s: float
+    rest_s: float  # sending weights and filters, results, evaluation
+    env_step_share: float  # of a runner's sampling: the simulators
+    inference_share: float  # the network
+    connectors_share: float  # RLlib's pipelines before and after the network
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", default=UR5)
+    parser.add_argument("--runners", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--envs", type=int, nargs="+", default=[1, 2, 4, 8, 16])
+    parser.add_argument("--iterations", type=int, default=3)
+    parser.add_argument("--vectorised", action="store_true", help="also the other ways to step several simulators")
+    parser.add_argument("--out", type=Path, default=Path("bench"))
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    rows: list[Row] = []
+    print(f"PPO on {args.env}, {BATCH:,} steps an iteration, median of {args.iterations}\n{HEADER}")
+    with training_run.ray_session(num_cpus=max(args.runners) + 1):
+        for runners in args.runners:
+            for envs in args.envs:
+                rows.append(measure(args.env, runners, envs, "sync", args.iterations))
+                print(line(rows[-1]), flush=True)
+        if args.vectorised:
+            rows.append(measure(args.env, 1, 2, "async", args.iterations))
+            print(line(rows[-1]), flush=True)
+    physics = measure_physics() if args.vectorised else []
+    for name, rate in physics:
+        print(f"{name:52} {rate:>10,.0f} substeps/s")
+    document = {"env": args.env, "rows": [asdict(row) for row in rows], "physics": dict(physics)}
+    (args.out / "training.json").write_text(json.dumps(document, indent=2) + "\n")
+    plot(rows, args.env, args.out / "training.png")
+    print(f"written: {args.out / 'training.json'}, {args.out / 'training.png'}")
+
+
+HEADER = (
+    f"{'runners x envs':>16} {'steps/s':>9} {'iteration':>10} {'sampling':>9} {'learning':>9} {'rest':>7}   "
+    "of sampling: env, network, connectors"
+)
+
+
+def line(row: Row) -> str:
+    name = f"{row.runners} x {row.envs}" + (f" {row.vectorize}" if row.vectorize != "sync" else "")
+    return (
+        f"{name:>16} {row.steps_per_s:>9,.0f} {row.iteration_s:>8.2f} s {row.sample_s:>7.2f} s {row.learn_s:>7.2f} s "
+        f"{row.rest_s:>5.2f} s   {row.env_step_share:.0%}, {row.inference_share:.0%}, {row.connectors_share:.0%}"
+    )
+
+
+def measure(env: str, runners: int, envs: int, vectorize: str, iterations: int) -> Row:
+    """Train a few iterations and return the medians."""
+    from ray.rllib.algorithms.ppo import PPOConfig
+
+    config = training_run.default_config("PPO")
+    assert isinstance(config, PPOConfig)
+    config.environment(env, env_config={"rs_state_to_info": False} if env.startswith("rlservo/") else {})
+    config.env_runners(
+        num_env_runners=runners,
+        num_envs_per_env_runner=envs,
+        gym_env_vectorize_mode=cast(Any, vectorize),  # its annotation names the old strings only
+    )
+    config.training(train_batch_size_per_learner=BATCH, minibatch_size=512, num_epochs=4)
+    config.rl_module(model_config={"fcnet_hiddens": [256, 256], "fcnet_activation": "tanh", "vf_share_layers": False})
+    config.debugging(seed=0)
+    with training_run.built(config.build_algo()) as algorithm:
+        algorithm.train()
+        taken: list[tuple[float, float, float, float, dict[str, float]]] = []
+        sampled = 0.0
+        for _ in range(iterations):
+            began = time.perf_counter()
+            before = sampled
+            result = algorithm.train()
+            wall = time.perf_counter() - began
+            sampled = float(result[training_run.STEPS])
+            timers = result["timers"]
+            steps = sampled - before if before else float(result["env_runners"]["num_env_steps_sampled"])
+            taken.append(
+                (steps / wall, wall, timers["env_runner_sampling_timer"], timers["learner_update_timer"], parts(result))
+            )
+    rate, wall, sample, learn = (statistics.median(column[i] for column in taken) for i in range(4))
+    shares = {name: statistics.median(column[4][name] for column in taken) for name in taken[0][4]}
+    return Row(
+        runners, envs, vectorize, rate, wall, sample, learn, max(0.0, wall - sample - learn),
+        shares["env_step_timer"], shares["rlmodule_inference_timer"], shares["connectors"],
+    )  # fmt: skip
+
+
+def parts(result: dict[str, Any]) -> dict[str, float]:
+    """Return the shares of a runner's own time: its simulators, network and pipelines."""
+    runner = result["env_runners"]
+    pipelines = sum(
+        float(runner[name]["connector_pipeline_timer"])
+        for name in ("env_to_module_connector", "module_to_env_connector")
+    )
+    each = {
+        "env_step_timer": float(runner["env_step_timer"]),
+        "rlmodule_inference_timer": float(runner["rlmodule_inference_timer"]),
+        "connectors": pipelines,
+    }
+    total = sum(each.values())
+    return {name: seconds / total for name, seconds in each.items()}
+
+
+def measure_physics(seconds: float = 2.0) -> list[tuple[str, float]]:
+    """Return substeps per second of the UR5's model, by way of stepping it."""
+    import gymnasium as gym
+    import mujoco
+    import numpy as np
+    from mujoco import rollout
+
+    env = cast(Any, gym.make(UR5, disable_env_checker=True).unwrapped)
+    env.reset(seed=0)
+    model, data = env.simulation.model, env.simulation.data
+    block = 200
+    found = []
+
+    def rate(work: Any, substeps: int) -> float:
+        count, began = 0, time.perf_counter()
+        while time.perf_counter() - began < seconds:
+            work()
+            count += substeps
+        return count / (time.perf_counter() - began)
+
+    def one_by_one() -> None:
+        for _ in range(block):
+            mujoco.mj_step(model, data)
+
+    found.append(("mj_step, one at a time from Python", rate(one_by_one, block)))
+    found.append(("mj_step, 200 in one call", rate(lambda: mujoco.mj_step(model, data, nstep=block), block)))
+    robots = 8
+    size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    state = np.zeros(size)
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    states = np.tile(state, (robots, 1))
+    control = np.zeros((robots, block, model.nu))
+    for threads in (1, 2):
+        datas = [mujoco.MjData(model) for _ in range(threads)]
+        with rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
+            many = rate(lambda pool=pool, datas=datas: pool.rollout(model, datas, states, control), robots * block)
+        found.append((f"mujoco.rollout, 8 robots on {threads} thread{'s' if threads > 1 else ''}", many))
+    env.close()
+    return found
+
+
+def plot(rows: list[Row], env: str, path: Path) -> None:
+    """Draw steps/s over environments per runner, a line per number of runners."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
+    for runners in sorted({row.runners for row in rows}):
+        own = [row for row in rows if row.runners == runners and row.vectorize == "sync"]
+        axes.plot([row.envs for row in own], [row.steps_per_s for row in own], marker="o", label=f"{runners} runners")
+    axes.set_xscale("log", base=2)
+    axes.set(
+        xlabel="environments per env runner", ylabel="environment steps/s, learner included", title=f"PPO on {env}"
+    )
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+if __name__ == "__main__":
+    main()

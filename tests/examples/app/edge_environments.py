@@ -1,0 +1,87 @@
+"""Environments at the edge, for the trainer's tests: `edge_environments:edge/Float64-v0` and the others below."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete
+
+
+class Edge(gym.Env[Any, Any]):
+    """Rewards the action that has the sign of the first number seen; subclasses say what is seen."""
+
+    action_space: Any = Discrete(2)
+    length = 25
+
+    def look(self) -> Any:
+        raise NotImplementedError
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        self.speed = self.np_random.uniform(-1, 1, 3)
+        return self.look(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        reward = float(bool(np.ravel(action)[0] > 0) == bool(self.speed[0] > 0))
+        self.steps += 1
+        self.speed = self.np_random.uniform(-1, 1, 3)
+        return self.look(), reward, False, self.steps >= self.length, {}
+
+
+class Float64(Edge):
+    """float64 observations and actions, as much of the world's code gives."""
+
+    observation_space: Any = Box(-1.0, 1.0, (3,), np.float64)
+    action_space: Any = Box(-1.0, 1.0, (1,), np.float64)
+
+    def look(self) -> Any:
+        return self.speed
+
+
+class Promises32(Float64):
+    """Says float32 and gives float64."""
+
+    observation_space: Any = Box(-1.0, 1.0, (3,), np.float32)
+    action_space: Any = Discrete(2)
+
+
+class Camera(Edge):
+    """A Dict with an image."""
+
+    observation_space: Any = Dict({"image": Box(0, 255, (12, 10, 3), np.uint8), "speed": Box(-1.0, 1.0, (3,))})
+
+    def look(self) -> Any:
+        return {
+            "image": self.np_random.integers(0, 256, (12, 10, 3), np.uint8),
+            "speed": self.speed.astype(np.float32),
+        }
+
+
+class Endless(Float64):
+    """Episodes that no training iteration sees the end of."""
+
+    length = 1_000_000
+
+
+class Crashing(Promises32):
+    """Fails now and then, as a simulator does; every crash is written down."""
+
+    def __init__(self, log: str = "") -> None:
+        self._log = log
+        self._chance = np.random.default_rng(os.getpid() * 1000 + int.from_bytes(os.urandom(2), "little"))
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self._chance.random() < 0.01:
+            if self._log:
+                with open(self._log, "a") as log:  # noqa: PTH123
+                    log.write("crash\n")
+            raise RuntimeError("the simulator's connection was lost")
+        return super().step(action)
+
+
+for kind in (Float64, Promises32, Camera, Endless, Crashing):
+    gym.register(f"edge/{kind.__name__}-v0", f"{__name__}:{kind.__name__}")

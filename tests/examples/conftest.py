@@ -1,0 +1,157 @@
+"""Scripts run as a user runs them, and what several tests look at: made once a session."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).resolve().parent
+EXAMPLES = HERE.parents[1] / "examples"
+TINY = ("--set", "train_batch_size_per_learner=400", "--hidden", "16")
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a script ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+def command(script: str, *arguments: str) -> list[str]:
+    return [sys.executable, str(EXAMPLES / script), *arguments]
+
+
+def environment(home: Path) -> dict[str, str]:
+    """A home of its own shows what a script leaves there."""
+    return {**os.environ, "HOME": str(home)}
+
+
+def run_script(script: str, *arguments: str, home: Path) -> Ended:
+    done = subprocess.run(
+        command(script, *arguments), capture_output=True, text=True, timeout=500, env=environment(home), cwd=home
+    )
+    return Ended(done.returncode, done.stdout, done.stderr)
+
+
+def run_helper(script: str, *arguments: str, folder: Path, given: str = "") -> str:
+    """Run a script of the tests' own and return its last line, a JSON document."""
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", str(HERE / script), *arguments],
+        input=given,
+        capture_output=True,
+        text=True,
+        timeout=550,
+        env=environment(folder),
+        cwd=folder,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr[-5000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="session", name="run_script")
+def run_script_fixture() -> Callable[..., Ended]:
+    """The function above, for test files: they cannot import this one."""
+    return run_script
+
+
+@pytest.fixture(scope="session", name="run_helper")
+def run_helper_fixture() -> Callable[..., str]:
+    return run_helper
+
+
+@pytest.fixture(scope="session")
+def refusals(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, list[list[str]]], list[Ended]]:
+    """Return a function that runs a script's `main` with many wrong command lines in one process."""
+
+    def run(script: str, arguments: list[list[str]]) -> list[Ended]:
+        folder = tmp_path_factory.mktemp("refused")
+        out = run_helper("run_many.py", script, folder=folder, given=json.dumps(arguments))
+        return [Ended(**one) for one in json.loads(out.splitlines()[-1])]
+
+    return run
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A finished run of `simple_trainer.py`: two learning rates, evaluation, traces, a bundle."""
+
+    home: Path
+    ended: Ended
+
+    @property
+    def run(self) -> Path:
+        return next(path.parent for path in (self.home / "runs").glob("*/run.json"))
+
+
+@pytest.fixture(scope="session")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Sweep:
+    home = tmp_path_factory.mktemp("sweep")
+    (home / "space.yaml").write_text("gamma: {choice: [0.9]}\n")
+    ended = run_script(
+        "simple_trainer.py", "--run", "PPO", "--name-env", "CartPole-v1", "--num-cpus", "0", *TINY,
+        "--stop-iters", "2", "--sweep", "lr=1e-4,1e-3", "--search-space", "space.yaml", "--scheduler", "asha",
+        "--evaluation-interval", "1", "--evaluation-duration", "2", "--output", "traces", "--episodes", "2",
+        home=home,
+    )  # fmt: skip
+    return Sweep(home, ended)
+
+
+@dataclass(frozen=True)
+class Interrupted:
+    """A run that got Ctrl-C after its second checkpoint, and was resumed."""
+
+    home: Path
+    stopped: Ended
+    resumed: Ended
+    left: list[str]
+
+
+@pytest.fixture(scope="session")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interrupted]:
+    home = tmp_path_factory.mktemp("interrupted")
+    started = subprocess.Popen(
+        command(
+            "simple_trainer.py", "--num-cpus", "1", *TINY, "--stop-iters", "6", "--checkpoint-frequency", "1",
+            "--episodes", "1",
+        ),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(home), cwd=home,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 300
+        while len(list(home.glob("runs/*/trial_*/checkpoint_*"))) < 2:
+            assert started.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        os.killpg(started.pid, signal.SIGINT)  # as a terminal sends it: to the script and all it started
+        out, err = started.communicate(timeout=100)
+        stopped = Ended(started.returncode, out, err)
+        left = in_session(started.pid)
+        run = next(home.glob("runs/*"))
+        resumed = run_script("simple_trainer.py", "--resume", str(run), home=home)
+        yield Interrupted(home, stopped, resumed, left)
+    finally:
+        if started.poll() is None:
+            os.killpg(started.pid, signal.SIGKILL)
+
+
+def in_session(leader: int) -> list[str]:
+    """Return what still runs of a session, given the time to end."""
+    deadline = time.monotonic() + 20
+    while True:
+        listed = subprocess.run(["ps", "-s", str(leader), "-o", "stat=,args="], capture_output=True, text=True).stdout
+        alive = [one for one in listed.splitlines() if one and not one.startswith("Z")]
+        if not alive or time.monotonic() > deadline:
+            return alive
+        time.sleep(0.2)

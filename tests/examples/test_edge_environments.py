@@ -1,0 +1,65 @@
+"""What the trainer does with environments at the edge, and on a cluster that loses a node. All real trainings."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rlservo.serve_app.policy import Policy
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def edges(tmp_path_factory: pytest.TempPathFactory, run_helper: Any) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("edges")
+    return folder, json.loads(run_helper("train_edges.py", str(folder), folder=folder).splitlines()[-1])
+
+
+@pytest.mark.parametrize("name", ["Float64", "Promises32"])
+def test_float64_trains_and_its_bundle_takes_what_the_environment_gives(name: str, edges: Any) -> None:
+    with Policy.load(edges[1][name]["bundle"]) as policy:
+        action = policy.act(np.array([0.1, -0.2, 0.3], np.float64))
+    assert action.shape == ((1,) if name == "Float64" else ())
+
+
+def test_dict_with_an_image_is_flattened_for_the_network_and_exported_as_a_dict(edges: Any) -> None:
+    found = edges[1]["Camera"]
+    assert "the network sees Dict observations as one vector" in found["said"]
+    with Policy.load(found["bundle"]) as policy:
+        seen = {"image": np.zeros((12, 10, 3), np.uint8), "speed": np.zeros(3, np.float32)}
+        assert policy.act(seen) in (0, 1)
+
+
+def test_episodes_longer_than_the_training_have_no_return_and_do_not_stop_it(edges: Any) -> None:
+    found = edges[1]["Endless"]
+    assert found["steps"] == 600
+    assert re.search(r"^\w+_00000 +2 +600 +- +-", found["said"], re.MULTILINE)
+    assert (Path(found["bundle"]) / "policy.onnx").is_file()
+
+
+@pytest.mark.parametrize(("name", "log"), [("Crashing", "crashes.txt"), ("Crashing runner", "runner_crashes.txt")])
+def test_crashes_are_survived_by_remaking_the_environment_or_the_runner(name: str, log: str, edges: Any) -> None:
+    folder, found = edges
+    assert (folder / log).read_text().count("crash") > 0
+    assert "error" not in found[name], found[name]
+    assert found[name]["steps"] >= 600
+
+
+def test_crash_in_the_driver_without_the_flag_ends_the_training_with_its_cause(edges: Any) -> None:
+    found = edges[1]["Crashing for good"]
+    assert re.search(r"training failed: .*error.txt, and --resume .* goes on", found["error"])
+
+
+def test_training_survives_a_node_killed_on_the_way(tmp_path: Path, run_helper: Any) -> None:
+    out = run_helper("train_on_two_nodes.py", str(tmp_path), folder=tmp_path)
+    end = json.loads(out.splitlines()[-1])
+    assert (end["before"], end["after"], end["code"]) == (2, 1, 0), out
+    iterations = [int(n) for n in re.findall(r"^\w+_00000 +(\d+) ", out, re.MULTILINE)]
+    assert iterations[-1] == 8
+    assert list(tmp_path.glob("runs/policies/cart-pole/1/contract.json"))

@@ -1,0 +1,41 @@
+"""The tour runs from end to end, and what it prints agrees with itself."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+
+def test_every_stop_ends_in_a_bundle(tmp_path: Path, run_script: Any) -> None:
+    picture = [] if os.environ.get("DISPLAY") or _offscreen() else ["--no-video"]
+    ended = run_script("tour.py", "--quick", *picture, home=tmp_path)
+    assert ended.code == 0, ended.out + ended.err
+    assert ended.out.count("the environment check passed") == 3
+    assert len(re.findall(r"random actions: mean return -?[\d.]+", ended.out)) == 3
+    assert "the exported graph gives the same: largest difference" in ended.out
+    assert len(re.findall(r"^[SFHG] [←↓→↑] +-?[\d.]+(   [SFHG] [←↓→↑] +-?[\d.]+){3}$", ended.out, re.MULTILINE)) == 4
+    assert re.search(r"step +0: value -?[\d.]+, action mean", ended.out)
+    bundles = {path.parent.parent.name for path in (tmp_path / "tour" / "bundles").glob("*/*/contract.json")}
+    assert len(bundles) == 3
+    if not picture:
+        films = list((tmp_path / "tour" / "videos").glob("*/*.mp4"))
+        assert len(films) == 3 and all(film.stat().st_size > 1000 for film in films)
+    assert not (tmp_path / "ray_results").exists()
+
+
+def _offscreen() -> bool:
+    from ctypes.util import find_library
+
+    return bool(find_library("EGL") or find_library("OSMesa"))
+
+
+def test_unknown_stop_is_refused_in_a_sentence(tmp_path: Path, run_script: Any) -> None:
+    ended = run_script("tour.py", "atari", home=tmp_path)
+    assert ended.code == 2
+    assert "atari is no stop of the tour: expected cartpole, frozenlake, ur5" in ended.err
