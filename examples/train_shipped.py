@@ -19,6 +19,7 @@ import resource
 import shutil
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +40,7 @@ from ray.tune.registry import get_trainable_cls
 
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 MILESTONE = 0.95  # the success rate whose time is printed
+SUMS = ("episodes", "judged", "return", "length", "success")
 
 
 @dataclass(frozen=True)
@@ -62,18 +64,18 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     config.env_runners(
         num_env_runners=0,
         num_envs_per_env_runner=settings["envs"],
+        rollout_fragment_length=settings.get("rollout_fragment_length", "auto"),
         env_to_module_connector=cast(Any, _mean_std_filter if settings["filter"] else None),
     )
     config.learners(num_learners=0, num_gpus_per_learner=0)
     config.rl_module(model_config=settings.get("model", {}))
     config.training(**settings.get("training", {}))
     config.reporting(
-        metrics_num_episodes_for_smoothing=settings["stop"]["episodes"],
         # Off-policy algorithms report by default once a second, however much that is.
         min_time_s_per_iteration=0,
         min_sample_timesteps_per_iteration=settings.get("steps_per_iteration", 0),
     )
-    config.callbacks(on_episode_end=_success_logger(settings["stop"]["episodes"]))
+    config.callbacks(on_episode_end=_log_episode)
     config.debugging(seed=seed, log_level="ERROR")
     return config
 
@@ -82,13 +84,14 @@ def _mean_std_filter(env: Any, spaces: Any, device: Any) -> MeanStdFilter:
     return MeanStdFilter()
 
 
-def _success_logger(window: int) -> Any:
-    def log_success(*, episode: Any, metrics_logger: Any, **_: Any) -> None:
-        info = episode.get_infos(-1) or {}
-        if "is_success" in info:
-            metrics_logger.log_value("success_rate", float(info["is_success"]), reduce="mean", window=window)
-
-    return log_success
+def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any = None, **_: Any) -> None:
+    # Sums: RLlib's own means and windows are of one iteration's episodes, which are few or many.
+    chunks = [*(prev_episode_chunks or ()), episode]  # an episode is cut where a sampling phase ended
+    total, length = sum(chunk.get_return() for chunk in chunks), sum(map(len, chunks))
+    info = episode.get_infos(-1) or {}
+    success, judged = info.get("is_success", False), "is_success" in info
+    for key, value in zip(SUMS, (1, judged, total, length, success), strict=True):
+        metrics_logger.log_value(("shipped", key), float(value), reduce="sum")
 
 
 def change_setting(settings: dict[str, Any], change: str) -> None:
@@ -110,19 +113,25 @@ def cpu_seconds() -> float:
     )
 
 
-def iterations(algorithm: Algorithm) -> Iterator[Row]:
-    """Train without end, one row after each iteration."""
+def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
+    """Train without end, one row after each iteration; means are of the last `window` episodes or a few more."""
     began, cpu_before, episodes = time.monotonic(), cpu_seconds(), 0
+    recent: deque[dict[str, float]] = deque()
     while True:
         result = cast(dict[str, Any], algorithm.train())
-        runners = result["env_runners"]
-        episodes += int(runners.get("num_episodes", 0))
+        sums = {key: float(value) for key, value in result["env_runners"].get("shipped", {}).items()}
+        if sums.get("episodes"):
+            episodes += int(sums["episodes"])
+            recent.append(sums)
+            while sum(one["episodes"] for one in recent) - recent[0]["episodes"] >= window:
+                recent.popleft()
+        count, judged, total, length, successes = (sum(one[key] for one in recent) for key in SUMS)
         yield Row(
             env_steps=int(result["num_env_steps_sampled_lifetime"]),
             episodes=episodes,
-            mean_return=float(runners.get("episode_return_mean", float("nan"))),
-            mean_length=float(runners.get("episode_len_mean", float("nan"))),
-            success=float(runners.get("success_rate", float("nan"))),
+            mean_return=total / count if count else float("nan"),
+            mean_length=length / count if count else float("nan"),
+            success=successes / judged if judged else float("nan"),
             wall_s=time.monotonic() - began,
             cpu_s=cpu_seconds() - cpu_before,
         )
@@ -139,7 +148,7 @@ def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
         with (folder / "curve.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(Row.__dataclass_fields__)
-            for row in iterations(algorithm):
+            for row in iterations(algorithm, stop["episodes"]):
                 rows.append(row)
                 writer.writerow(
                     [row.env_steps, row.episodes, f"{row.mean_return:.4g}", f"{row.mean_length:.1f}",
