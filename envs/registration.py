@@ -11,6 +11,7 @@ ENTRY_POINTS = {
     "EmptyEnvironmentURSim-v0": "rlservo.envs.ur.empty_environment:EmptyEnvironmentURSim",
     "BasicAvoidanceURSim-v0": "rlservo.envs.ur.basic_avoidance:BasicAvoidanceURSim",
     "NoObstacleNavigationMir100Sim-v0": "rlservo.envs.mir100.no_obstacle_navigation:NoObstacleNavigationMir100Sim",
+    "SparseFixNavigationMir100Sim-v0": "rlservo.envs.mir100.sparse_fix_navigation:SparseFixNavigationMir100Sim",
     "ObstacleAvoidanceMir100Sim-v0": "rlservo.envs.mir100.obstacle_avoidance:ObstacleAvoidanceMir100Sim",
 }
 

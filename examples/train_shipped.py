@@ -1,0 +1,257 @@
+"""Train one of the policies in examples/checkpoints again, from the settings that stand beside it.
+
+    python examples/train_shipped.py mir100_obstacle_avoidance
+
+`examples/checkpoints/NAME/training.yaml` says what is trained and when to stop; `--seed` and `--set` change that
+for one run. The run goes to `runs/NAME`: the best checkpoint so far (by the mean of the last episodes), `curve.csv` and
+`curve.png`. `--install` then puts the pruned checkpoint and the curve beside the settings. One process, one thread:
+RLlib samples in the driver, because two sampling processes get `MeanStdFilter` statistics merged wrongly (DESIGN.md).
+It knows nothing of how good a policy is afterwards: that is `evaluate_shipped.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import logging
+import os
+import resource
+import shutil
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+# Said before Ray is imported, so that it holds for every process of the cluster that is started here.
+os.environ.setdefault("RAY_AUTH_MODE", "token")
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+
+import ray
+import torch
+import yaml
+from ray import cloudpickle
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.connectors.env_to_module import MeanStdFilter
+from ray.tune.registry import get_trainable_cls
+
+SHIPPED = Path(__file__).resolve().parent / "checkpoints"
+MILESTONE = 0.95  # the success rate whose time is printed
+SUMS = ("episodes", "judged", "return", "length", "success")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the curve; return, length and success are means over the last episodes, with exploration."""
+
+    env_steps: int
+    episodes: int
+    mean_return: float
+    mean_length: float
+    success: float
+    wall_s: float
+    cpu_s: float
+
+
+def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
+    """Return the RLlib configuration that `training.yaml` describes."""
+    config: AlgorithmConfig = get_trainable_cls(settings["algorithm"]).get_default_config()
+    config.environment(settings["env"], env_config=settings.get("env_config", {}), clip_rewards=False)
+    # RLlib's annotation here is narrower than what it takes: the connector's three-argument form.
+    config.env_runners(
+        num_env_runners=0,
+        num_envs_per_env_runner=settings["envs"],
+        rollout_fragment_length=settings.get("rollout_fragment_length", "auto"),
+        env_to_module_connector=cast(Any, _mean_std_filter if settings["filter"] else None),
+    )
+    config.learners(num_learners=0, num_gpus_per_learner=0)
+    config.rl_module(model_config=settings.get("model", {}))
+    config.training(**settings.get("training", {}))
+    config.reporting(
+        # Off-policy algorithms report by default once a second, however much that is.
+        min_time_s_per_iteration=0,
+        min_sample_timesteps_per_iteration=settings.get("steps_per_iteration", 0),
+    )
+    config.callbacks(on_episode_end=_log_episode)
+    config.debugging(seed=seed, log_level="ERROR")
+    return config
+
+
+def _mean_std_filter(env: Any, spaces: Any, device: Any) -> MeanStdFilter:
+    return MeanStdFilter()
+
+
+def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any = None, **_: Any) -> None:
+    # Sums: RLlib's own means and windows are of one iteration's episodes, which are few or many.
+    chunks = [*(prev_episode_chunks or ()), episode]  # an episode is cut where a sampling phase ended
+    total, length = sum(chunk.get_return() for chunk in chunks), sum(map(len, chunks))
+    info = episode.get_infos(-1) or {}
+    success, judged = info.get("is_success", False), "is_success" in info
+    for key, value in zip(SUMS, (1, judged, total, length, success), strict=True):
+        metrics_logger.log_value(("shipped", key), float(value), reduce="sum")
+
+
+def change_setting(settings: dict[str, Any], change: str) -> None:
+    """Apply `a.b=value` (YAML) to the settings. Raises ValueError for a setting that is not there."""
+    key, equals, value = change.partition("=")
+    *parents, last = key.split(".")
+    where: Any = settings
+    for parent in parents:
+        where = where.get(parent) if isinstance(where, dict) else None
+    if not equals or not isinstance(where, dict) or last not in where:
+        raise ValueError("expected KEY=VALUE with a key that training.yaml has, say stop.env_steps=20000")
+    where[last] = yaml.safe_load(value)
+
+
+def cpu_seconds() -> float:
+    """Return the processor time of this process and of those it started that have ended [s]."""
+    return sum(
+        usage.ru_utime + usage.ru_stime for usage in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
+
+
+def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
+    """Train without end, one row after each iteration; means are of the last `window` episodes or a few more."""
+    began, cpu_before, episodes = time.monotonic(), cpu_seconds(), 0
+    recent: deque[dict[str, float]] = deque()
+    while True:
+        result = cast(dict[str, Any], algorithm.train())
+        sums = {key: float(value) for key, value in result["env_runners"].get("shipped", {}).items()}
+        if sums.get("episodes"):
+            episodes += int(sums["episodes"])
+            recent.append(sums)
+            while sum(one["episodes"] for one in recent) - recent[0]["episodes"] >= window:
+                recent.popleft()
+        count, judged, total, length, successes = (sum(one[key] for one in recent) for key in SUMS)
+        yield Row(
+            env_steps=int(result["num_env_steps_sampled_lifetime"]),
+            episodes=episodes,
+            mean_return=total / count if count else float("nan"),
+            mean_length=length / count if count else float("nan"),
+            success=successes / judged if judged else float("nan"),
+            wall_s=time.monotonic() - began,
+            cpu_s=cpu_seconds() - cpu_before,
+        )
+
+
+def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
+    """Train until the stop metric or the steps are reached; leave `folder/checkpoint` (the best) and `curve.csv`."""
+    stop = settings["stop"]
+    rows: list[Row] = []
+    best, reached_milestone = float("-inf"), False
+    checkpoint = folder / "checkpoint"
+    algorithm = algorithm_config(settings, seed).build_algo()
+    try:
+        with (folder / "curve.csv").open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(Row.__dataclass_fields__)
+            for row in iterations(algorithm, stop["episodes"]):
+                rows.append(row)
+                writer.writerow(
+                    [row.env_steps, row.episodes, f"{row.mean_return:.4g}", f"{row.mean_length:.1f}",
+                     f"{row.success:.4f}", f"{row.wall_s:.0f}", f"{row.cpu_s:.0f}"]
+                )  # fmt: skip
+                file.flush()
+                print(
+                    f"steps {row.env_steps:>10,} of {stop['env_steps']:,}  return {row.mean_return:9.3f}  "
+                    f"length {row.mean_length:6.1f}  success {row.success:6.1%}  "
+                    f"wall {row.wall_s:6.0f} s  CPU {row.cpu_s:6.0f} s",
+                    flush=True,
+                )
+                filled = row.episodes >= stop["episodes"]
+                if filled and not reached_milestone and row.success >= MILESTONE:
+                    reached_milestone = True
+                    print(
+                        f"{MILESTONE:.0%} success over {stop['episodes']} training episodes after {row.env_steps:,} "
+                        f"steps, {row.wall_s:.0f} s ({row.cpu_s:.0f} s of processor time)"
+                    )
+                value = getattr(row, stop["metric"])
+                if filled and value > best:
+                    best = value
+                    algorithm.save_to_path(str(checkpoint.resolve()))
+                if (filled and value >= stop["value"]) or row.env_steps >= stop["env_steps"]:
+                    break
+    except KeyboardInterrupt:
+        print("interrupted: what has been reached is kept")
+    finally:
+        if best == float("-inf"):  # too short for a first mean: a checkpoint all the same
+            algorithm.save_to_path(str(checkpoint.resolve()))
+        algorithm.stop()
+    return rows
+
+
+def draw(rows: list[Row], title: str, path: Path) -> None:
+    """Draw return, and success where the environment tells of it, over environment steps."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    figure, left = pyplot.subplots(figsize=(5, 2.8), layout="constrained")
+    steps = [row.env_steps for row in rows]
+    left.plot(steps, [row.mean_return for row in rows], color="tab:blue", linewidth=1)
+    left.set_xlabel("environment steps")
+    left.set_ylabel("mean return", color="tab:blue")
+    if any(row.success == row.success for row in rows):
+        right = left.twinx()
+        right.plot(steps, [100 * row.success for row in rows], color="tab:orange", linewidth=1)
+        right.set_ylabel("success [%]", color="tab:orange")
+        right.set_ylim(0, 102)
+    left.set_title(title, fontsize=9)
+    figure.savefig(path, dpi=80)
+    pyplot.close(figure)
+
+
+def install(name: str, folder: Path) -> None:
+    """Replace the shipped checkpoint and curve by those of `folder`."""
+    from rlservo.export.prune import prune_checkpoint
+
+    pruned = folder / "pruned"
+    shutil.rmtree(pruned, ignore_errors=True)
+    prune_checkpoint(folder / "checkpoint", pruned, notify=print)
+    shutil.copytree(pruned, SHIPPED / name, dirs_exist_ok=True)
+    for curve in ("curve.csv", "curve.png"):
+        shutil.copyfile(folder / curve, SHIPPED / name / curve)
+
+
+def main() -> None:
+    names = sorted(path.parent.name for path in SHIPPED.glob("*/training.yaml"))
+    parser = argparse.ArgumentParser(description="Train one of the policies that ship again.")
+    parser.add_argument("name", choices=names)
+    parser.add_argument("--seed", type=int, help="instead of the one in training.yaml")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
+        help="change a setting of training.yaml for this run, say stop.env_steps=20000 or model.use_lstm=false",
+    )  # fmt: skip
+    parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for checkpoint and curve")
+    parser.add_argument("--install", action="store_true", help="replace the shipped checkpoint and curve by this run's")
+    args = parser.parse_args()
+    settings = yaml.safe_load((SHIPPED / args.name / "training.yaml").read_text(encoding="utf-8"))
+    for change in args.changes:
+        try:
+            change_setting(settings, change)
+        except ValueError as error:
+            parser.error(f"--set {change}: {error}")
+    seed = settings["seed"] if args.seed is None else args.seed
+    folder = args.storage / args.name
+    folder.mkdir(parents=True, exist_ok=True)
+
+    # Checkpoints hold functions of this file. Pickled by value, they load where it does not exist.
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    torch.set_num_threads(1)
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+    try:
+        rows = train(settings, seed, folder)
+    finally:
+        ray.shutdown()
+    draw(rows, f"{args.name}, {settings['algorithm']}, seed {seed}", folder / "curve.png")
+    print(f"best checkpoint: {folder / 'checkpoint'}")
+    if args.install:
+        install(args.name, folder)
+
+
+if __name__ == "__main__":
+    main()

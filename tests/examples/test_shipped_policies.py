@@ -1,0 +1,187 @@
+"""The policies that ship: each exports, acts through Policy as well as its card says, and can be trained again.
+
+Seeds here are neither those of training nor those of the cards. What is asked for follows from the card: the number of
+successes below which a policy as good as the card's lower confidence bound falls once in ten thousand times.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import yaml
+
+from rlservo.export.exporter import export_checkpoint
+from rlservo.serve_app.policy import Policy
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+SHIPPED = EXAMPLES / "checkpoints"
+NAMES = sorted(path.parent.name for path in SHIPPED.glob("*/training.yaml"))
+SEED = 700_000
+ONCE_IN = 10_000
+LARGEST = 750_000  # bytes of a folder
+
+
+def load_evaluate_shipped() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("evaluate_shipped", EXAMPLES / "evaluate_shipped.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+evaluate_shipped = load_evaluate_shipped()
+
+
+@pytest.fixture(scope="module")
+def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Every shipped checkpoint, exported: that alone proves that the file acts as RLlib does."""
+    out = tmp_path_factory.mktemp("bundles")
+    return {name: export_checkpoint(SHIPPED / name, out, name=name, notify=lambda line: None).path for name in NAMES}
+
+
+def fewest_successes(rate: float, episodes: int) -> int:
+    """The fewest successes that a policy of this rate stays below less than once in `ONCE_IN` times."""
+    below = 0.0
+    for successes in range(episodes + 1):
+        below += math.comb(episodes, successes) * rate**successes * (1.0 - rate) ** (episodes - successes)
+        if below > 1.0 / ONCE_IN:
+            return successes
+    return episodes
+
+
+def card_figures(name: str) -> list[dict[str, Any]]:
+    figures: list[dict[str, Any]] = json.loads((SHIPPED / name / "evaluation.json").read_text(encoding="utf-8"))
+    return figures
+
+
+def test_the_issues_six_policies_ship() -> None:
+    assert NAMES == [
+        "cartpole_dqn", "mir100_navigation", "mir100_obstacle_avoidance", "mir100_sparse_fixes", "pendulum_sac",
+        "ur5_positioning",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("rate", "episodes", "expected"),
+    [(1.0, 40, 40), (0.5, 1, 0), (0.9, 40, 27)],  # the last by scipy.stats.binom.ppf(1e-4, 40, 0.9)
+)
+def test_threshold_is_the_binomial_quantile(rate: float, episodes: int, expected: int) -> None:
+    assert fewest_successes(rate, episodes) == expected
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_acts_as_well_as_its_card_says(name: str, bundles: dict[str, Path]) -> None:
+    episodes = 20 if name == "cartpole_dqn" else 40  # an episode there is 500 steps
+    settings = evaluate_shipped.load_settings(name)
+    with Policy.load(bundles[name]) as policy:
+        measured = evaluate_shipped.evaluate(policy, settings, episodes, SEED)
+    for ours, card in zip(measured, card_figures(name), strict=True):
+        if card["successes"] is not None:
+            assert ours.successes >= fewest_successes(card["success_interval"][0], episodes), ours
+        else:
+            low, high = card["return_interval"]
+            deviation = (high - low) / (2 * 1.96) * math.sqrt(card["episodes"])
+            assert ours.mean_return >= low - 3.72 * deviation / math.sqrt(episodes), ours  # 1e-4 of a normal
+
+
+def test_the_recurrent_policy_needs_its_memory(bundles: dict[str, Path]) -> None:
+    class Forgetful:
+        """The same policy, its state thrown away before every action."""
+
+        def __init__(self, policy: Policy) -> None:
+            self.policy, self.contract = policy, policy.contract
+
+        def reset(self) -> None:
+            self.policy.reset()
+
+        def act(self, obs: Any, **arguments: Any) -> Any:
+            self.policy.reset()
+            return self.policy.act(obs, **arguments)
+
+    settings = evaluate_shipped.load_settings("mir100_sparse_fixes")
+    with Policy.load(bundles["mir100_sparse_fixes"]) as policy:
+        remembering = evaluate_shipped.evaluate(policy, settings, 20, SEED)[0]
+        forgetting = evaluate_shipped.evaluate(Forgetful(policy), settings, 20, SEED)[0]
+    assert remembering.successes > forgetting.successes + 5
+    assert remembering.mean_return > forgetting.mean_return
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_card_states_what_was_measured(name: str) -> None:
+    folder = SHIPPED / name
+    card = (folder / "README.md").read_text(encoding="utf-8")
+    figures = [evaluate_shipped.Measured(**one) for one in card_figures(name)]
+    table = card.partition(evaluate_shipped.BEGIN)[2].partition(evaluate_shipped.END)[0].strip()
+    assert table == evaluate_shipped.render(figures)
+    assert {(one.episodes, one.seed) for one in figures} == {(evaluate_shipped.EPISODES, evaluate_shipped.SEED)}
+    for part in ("## Training", "## Failure modes", "](curve.png)", "```sh\npython examples/"):
+        assert part in card, part
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_folder_is_small_and_complete(name: str) -> None:
+    folder = SHIPPED / name
+    assert sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) < LARGEST
+    facts = json.loads((folder / "rlservo_facts.json").read_text(encoding="utf-8"))
+    settings = yaml.safe_load((folder / "training.yaml").read_text(encoding="utf-8"))
+    assert (facts["algorithm"], facts["env_id"]) == (settings["algorithm"], settings["env"])
+    curve = (folder / "curve.csv").read_text(encoding="utf-8").splitlines()
+    assert curve[0] == "env_steps,episodes,mean_return,mean_length,success,wall_s,cpu_s"
+    steps = [int(line.split(",")[0]) for line in curve[1:]]
+    assert steps == sorted(steps)
+    assert facts["env_steps"] in steps  # the checkpoint is of this run
+    assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", ["mir100_obstacle_avoidance"])
+def test_targets_of_the_robots_are_met(name: str) -> None:
+    assert [one["successes"] / one["episodes"] >= 0.93 for one in card_figures(name)] == [True]
+
+
+def run_script(script: str, *arguments: str, home: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "HOME": str(home)}  # a local Ray writes its token into the home folder
+    command = [sys.executable, str(EXAMPLES / script), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, cwd=home)
+
+
+@pytest.mark.slow
+def test_training_again_leaves_a_curve_and_a_checkpoint_that_exports(tmp_path: Path) -> None:
+    done = run_script("train_shipped.py", "cartpole_dqn", "--set", "stop.env_steps=3000", home=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    run = tmp_path / "runs" / "cartpole_dqn"
+    assert len((run / "curve.csv").read_text().splitlines()) == 3  # 2,000 steps an iteration
+    assert (run / "curve.png").exists()
+    arguments = ("cartpole_dqn", "--checkpoint", str(run / "checkpoint"), "--episodes", "3")
+    measured = run_script("evaluate_shipped.py", *arguments, home=tmp_path)
+    assert measured.returncode == 0, measured.stderr
+    assert "| anywhere | 3 |" in measured.stdout
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "sentence"),
+    [
+        ("train_shipped.py", ("nobody",), "invalid choice: 'nobody'"),
+        ("train_shipped.py", ("cartpole_dqn", "--set", "stop.env_step=1"), "expected KEY=VALUE with a key that"),
+        ("train_shipped.py", ("cartpole_dqn", "--set", "stop"), "expected KEY=VALUE with a key that"),
+        ("evaluate_shipped.py", ("nobody",), "no policy 'nobody' ships: expected some of cartpole_dqn"),
+        ("evaluate_shipped.py", ("--episodes", "1"), "--episodes is 1 and --seed 20000: expected at least 2 and 0"),
+        ("evaluate_shipped.py", ("--checkpoint", "x"), "--checkpoint goes with one NAME and without --write"),
+    ],
+)
+def test_wrong_argument_is_refused_in_a_sentence(
+    script: str, arguments: tuple[str, ...], sentence: str, tmp_path: Path
+) -> None:
+    done = run_script(script, *arguments, home=tmp_path)
+    assert done.returncode == 2
+    assert sentence in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
