@@ -23,6 +23,7 @@ from rlservo.export.errors import RlservoError
 from rlservo.serve_app.http import create_app
 from rlservo.serve_app.ingress import gate
 from rlservo.serve_app.keys import check_exposure, is_loopback
+from rlservo.serve_app.logs import configure
 from rlservo.serve_app.oip_grpc import InferenceService
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
@@ -87,6 +88,7 @@ class PolicyServer(InferenceService):
         """Load and prove every policy; Serve sends requests only after this has returned."""
         self._settings = ServerSettings(**settings)
         try:
+            configure(self._settings, replica=serve.get_replica_context().replica_tag)
             self._host = _listening_host()
             check_exposure(self._host, self._settings)
             self._store = PolicyStore.load(folders, threads=self._settings.threads)
