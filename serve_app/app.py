@@ -25,6 +25,7 @@ from rlservo.serve_app.ingress import gate
 from rlservo.serve_app.keys import check_exposure, is_loopback
 from rlservo.serve_app.logs import configure
 from rlservo.serve_app.oip_grpc import InferenceService
+from rlservo.serve_app.scaling import BUSY, Load
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
 
@@ -87,6 +88,7 @@ class PolicyServer(InferenceService):
     def __init__(self, folders: list[str], settings: dict[str, Any]) -> None:
         """Load and prove every policy; Serve sends requests only after this has returned."""
         self._settings = ServerSettings(**settings)
+        self._load = Load()
         try:
             configure(self._settings, replica=serve.get_replica_context().replica_tag)
             self._host = _listening_host()
@@ -101,6 +103,10 @@ class PolicyServer(InferenceService):
         gate.is_open = app.state.core.admission.is_open
         self.serve_grpc(app.state.core, local_only=is_loopback(self._host))
         return app
+
+    def record_autoscaling_stats(self) -> dict[str, float]:
+        """Tell Serve's autoscaler how busy this replica is, for `scaling.by_load`."""
+        return {BUSY: self._load.busy()}
 
     async def check_health(self) -> None:
         """Tell Serve's controller that the event loop turns and the policies are there; if not, it replaces us."""

@@ -8,6 +8,8 @@ element. No observation is kept. It knows numpy and the contract; nothing of met
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
@@ -48,14 +50,14 @@ class Drift:
         labels = names if len(set(names)) == space.size else [label for _, label in iter_elements(space)]
         return cls(tuple(labels), mean, std)
 
-    def see(self, obs: NDArray[np.generic]) -> None:
+    def see(self, obs: NDArray[Any]) -> None:
         """Take note of checked observations `[batch, ...]`, or do not: only some are looked at."""
         self._left -= 1
         if self._left:
             return
         self._left = EVERY
         self.looks += 1
-        z = (obs[:ROWS].reshape(min(len(obs), ROWS), -1) - self._mean) * self._scale
+        z: NDArray[np.float64] = (obs[:ROWS].reshape(min(len(obs), ROWS), -1) - self._mean) * self._scale
         np.clip(z, -LARGEST, LARGEST, out=z)
         weight = max(1.0 / self.looks, 1.0 / MEMORY)
         self._shift += weight * (z.mean(axis=0) - self._shift)

@@ -265,11 +265,14 @@ def _inputs(asked: Any) -> dict[str, NDArray[Any]]:
         raise RequestError(
             f"there are {len(asked.inputs)} inputs and {len(raw)} raw_input_contents: one for each, or none"
         )
+    seen: set[str] = set()
+    for tensor in asked.inputs:
+        if tensor.name in seen:
+            raise RequestError(f"input '{tensor.name[:64]}' is there twice")
+        seen.add(tensor.name)
     inputs: dict[str, NDArray[Any]] = {}
     for index, tensor in enumerate(asked.inputs):
         label, shape = tensor.name[:64], tuple(tensor.shape)
-        if tensor.name in inputs:
-            raise RequestError(f"input '{label}' is there twice")
         if tensor.datatype == "BYTES":
             raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")
         dtype = DTYPES.get(tensor.datatype)
