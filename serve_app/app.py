@@ -30,8 +30,10 @@ from rlservo.serve_app.ingress import gate
 from rlservo.serve_app.keys import check_exposure, is_loopback
 from rlservo.serve_app.ledger import GcsLedger
 from rlservo.serve_app.library import Library, Repository
+from rlservo.serve_app.logs import configure
 from rlservo.serve_app.oip_grpc import InferenceService
 from rlservo.serve_app.plan import ServedConfig
+from rlservo.serve_app.scaling import BUSY, Load
 from rlservo.serve_app.settings import ServerSettings
 
 logger = logging.getLogger(__name__)
@@ -113,7 +115,9 @@ class PolicyServer(InferenceService):
         self._id = context.replica_id.deployment_id
         self._core: Core | None = None
         self._watch: asyncio.Task[None] | None = None
+        self._load = Load()
         try:
+            configure(self._settings, replica=self._replica)
             self._host = _listening_host()
             check_exposure(self._host, self._settings)
             library = Library(Repository(folders), threads=self._settings.threads)
@@ -148,6 +152,10 @@ class PolicyServer(InferenceService):
             self._watch = asyncio.create_task(self._control.watch())
         else:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
+
+    def record_autoscaling_stats(self) -> dict[str, float]:
+        """Tell Serve's autoscaler how busy this replica is, for `scaling.by_load`."""
+        return {BUSY: self._load.busy()}
 
     async def check_health(self) -> None:
         """Tell Serve's controller that the event loop turns and the policies are there; if not, it replaces us."""

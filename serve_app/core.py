@@ -7,7 +7,8 @@ the policies are loaded, the deadline, the batch limit. It knows nothing of HTTP
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,11 @@ import numpy as np
 from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError
 from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.control import Control
+from rlservo.serve_app.gauges import drift, queue
 from rlservo.serve_app.keys import Guard, Keys
+from rlservo.serve_app.logs import RequestLog
 from rlservo.serve_app.metrics import Metrics
+from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.shadow import Shadows
 from rlservo.serve_app.store import Decision, PolicyStore
@@ -46,6 +50,8 @@ class Core:
         self.settings = settings
         self.guard = Guard(Keys.from_settings(settings))
         self.metrics = Metrics(replica)
+        self.metrics.sources += [partial(queue, self, replica), partial(drift, self, replica)]
+        self.log = RequestLog(settings)
         self.admission = Admission(
             max_queued=settings.max_ongoing_requests,
             max_queue_ms=settings.max_queue_ms,
@@ -116,6 +122,14 @@ class Core:
         elif version is not None:  # an alias is counted as the version it leads to
             version = store.version_of(name, version)
         self.metrics.failed(protocol, name, version or "", code)
+
+    def policies(self) -> Iterator[tuple[str, str, Policy]]:
+        """Yield (name, version, policy) of all that are loaded."""
+        store = self._store_provider()
+        if store is not None:
+            for name in store.names:
+                for version in store.versions(name):
+                    yield name, version, store.get(name, version)
 
     def exposition(self) -> bytes:
         """Return the metrics as Prometheus reads them."""

@@ -32,6 +32,7 @@ from rlservo.export.errors import (
 )
 from rlservo.serve_app import wire
 from rlservo.serve_app.core import Core
+from rlservo.serve_app.logs import FIELDS
 from rlservo.serve_app.store import Decision
 
 logger = logging.getLogger(__name__)
@@ -72,7 +73,7 @@ class Endpoint:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
-        admission = self._core.admission
+        admission, log = self._core.admission, self._core.log
         started = time.perf_counter()
         try:
             self._check_headers(scope["headers"])
@@ -84,12 +85,17 @@ class Endpoint:
             received = min(started, admission.enter())  # only now: a body that is slow to come waits for itself
             content, headers, decision = self._handle(scope, body, received)
             status = 200
-            self._core.metrics.answered(self._protocol, decision, decision.batch or 1, time.perf_counter() - received)
+            taken, batch = time.perf_counter() - received, decision.batch or 1
+            self._core.metrics.answered(self._protocol, decision, batch, taken)
+            if log.every:
+                log.answered(
+                    self._protocol, decision.name, decision.version, taken, batch=batch, request_id=request_id(scope)
+                )
         except RlservoError as error:
             status, content, headers = error_answer(error)
-            self._failed(scope, error.code)
+            self._failed(scope, error)
         except Exception:
-            logger.exception("a request to %s failed", scope["path"])
+            logger.exception("a request failed", extra={FIELDS: {"request_id": request_id(scope)}})
             status, content, headers = 500, encode_bug(), JSON_HEADERS
             self._core.metrics.failed(self._protocol, "", "", "internal")  # what failed may be the policies
         await send(
@@ -101,9 +107,11 @@ class Endpoint:
         )
         await send({"type": "http.response.body", "body": content})
 
-    def _failed(self, scope: Scope, code: str) -> None:
+    def _failed(self, scope: Scope, error: RlservoError) -> None:
         params = scope["path_params"]
-        self._core.failed(self._protocol, params["name"], params.get("version"), code)
+        name, version = params["name"], params.get("version")
+        self._core.failed(self._protocol, name, version, error.code)
+        self._core.log.failed(self._protocol, name, version, error.code, error.message, request_id=request_id(scope))
 
 
 JSON_HEADERS: Headers = ((b"content-type", JSON),)
@@ -187,6 +195,14 @@ async def read_body(receive: Receive, *, max_bytes: int, timeout_s: float) -> Bo
     if len(body) > max_bytes:
         raise too_large(max_bytes)
     return body  # type: ignore[no-any-return]  # ASGI messages are untyped
+
+
+def request_id(scope: Scope) -> str | None:
+    """Return the request's id: the client's, or the one that Ray Serve made; Serve puts it on the answer."""
+    for name, value in scope["headers"]:
+        if name == b"x-request-id":
+            return str(value.decode("latin-1"))
+    return None
 
 
 def check_length(headers: list[tuple[bytes, bytes]], max_bytes: int) -> None:

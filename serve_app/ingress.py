@@ -2,8 +2,8 @@
 
 The gate turns requests away while the replica has more than it takes on (`admission.py`), before Serve spends on them
 what an answer costs; it is open in Serve's proxies, which take nothing on. The header is worth two asyncio tasks a
-request: Serve watches every HTTP request for the client hanging up, so that long work can be cancelled. A policy answers before
-anything could be cancelled. The header `x-request-disconnect-disabled` is Serve's switch for that (ray 2.60), and
+request: Serve watches every HTTP request for the client hanging up, so that long work can be cancelled. A policy
+answers before anything could be cancelled. `x-request-disconnect-disabled` is Serve's switch for that (ray 2.60), and
 `RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH=rlservo.serve_app.ingress:middlewares` sets it on the server's side. It is
 imported by Serve's proxies as well, so it needs nothing but starlette.
 """

@@ -47,6 +47,7 @@ STOP, STOP_NOW = "stop", "stop now"
 # send a request's headers; and Ray has it answer 500 in HTML where no replica can be reached (ray 2.60,
 # haproxy_templates.py). This stands before the real binary and mends its configuration.
 HEADERS_TIMEOUT_S = 5
+DEFAULT_MESSAGE = 4 << 20  # [bytes]
 UNREACHABLE = (
     b"HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/json\r\nretry-after: 1\r\n"
     b"connection: close\r\n\r\n"
@@ -284,7 +285,7 @@ def _pass_on(read_fd: int, events: queue.SimpleQueue[Any]) -> None:
 
 
 def ray_environment(
-    folder: Path, *, haproxy: str | None, mark: str, max_message: int = ServerSettings().max_body_bytes
+    folder: Path, *, haproxy: str | None, mark: str, max_message: int = DEFAULT_MESSAGE
 ) -> dict[str, str]:
     """Return the environment of the cluster: this process's, without its Ray settings, with ours.
 

@@ -8,7 +8,7 @@ conventions (base units, `_total`). It knows nothing of HTTP.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
@@ -63,6 +63,7 @@ class Metrics:
         self._answered: dict[tuple[str, str, str], _Series] = {}
         self._failed: dict[tuple[str, str, str, str], int] = {}
         self._streams: dict[str, int] = {}
+        self.sources: list[Callable[[], Iterable[Metric]]] = []  # further families, asked for when somebody looks
 
     def answered(self, protocol: str, decision: Decision, batch: int, seconds: float) -> None:
         """Count a request that got its action `seconds` after it arrived."""
@@ -132,6 +133,8 @@ class Metrics:
             for version in versions:
                 loaded.add_metric([self._replica, policy, version], float(version == versions[-1]))
         yield loaded
+        for source in self.sources:
+            yield from source()
 
 
 class _Snapshot(Collector):

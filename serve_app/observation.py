@@ -10,7 +10,7 @@ An observation outside the space's bounds is accepted here: RLlib's own pipeline
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -39,6 +39,7 @@ class ObservationReader:
         # Of a choice that does not exist RLlib makes an error or a one-hot of nothing; a Box may be left.
         self._choices = None if isinstance(space, BoxSpec) else space.bounds()
         self._names = tuple(element.name for element in space.elements)
+        self.watch: Callable[[NDArray[Any]], None] | None = None  # is shown every array that passed the checks
         self._named = bool(self._names) and len(set(self._names)) == len(self._names)
 
     def read(self, obs: Any) -> tuple[NDArray[Any], bool]:
@@ -71,6 +72,8 @@ class ObservationReader:
                 self._check_finite(array)
         elif self._choices is not None:
             self._check_range(array, *self._choices)
+        if self.watch is not None:
+            self.watch(array)
         return array, batch
 
     # How each form becomes an array.

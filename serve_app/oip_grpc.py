@@ -40,6 +40,7 @@ from rlservo.serve_app.tensors import DTYPES, MAX_AXES, datatype_of, from_bytes
 logger = logging.getLogger(__name__)
 
 PROTOCOL = "grpc"
+REQUEST_ID = "x-request-id"
 CODES = {
     400: grpc.StatusCode.INVALID_ARGUMENT,
     401: grpc.StatusCode.UNAUTHENTICATED,
@@ -124,14 +125,17 @@ class Grpc:
             "ServerMetadata": lambda _request: messages.ServerMetadataResponse(**oip.server_metadata()),
             "ModelReady": self._model_ready,
             "ModelMetadata": self._model_metadata,
-            "ModelInfer": self._infer,
             "RepositoryIndex": self._index,
         }
 
     def answer(self, method: str, request: Incoming, context: Any) -> Any:
         """Return the reply to one call. An error sets the status, and the empty reply is not looked at."""
         try:
-            self._check(method, context)
+            request_id = self._check(method, context)
+            if request_id is not None:
+                context.set_trailing_metadata([(REQUEST_ID, request_id)])  # in addition to Serve's own
+            if method == "ModelInfer":
+                return self._infer(request, request_id)
             return self._methods[method](request)
         except Exception as error:
             _fail(context, error)
@@ -144,7 +148,7 @@ class Grpc:
         """
         idle_s = self._core.settings.stream_idle_s
         try:
-            self._check("ModelStreamInfer", context)
+            request_id = self._check("ModelStreamInfer", context)
             counted = self._core.admission.streaming()
             counted.__enter__()
         except Exception as error:
@@ -161,7 +165,7 @@ class Grpc:
                     _fail(context, DeadlineError(f"the stream was silent for {idle_s:g} s: open another one"))
                     return
                 try:
-                    yield messages.ModelStreamInferResponse(infer_response=self._infer((content, None)))
+                    yield messages.ModelStreamInferResponse(infer_response=self._infer((content, None), request_id))
                 except Exception as error:
                     sentence = _explain(error)[1]
                     yield messages.ModelStreamInferResponse(
@@ -171,13 +175,16 @@ class Grpc:
             counted.__exit__(None, None, None)
             self._core.metrics.stream("", -1)
 
-    def _check(self, method: str, context: Any) -> None:
+    def _check(self, method: str, context: Any) -> str | None:
+        """Return the caller's request id, if it gave one. Raises ForbiddenError or UnauthenticatedError."""
         if self._local_only and not is_local(context.peer()):
             raise ForbiddenError(
                 "this server listens on this machine only: serve it with --host to reach it from others"
             )
-        headers = [(name.encode(), _bytes(value)) for name, value in context.invocation_metadata()]
+        metadata = context.invocation_metadata()
+        headers = [(name.encode(), _bytes(value)) for name, value in metadata]
         self._core.guard.check({"headers": headers}, PATHS[method])
+        return next((value for name, value in metadata if name == REQUEST_ID), None)
 
     def _model_ready(self, request: Incoming) -> Any:
         asked = _parse(messages.ModelReadyRequest, request[0])
@@ -191,7 +198,7 @@ class Grpc:
         asked = _parse(messages.RepositoryIndexRequest, request[0])
         return messages.RepositoryIndexResponse(models=oip.repository_index(self._core, ready=asked.ready))
 
-    def _infer(self, request: Incoming) -> Any:
+    def _infer(self, request: Incoming, request_id: str | None = None) -> Any:
         content, remaining_s = request
         name, version = "", None
         try:
@@ -219,12 +226,18 @@ class Grpc:
             )
         except RlservoError as error:
             self._core.failed(PROTOCOL, name, version, error.code)
+            self._core.log.failed(PROTOCOL, name, version, error.code, error.message, request_id=request_id)
             raise
         except Exception:
             self._core.metrics.failed(PROTOCOL, "", "", "internal")
             raise
         reply = _reply(decision, asked.id, seq, raw=bool(asked.raw_input_contents))
-        self._core.metrics.answered(PROTOCOL, decision, decision.batch or 1, time.perf_counter() - received)
+        taken, batch = time.perf_counter() - received, decision.batch or 1
+        self._core.metrics.answered(PROTOCOL, decision, batch, taken)
+        if self._core.log.every:
+            self._core.log.answered(
+                PROTOCOL, decision.name, decision.version, taken, batch=batch, request_id=request_id
+            )
         return reply
 
 
@@ -253,11 +266,14 @@ def _inputs(asked: Any) -> dict[str, NDArray[Any]]:
         raise RequestError(
             f"there are {len(asked.inputs)} inputs and {len(raw)} raw_input_contents: one for each, or none"
         )
+    seen: set[str] = set()
+    for tensor in asked.inputs:
+        if tensor.name in seen:
+            raise RequestError(f"input '{tensor.name[:64]}' is there twice")
+        seen.add(tensor.name)
     inputs: dict[str, NDArray[Any]] = {}
     for index, tensor in enumerate(asked.inputs):
         label, shape = tensor.name[:64], tuple(tensor.shape)
-        if tensor.name in inputs:
-            raise RequestError(f"input '{label}' is there twice")
         if tensor.datatype == "BYTES":
             raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")
         dtype = DTYPES.get(tensor.datatype)

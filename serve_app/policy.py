@@ -43,6 +43,7 @@ from rlservo.export.errors import (
 from rlservo.export.scores import split_scores
 from rlservo.export.session import open_session
 from rlservo.serve_app.acting import Observation
+from rlservo.serve_app.drift import Drift
 from rlservo.serve_app.exploring import distribution_size, sample_leaves
 from rlservo.serve_app.guard import ActionGuard
 from rlservo.serve_app.memory import REWARD, Memory, State
@@ -93,6 +94,10 @@ class Policy:
         observations = leaf_specs(contract.observation_space, "obs")
         self._simple = len(observations) == len(actions) == 1 and len(contract.inputs) == 1
         self._leaf_reader = ObservationReader(contract.name, next(iter(observations.values())))
+        self.drift = Drift.of(contract)
+        if self.drift is not None:
+            self._leaf_reader.watch = self.drift.see
+            self._reader.watch("obs", self.drift.see)
         self._guard = next(iter(self._guards.values()))
         self._input = contract.inputs[0].name
         self._action_only = ["action"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from typing_extensions import Self
@@ -65,10 +65,22 @@ class ServerSettings(BaseModel):
     default_policy: str | None = None
     """The policy of a WebSocket at `/`, where openpi's clients connect; the only one, where there is one."""
 
+    log_file: str | None = None
+    """Append the log to this file; without one it goes to standard error, which Ray keeps in its session folder."""
+
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """The least that is logged; at `info`, every request that got no action."""
+
+    log_requests: bool = False
+    """Log also every request that got its action: a line costs about as much as the policy."""
+
+    log_values: bool = False
+    """Log the sentences of errors, which may name values of observations."""
+
     docs: bool = True
     """Serve the interactive API documentation at /docs, from files that come with the server."""
 
-    @field_validator("api_keys_file")
+    @field_validator("api_keys_file", "log_file")
     @classmethod
     def _absolute(cls, value: str | None) -> str | None:
         """A replica's working directory is not the caller's."""

@@ -29,7 +29,7 @@ from rlservo.serve_app import wire
 from rlservo.serve_app.admission import IdleTimer
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.edge import encode_bug, error_answer, session_of, status_of
+from rlservo.serve_app.edge import encode_bug, error_answer, request_id, session_of, status_of
 from rlservo.serve_app.keys import check_origin
 
 logger = logging.getLogger(__name__)
@@ -80,6 +80,7 @@ class Stream:
             await _close_idle(send)
         except RlservoError as error:
             self._core.failed(PROTOCOL, name, version, error.code)
+            self._core.log.failed(PROTOCOL, name, version, error.code, error.message, request_id=request_id(scope))
             if status_of(error) >= 500:
                 logger.error("%s", error.message)
             await _fail(send, error_answer(error)[1])

@@ -7,7 +7,7 @@ the contract's spaces only.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -25,6 +25,10 @@ class StructureReader:
         self._policy = policy
         self._space = space
         self._readers = {name: ObservationReader(policy, leaf, name) for name, leaf in leaf_specs(space, "obs").items()}
+
+    def watch(self, name: str, see: Callable[[NDArray[Any]], None]) -> None:
+        """Show `see` the checked observations of the leaf `name`."""
+        self._readers[name].watch = see
 
     def read(self, obs: Any) -> tuple[dict[str, NDArray[Any]], bool]:
         """Return (`[batch, ...]` by the graph's input names, whether `obs` was a batch).

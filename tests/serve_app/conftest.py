@@ -14,6 +14,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,9 @@ from rlservo.export.bundle import (
     Provenance,
     TensorSpec,
 )
+from rlservo.serve_app.keys import new_key
+from rlservo.serve_app.launcher import serve_policies
+from rlservo.serve_app.processes import free_ports
 
 OBS = 27
 HIDDEN = 256
@@ -293,6 +297,54 @@ def over_uvicorn(app: Any) -> Iterator[int]:
 def served() -> Callable[[Any], AbstractContextManager[int]]:
     """`over_uvicorn`."""
     return over_uvicorn
+
+
+@dataclass(frozen=True)
+class LiveServer:
+    """A policy server on Ray Serve, with a key, gRPC and a log file."""
+
+    port: int
+    grpc_port: int
+    key: str
+    log: Path
+
+    @property
+    def bearer(self) -> str:
+        return f"Bearer {self.key}"
+
+
+@pytest.fixture(scope="session")
+def live_server(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
+    """Start `rlservo serve` once for all the tests that need nothing special of it."""
+    port, grpc_port = free_ports(2)
+    key, line = new_key("tests")
+    log = tmp_path_factory.mktemp("log") / "server.jsonl"
+    ready, stop = threading.Event(), threading.Event()
+    failures: list[Exception] = []
+
+    def serve() -> None:
+        try:
+            serve_policies(
+                [policies],
+                port=port,
+                grpc_port=grpc_port,
+                settings={"api_keys": line, "default_policy": "ur5", "log_file": str(log), "log_requests": True},
+                on_ready=lambda _: ready.set(),
+                stop=stop,
+            )
+        except Exception as error:
+            failures.append(error)
+            ready.set()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        assert ready.wait(120) and not failures, failures
+        yield LiveServer(port, grpc_port, key, log)
+    finally:
+        stop.set()
+        thread.join(60)
+    assert not thread.is_alive()
 
 
 @pytest.fixture(scope="session")

@@ -280,11 +280,13 @@ def wait_until_served(run: Run) -> None:
 def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
     policies: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
+    import grpc
     import yaml
 
-    (port, stats, metrics, fallback) = free_ports(4)
+    (port, stats, metrics, fallback, grpc_port, grpc_fallback) = free_ports(6)
     configuration = yaml.safe_load((ROOT / "deploy" / "serve.yaml").read_text())
     configuration["http_options"]["port"] = port
+    configuration["grpc_options"]["port"] = grpc_port
     configuration["applications"][0]["args"]["policies"] = [str(policies)]
     file = tmp_path / "serve.yaml"
     file.write_text(yaml.safe_dump(configuration))
@@ -302,6 +304,7 @@ def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
+        "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(grpc_fallback),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(ray_folder / "haproxy.cfg"),
         "RAY_SERVE_HAPROXY_SOCKET_PATH": str(ray_folder / "a.sock"),
         "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(ray_folder),
@@ -319,6 +322,9 @@ def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
             status, reply = ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})
             assert status == 200, "".join(output)
             assert len(reply["action"]) == 6
+            with grpc.insecure_channel(f"127.0.0.1:{grpc_port}") as channel:
+                live = channel.unary_unary("/inference.GRPCInferenceService/ServerLive")
+                assert live(b"", timeout=20, wait_for_ready=True) == b"\x08\x01"  # field 1, true
             run.process.send_signal(number)
             run.process.wait(timeout=90)
             run.nothing_is_left(folders=False)  # Ray's dashboard leaves an empty one
