@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import http.client
 import json
 import shutil
@@ -78,8 +79,6 @@ def key_path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture
 def port(folder: Path, key_path: Path, served: Serve) -> Iterator[int]:
     """A server whose operator has a key and which asks nobody else for one; ur5 in 1 and 2, production 1."""
-    import hashlib
-
     digest = "sha256:" + hashlib.sha256(read_key(key_path).encode()).hexdigest()
     control = Control(Library(Repository([folder])), Shelf(), replica="only")
     config = {"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}},
@@ -185,9 +184,11 @@ def test_a_server_without_an_operator_lets_nobody_administer(folder: Path, serve
     control = Control(Library(Repository([folder / "ur5" / "1"])), Shelf())
     asyncio.run(control.configure({}))
     with served(create_app(lambda: control.store, ServerSettings(), control=control)) as open_port:
-        with AdminClient(f"http://127.0.0.1:{open_port}", api_key="any") as client:
-            with pytest.raises(ForbiddenError, match="this server has none"):
-                client.unload("ur5")
+        with (
+            AdminClient(f"http://127.0.0.1:{open_port}", api_key="any") as client,
+            pytest.raises(ForbiddenError, match="this server has none"),
+        ):
+            client.unload("ur5")
         assert act(open_port)["version"] == "1"
 
 
@@ -252,7 +253,8 @@ def test_a_shadow_computes_along_and_only_its_difference_is_kept(port: int, admi
     _, text = ask(port, "GET", "/metrics")
     labels = 'policy="ur5",replica="only",shadow="2",version="1"'
     assert f"rlservo_shadow_difference_count{{{labels}}} 15.0" in text
-    assert f'rlservo_shadow_missed_total{{policy="ur5",reason="failed",replica="only",shadow="2",version="1"}} 0.0' in text
+    missed = 'rlservo_shadow_missed_total{policy="ur5",reason="failed",replica="only",shadow="2",version="1"}'
+    assert f"{missed} 0.0" in text
     admin.shadow("ur5", None)
     assert listed(port)["shadow"] is None
 

@@ -140,7 +140,9 @@ def test_a_version_that_fails_is_refused_and_every_replica_says_why(folder: Path
             assert "is not the file" in states["2"].reason and states["1"].loaded_at is not None
         assert fleet.defaults() == ["1", "1"]
         await fleet.controls[1].change(lambda p: plan.set_shadow(p, "ur5", None), what="shadow off")
-        assert fleet.controls[0].plan is not None and fleet.controls[0].plan.refused is None  # the last change went well
+        assert (
+            fleet.controls[0].plan is not None and fleet.controls[0].plan.refused is None
+        )  # the last change went well
 
     asyncio.run(run())
 
@@ -274,9 +276,7 @@ def test_canary_and_shadow_have_to_read_and_give_the_same(
         await fleet.deploy(config("1", "12", production="1"))
         control = fleet.controls[0]
         with pytest.raises(RefusedError, match=r"version 12 cannot be the canary of version 1"):
-            await control.change(
-                lambda p: plan.set_canary(p, "ur5", Canary(version="12", share=0.5)), what="canary"
-            )
+            await control.change(lambda p: plan.set_canary(p, "ur5", Canary(version="12", share=0.5)), what="canary")
         with pytest.raises(RefusedError, match=r"version 12 cannot be the shadow of version 1"):
             await control.change(lambda p: plan.set_shadow(p, "ur5", "12"), what="shadow")
 

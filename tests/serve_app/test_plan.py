@@ -64,7 +64,7 @@ def test_a_configuration_that_is_none_is_refused_by_field(config: Any, sentence:
     [
         ({"policies": {"ur6": {}}}, UnknownPolicyError, "no policy 'ur6': it has mir, ur5"),
         ({"policies": {"ur5": {"versions": ["3"]}}}, UnknownVersionError, "no version 3 .* it has 1, 2, 10"),
-        ({"policies": {"ur5": {"versions": ["1"], "aliases": {"production": "2"}}}}, UnknownVersionError, "loaded are 1"),
+        ({"policies": {"ur5": {"versions": [1], "aliases": {"production": 2}}}}, UnknownVersionError, "loaded are 1"),
         ({"policies": {"ur5": {"shadow": "candidate"}}}, UnknownVersionError, "no alias 'candidate'"),
     ],
 )  # fmt: skip
@@ -74,7 +74,7 @@ def test_a_configuration_that_leads_nowhere_is_refused(config: Any, error: type[
 
 
 def test_versions_that_compare_equal_are_refused() -> None:
-    with pytest.raises(ConflictError, match="'1' and '1.0.0'"):
+    with pytest.raises(ConflictError, match=r"'1' and '1\.0\.0'"):
         plan_of(ServedConfig(), {"ur5": {"1": "a", "1.0.0": "b"}}, None)
 
 
@@ -105,8 +105,9 @@ def test_a_new_configuration_leaves_the_way_back_open() -> None:
 
 
 def test_what_is_in_use_is_not_unloaded() -> None:
-    now = made(planned({"policies": {"ur5": {"aliases": {"production": "1", "candidate": "2"},
-                                             "canary": {"version": "candidate", "share": 0.1}, "shadow": "10"}}}))  # fmt: skip
+    canary = {"version": "candidate", "share": 0.1}
+    ur5 = {"aliases": {"production": "1", "candidate": "2"}, "canary": canary, "shadow": "10"}
+    now = made(planned({"policies": {"ur5": ur5}}))
     with pytest.raises(ConflictError, match="alias 'candidate' and the canary"):
         plan.unload(now, "ur5", "2")
     with pytest.raises(ConflictError, match="in use by the shadow"):
