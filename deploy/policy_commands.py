@@ -23,7 +23,7 @@ policy = typer.Typer(
 )
 _out = Console()
 
-Url = Annotated[str, typer.Option(help="The server.")]
+Url = Annotated[str, typer.Option(help="The server.", envvar="RLSERVO_URL")]
 KeyFile = Annotated[
     Path | None,
     typer.Option(help="File with the admin key; else RLSERVO_ADMIN_KEY, else the one 'rlservo serve' wrote here."),

@@ -17,6 +17,7 @@ import ray
 from fastapi import FastAPI
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from ray import serve
+from ray.exceptions import ActorDiedError, RayError
 from ray.serve import Application, Deployment
 from ray.serve.config import HTTPOptions, gRPCOptions
 from ray.serve.context import _get_global_client
@@ -184,7 +185,7 @@ class PolicyServer(InferenceService):
         """
         try:
             current = await _controller().get_deployment_config.remote(self._id)
-        except ray.exceptions.RayError:  # the controller is coming back: nobody says otherwise
+        except RayError:  # the controller is coming back: nobody says otherwise
             return True
         return current is None or current.user_config == user_config
 
@@ -205,9 +206,7 @@ class PolicyServer(InferenceService):
         except TimeoutError:
             raise PartlyAppliedError(f"not every replica answered within {FOLLOW_TIMEOUT_S:g} s") from None
         failures = [
-            reply
-            for reply in replies
-            if isinstance(reply, BaseException) and not isinstance(reply, ray.exceptions.ActorDiedError)
+            reply for reply in replies if isinstance(reply, BaseException) and not isinstance(reply, ActorDiedError)
         ]
         if failures:
             raise PartlyAppliedError(

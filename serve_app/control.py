@@ -237,7 +237,7 @@ class Control:
         """Return the plan that a configuration means, or the one that refuses it."""
         try:
             config = ServedConfig.read(document)
-            available = await self._in_thread(self._library.repository.available)
+            available = await self._in_thread(self._library.repository.available, config)
             policies = plan_of(config, available, before)
             await self._prove(policies, {} if before is None else before.policies)
         except RlservoError as error:

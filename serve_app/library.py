@@ -7,12 +7,19 @@ Everything here blocks (hashing, onnxruntime, golden vectors): the event loop ha
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rlservo.export.bundle import SUMS_FILE, find_bundles, read_contract, version_key
-from rlservo.export.errors import BundleError, BundleTamperedError, UnknownPolicyError, UnknownVersionError, UsageError
+from rlservo.export.errors import (
+    BundleError,
+    BundleTamperedError,
+    RlservoError,
+    UnknownPolicyError,
+    UnknownVersionError,
+    UsageError,
+)
 from rlservo.serve_app.plan import ServedConfig, now, plan_of
 from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.store import PolicyStore
@@ -37,41 +44,47 @@ class Repository:
         if not self._paths:
             raise UsageError("no policy to serve: give at least one bundle folder")
 
-    def scan(self) -> tuple[dict[Key, Path], list[BundleError]]:
-        """Return the bundles by name and version, and what cannot be read.
+    def scan(self) -> tuple[dict[Key, Path], dict[Path, RlservoError]]:
+        """Return the bundles by name and version, and what cannot be served, by folder.
 
-        Raises UsageError when two folders hold the same policy in the same version.
+        Two bundles of the same policy in the same version are among the latter: nobody could say which one is meant.
+        A copy of a bundle is the bundle.
         """
         found: dict[Key, Path] = {}
-        errors: list[BundleError] = []
+        errors: dict[Path, RlservoError] = {}
         folders: dict[Path, Path] = {}  # resolved -> as given: the same folder given twice counts once
         for path in self._paths:
             try:
                 folders.update({folder.resolve(): folder for folder in find_bundles(path)})
             except BundleError as error:
-                errors.append(error)
+                errors[path] = error
+        twice: set[Key] = set()
         for folder in folders.values():
             try:
                 contract = read_contract(folder)
+                key = (contract.name, contract.version)
+                copied = key in found and digest_of(folder) == digest_of(found[key])
             except BundleError as error:
-                errors.append(error)
+                errors[folder] = error
                 continue
-            key = (contract.name, contract.version)
-            if key in found:
-                raise UsageError(
+            if key in found and not copied:
+                twice.add(key)
+                errors[folder] = UsageError(
                     f"policy '{key[0]}' version {key[1]} is in both {found[key]} and {folder}: "
                     "serve one of them, or export one under another name or version"
                 )
-            found[key] = folder
-        return found, errors
+            elif not copied:
+                found[key] = folder
+        return {key: folder for key, folder in found.items() if key not in twice}, errors
 
-    def available(self) -> dict[str, dict[str, str]]:
+    def available(self, config: ServedConfig) -> dict[str, dict[str, str]]:
         """Return every bundle's hash by name and version.
 
-        Raises BundleError when one of them cannot be read: a repository that is served whole has to be whole.
+        Where the configuration means all that is there, all of it has to be good: raises BundleError or UsageError.
         """
         found, errors = self.scan()
-        raise_all(errors)
+        if config.wants_all:
+            raise_all(list(errors.values()))
         hashes: dict[str, dict[str, str]] = {}
         for (name, version), folder in sorted(found.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
             hashes.setdefault(name, {})[version] = digest_of(folder)
@@ -80,16 +93,16 @@ class Repository:
     def find(self, name: str, version: str | None) -> tuple[str, Path]:
         """Return (version, folder) of a bundle; None is the newest one.
 
-        Raises UnknownPolicyError or UnknownVersionError, or the BundleError of the folder of that name and version.
+        Raises UnknownPolicyError or UnknownVersionError, or what is wrong with the folder of that name and version.
         """
         found, errors = self.scan()
         versions = sorted((v for n, v in found if n == name), key=version_key)
         wanted = version if version is not None else (versions[-1] if versions else None)
         if wanted is not None and (name, wanted) in found:
             return wanted, found[name, wanted]
-        # A folder of that name and version that is no bundle says more than that there is none.
-        for error in errors:
-            if f"/{name}/{version or ''}" in error.message:
+        # A folder of that name and version that cannot be served says more than that there is none.
+        for folder, error in errors.items():
+            if folder.parent.name == name and version in (folder.name, None):
                 raise error
         if not versions:
             known = ", ".join(sorted({n for n, _ in found})) or "none"
@@ -102,9 +115,9 @@ class Repository:
 def load_served(paths: Iterable[str | Path], config: ServedConfig) -> PolicyStore:
     """Load and prove what a server of these folders would start with. Raises UsageError or BundleError."""
     library = Library(Repository(paths))
-    plans = plan_of(config, library.repository.available(), None)
+    plans = plan_of(config, library.repository.available(config), None)
     policies: list[Policy] = []
-    errors: list[BundleError] = []
+    errors: list[RlservoError] = []
     for name, plan in plans.items():
         for version, digest in plan.versions.items():
             try:
@@ -161,8 +174,8 @@ def digest_of(folder: Path) -> str:
         raise BundleError(f"{folder / SUMS_FILE} cannot be read: {error.strerror}") from None
 
 
-def raise_all(errors: list[BundleError]) -> None:
-    """Raise one error that lists all of them."""
+def raise_all(errors: Sequence[RlservoError]) -> None:
+    """Raise the error, or one that lists all of them."""
     if len(errors) == 1:
         raise errors[0]
     if errors:

@@ -75,6 +75,11 @@ class ServedConfig(_Model):
     unlisted: Literal["load", "ignore"] = "load"
     """What becomes of the repository's policies that `policies` does not name."""
 
+    @property
+    def wants_all(self) -> bool:
+        """Whether something is meant by not being named, so that nothing of the repository may be missing."""
+        return self.unlisted == "load" or any(policy.versions is None for policy in self.policies.values())
+
     @classmethod
     def read(cls, document: Any) -> Self:
         """Check a configuration as it was given. Raises UsageError."""

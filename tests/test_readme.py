@@ -39,6 +39,7 @@ def checkout(tmp_path: Path) -> Path:
 def test_commands_run_as_written(checkout: Path) -> None:
     port = free_port()
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "HOME": str(checkout)}
+    environment |= {"RLSERVO_URL": f"http://127.0.0.1:{port}", "XDG_RUNTIME_DIR": str(checkout)}
 
     def as_written(command: str) -> str:
         return command.replace("127.0.0.1:8000", f"127.0.0.1:{port}")
@@ -56,7 +57,7 @@ def test_commands_run_as_written(checkout: Path) -> None:
         return done.stdout
 
     commands = blocks("sh")
-    train, export, serve, curl, rollout = commands[1:6]
+    train, export, serve, curl, policy, rollout = commands[1:7]
     assert "training_inference_ur.py" in train  # run by tests/examples
     run(export)
     assert serve.strip() == "rlservo serve policies"
@@ -71,6 +72,7 @@ def test_commands_run_as_written(checkout: Path) -> None:
             time.sleep(0.5)
         answer = run(curl)
         assert re.search(r'"action":\[(-?[\d.e-]+,){4}-?[\d.e-]+\].*"policy":"ur5"', answer)
+        assert "production=1" in run(policy)
         # Random targets, of which the policy reaches 99.4 %: fewer than 18 of 20 would be one run in thousands.
         found = re.search(r"success: (\d+)", run(rollout))
         assert found is not None
