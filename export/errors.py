@@ -18,6 +18,8 @@ handler in `deploy/cli.py` maps them to exit codes.
     ├── ObservationError          bad-observation          shape, dtype, non-finite or misnamed element
     ├── ActionError               unsafe-action            the policy produced an action that must not leave
     ├── DeadlineError             deadline-passed
+    ├── SessionError              session-conflict         a session's requests contradict each other
+    │   └── SessionLostError      session-lost             the server has no such session (any more)
     ├── UnavailableError          unavailable              not ready, over capacity, or the server cannot be reached
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
 """
@@ -121,6 +123,18 @@ class DeadlineError(RlservoError):
     """The answer could not have arrived in time, so the work was not done."""
 
     code = "deadline-passed"
+
+
+class SessionError(RlservoError):
+    """The request does not fit where its session stands."""
+
+    code = "session-conflict"
+
+
+class SessionLostError(SessionError):
+    """The server does not know the session: its memory is gone, and only a new episode can follow."""
+
+    code = "session-lost"
 
 
 class UnavailableError(RlservoError):

@@ -79,19 +79,27 @@ class PolicyServer:
         self._settings = ServerSettings(**settings)
         try:
             check_exposure(_listening_host(), self._settings)
-            self._store = PolicyStore.load(folders, threads=self._settings.threads)
+            self._store = PolicyStore.load(
+                folders, threads=self._settings.threads, options=self._settings.policy_options
+            )
         except RlservoError as error:
             # Ray pickles what a constructor raises and prints its text: one sentence instead of our class and details.
             raise RuntimeError(error.message) from None
 
     def __serve_build_asgi_app__(self) -> FastAPI:  # Serve's hook: the app is built in the replica
-        return create_app(lambda: self._store, self._settings, replica=serve.get_replica_context().replica_tag)
+        tag = serve.get_replica_context().replica_tag
+        return create_app(lambda: self._store, self._settings, replica=tag, alone=_alone)
 
     async def check_health(self) -> None:
         """Tell Serve's controller that the event loop turns and the policies are there; if not, it replaces us."""
         await asyncio.sleep(0)
         if not self._store.names:
             raise RuntimeError("no policies are loaded")
+
+
+def _alone() -> bool:
+    """Whether this is the deployment's only replica, as Serve's controller last told it."""
+    return int(serve.get_replica_context().world_size) <= 1
 
 
 def _listening_host() -> str:

@@ -12,9 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from rlservo.export.bundle import Contract, DictSpec, SpaceSpec, TupleSpec
 from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError
+from rlservo.serve_app.episodes import Episode, Episodes
 from rlservo.serve_app.keys import Guard, Keys
 from rlservo.serve_app.metrics import Metrics
+from rlservo.serve_app.sessions import Session
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import Decision, PolicyStore
 
@@ -24,12 +27,23 @@ StoreProvider = Callable[[], PolicyStore | None]
 class Core:
     """The policies as the protocols see them; `store_provider` gives None for as long as they are being loaded."""
 
-    def __init__(self, store_provider: StoreProvider, settings: ServerSettings, *, replica: str = "") -> None:
-        """Read the keys that `settings` name; `replica` names this process in the metrics. Raises UsageError."""
+    def __init__(
+        self,
+        store_provider: StoreProvider,
+        settings: ServerSettings,
+        *,
+        replica: str = "",
+        alone: Callable[[], bool] = lambda: True,
+    ) -> None:
+        """Read the keys that `settings` name; `replica` names this process in the metrics.
+
+        `alone` says whether every request comes to this process, as sessions by id need. Raises UsageError.
+        """
         self._store_provider = store_provider
         self.settings = settings
         self.guard = Guard(Keys.from_settings(settings))
         self.metrics = Metrics(replica)
+        self.episodes = Episodes(max_sessions=settings.max_sessions, idle_s=settings.session_idle_s, alone=alone)
 
     def store(self) -> PolicyStore:
         """Return the policies. Raises UnavailableError while they are being loaded."""
@@ -37,6 +51,11 @@ class Core:
         if store is None:
             raise UnavailableError("the policies are still being loaded: try again shortly")
         return store
+
+    def contract(self, name: str, version: str | None, session_id: str | None = None) -> Contract:
+        """Return the contract that a request's tensors follow: a session's own, whatever the default is meanwhile."""
+        session = None if session_id is None else self.episodes.sessions.peek(name, session_id)
+        return (self.store().get(name, version) if session is None else session.policy).contract
 
     def act(
         self,
@@ -49,8 +68,12 @@ class Core:
         seed: int | None = None,
         seq: int | None = None,
         deadline_ms: float | None = None,
+        episode: Episode | None = None,
+        stream: Session | None = None,
     ) -> Decision:
         """Decide for `obs`, unless `deadline_ms` have passed since `received` (`time.perf_counter`).
+
+        `episode` is what the request says of its episode, `stream` the session of the stream it came on.
 
         Raises DeadlineError, TooLargeError, UnavailableError and what `PolicyStore.act` raises.
         """
@@ -62,12 +85,16 @@ class Core:
                     f"the deadline of {deadline_ms:g} ms passed before the policy was asked: nothing computed",
                     {"deadline_ms": deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": seq},
                 )
-        rows = _rows(obs)
-        if rows > self.settings.max_batch:
-            shape = getattr(store.get(name, version).contract.observation_space, "shape", ())
-            if type(obs) is dict or rows != (shape or (0,))[0]:  # not one long observation
+        if _rows(obs) > self.settings.max_batch:
+            space = store.get(name, version).contract.observation_space
+            rows = _batch(space, obs)
+            if rows > self.settings.max_batch:
                 raise TooLargeError(f"a batch of {rows} observations is too large: at most {self.settings.max_batch}")
-        return store.act(name, version, obs, explore=explore, seed=seed)
+        if episode is None and stream is None:
+            return store.act(name, version, obs, explore=explore, seed=seed)
+        return self.episodes.act(
+            store, name, version, obs, episode or NO_EPISODE, stream=stream, explore=explore, seed=seed, seq=seq
+        )
 
     def failed(self, protocol: str, name: str, version: str | None, code: str) -> None:
         """Count a request that got no action; names that are not loaded are not told apart."""
@@ -82,6 +109,22 @@ class Core:
         """Return the metrics as Prometheus reads them."""
         store = self._store_provider()
         return self.metrics.exposition({} if store is None else {name: store.versions(name) for name in store.names})
+
+
+NO_EPISODE = Episode()
+
+
+def _batch(space: SpaceSpec, obs: Any) -> int:
+    """Return how many observations a large `obs` holds; an array as long as the space's own is one."""
+    if isinstance(space, DictSpec | TupleSpec):
+        if isinstance(space, DictSpec) and type(obs) is list:
+            return len(obs)  # of single observations
+        inside = space.spaces.items() if isinstance(space, DictSpec) else enumerate(space.spaces)
+        parts = obs if type(obs) in (dict, list, tuple) else {}
+        found = dict(parts) if type(parts) is dict else dict(enumerate(parts))
+        return max((_batch(child, found[key]) for key, child in inside if key in found), default=0)
+    rows = _rows(obs)
+    return rows if type(obs) is dict or rows != (space.shape or (0,))[0] else 1
 
 
 def _rows(obs: Any) -> int:

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -34,12 +34,20 @@ ACT_VERSION_PATH = "/v1/policies/{name}/versions/{version}/act"
 ACT_PATTERN = re.compile(r"/v1/policies/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/act")
 
 
-def create_app(store_provider: StoreProvider, settings: ServerSettings, *, replica: str = "") -> FastAPI:
+def create_app(
+    store_provider: StoreProvider,
+    settings: ServerSettings,
+    *,
+    replica: str = "",
+    alone: Callable[[], bool] = lambda: True,
+) -> FastAPI:
     """Return the application; `store_provider` gives None for as long as the policies are being loaded.
+
+    `replica` and `alone` are the `Core`'s.
 
     Raises UsageError when the API keys that `settings` name cannot be read.
     """
-    core = Core(store_provider, settings, replica=replica)
+    core = Core(store_provider, settings, replica=replica, alone=alone)
     act = Endpoint("json", _Act(core), _check_headers, core)
     infer = oip.endpoint(core)
     app = PolicyApp(
@@ -115,6 +123,8 @@ class _Act:
     def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
         self._core.store()  # not ready comes before any fault of the request
         request = wire.read_request(body)
+        if request.non_finite and request.episode is not None:
+            wire.refuse_non_finite()  # before a session moves on
         params = scope["path_params"]
         try:
             decision = self._core.act(
@@ -126,6 +136,7 @@ class _Act:
                 seed=request.seed,
                 seq=request.seq,
                 deadline_ms=request.deadline_ms,
+                episode=request.episode,
             )
         except ObservationError as error:
             if request.non_finite:
@@ -133,7 +144,8 @@ class _Act:
             raise
         if request.non_finite:
             wire.refuse_non_finite()
-        return wire.encode_decision(decision, request.seq), JSON_HEADERS, decision
+        clock = None if request.timestamp is None else wire.clock(request.timestamp, received)
+        return wire.encode_decision(decision, request.seq, clock), JSON_HEADERS, decision
 
 
 def _add_act(app: FastAPI, act: ASGIApp) -> None:
@@ -150,7 +162,7 @@ def _add_act(app: FastAPI, act: ASGIApp) -> None:
                 summary=summary,
                 reply=wire.ActReply,
                 body={"application/json": {"schema": wire.ActRequest.model_json_schema()}},
-                responses=edge.error_models(400, 404, 408, 413, 415, 422, 500, 503),
+                responses=edge.error_models(400, 404, 408, 409, 410, 413, 415, 422, 500, 503),
             )
         )
 
