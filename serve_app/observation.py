@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from operator import ge, le
+from operator import ge, itemgetter, le
 from typing import Any, NoReturn
 
 import numpy as np
@@ -80,17 +80,19 @@ class ObservationReader:
             self._refuse_shape(array.shape)
         if array.dtype is not self._dtype and array.dtype != self._dtype:
             array = self._cast(array)
+        values: list[float] | None = array.ravel().tolist() if array.size <= SMALL else None
         if self._is_float:
             # One not-a-number or infinity makes the sum one. A sum that merely overflows is looked at again.
-            total = sum(array.ravel().tolist()) if array.size <= SMALL else math.inf
-            if not math.isfinite(total):
+            if values is None or not math.isfinite(sum(values)):
                 self._check_finite(array)
         elif self._choices is not None:
             self._check_range(array, *self._choices)
         if self._bounded:
-            values = array.ravel().tolist() if array.size == self._space.size <= SMALL else None
-            if values is None or not (all(map(le, self._lows, values)) and all(map(ge, self._highs, values))):
-                array = self._keep_bounds(array)
+            if values is not None and len(array) == 1:
+                checked = self._pick(values)
+                if all(map(le, self._lows, checked)) and all(map(ge, self._highs, checked)):
+                    return array, batch
+            array = self._keep_bounds(array)
         return array, batch
 
     def _take_bounds(self, space: BoxSpec) -> bool:
@@ -105,8 +107,12 @@ class ObservationReader:
             slack = BOUND_SLACK * np.maximum(1.0, np.minimum(np.abs(low), np.abs(high)))
         self._low, self._high = low, high
         self._loosest = (low - slack, high + slack)
-        self._lows: list[float] = self._loosest[0].ravel().tolist()
-        self._highs: list[float] = self._loosest[1].ravel().tolist()
+        # The elements that have a bound, for the one observation that a control loop sends at a time.
+        bounded = np.flatnonzero(np.isfinite(low.ravel()) | np.isfinite(high.ravel())).tolist()
+        self._lows: list[float] = self._loosest[0].ravel()[bounded].tolist()
+        self._highs: list[float] = self._loosest[1].ravel()[bounded].tolist()
+        # itemgetter of a single index gives no tuple; repeating it does no harm, since map stops at the shortest.
+        self._pick: Callable[[list[float]], Sequence[float]] = itemgetter(*bounded, *bounded[:1]) if bounded else tuple
         return checked and self._out_of_bounds != "accept"
 
     def _keep_bounds(self, array: NDArray[Any]) -> NDArray[Any]:

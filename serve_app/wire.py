@@ -106,7 +106,7 @@ class PolicyList(BaseModel):
     policies: list[PolicySummary]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen, as `Decision`
 class Act:
     """An act request whose form has been checked; the observation itself is the policy's to judge."""
 
@@ -122,7 +122,7 @@ class Act:
 
 KNOWN = frozenset(ActRequest.model_fields)
 OPTIONS = ("explore", "seed", "seq", "deadline_ms", "timestamp")
-OF_EPISODE = ("state", "session_id", "reset", "end", "reward", "last_action")
+OF_EPISODE = frozenset({"state", "session_id", "reset", "end", "reward", "last_action"})
 
 
 def read_request(body: bytes | bytearray) -> Act:
@@ -245,6 +245,8 @@ def read_options(document: Mapping[str, Any]) -> tuple[bool, int | None, int | N
 
 def read_episode(document: Mapping[str, Any]) -> Episode | None:
     """Return what a request says of its episode; None when it says nothing. Raises RequestError."""
+    if OF_EPISODE.isdisjoint(document):
+        return None
     found = {name: document[name] for name in OF_EPISODE if document.get(name) is not None}
     if not found:
         return None
