@@ -20,6 +20,8 @@ handler in `deploy/cli.py` maps them to exit codes.
     ├── DeadlineError             deadline-passed
     ├── ConflictError             conflict                 a change of what is served that contradicts what is
     │   └── RefusedError              version-refused      a version or configuration that cannot be served
+    ├── SessionError              session-conflict         a session's requests contradict each other
+    │   └── SessionLostError      session-lost             the server has no such session (any more)
     ├── UnavailableError          unavailable              not ready, or the server cannot be reached
     │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
     │   └── PartlyAppliedError    partly-applied           a change that some replicas could not follow
@@ -125,6 +127,18 @@ class DeadlineError(RlservoError):
     """The answer could not have arrived in time, so the work was not done."""
 
     code = "deadline-passed"
+
+
+class SessionError(RlservoError):
+    """The request does not fit where its session stands."""
+
+    code = "session-conflict"
+
+
+class SessionLostError(SessionError):
+    """The server does not know the session: its memory is gone, and only a new episode can follow."""
+
+    code = "session-lost"
 
 
 class UnavailableError(RlservoError):

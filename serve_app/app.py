@@ -121,7 +121,9 @@ class PolicyServer(InferenceService):
             configure(self._settings, replica=self._replica)
             self._host = _listening_host()
             check_exposure(self._host, self._settings)
-            library = Library(Repository(folders), threads=self._settings.threads)
+            library = Library(
+                Repository(folders), threads=self._settings.threads, options=self._settings.policy_options
+            )
         except RlservoError as error:
             raise _plain(error) from None
         self._control = Control(
@@ -134,7 +136,9 @@ class PolicyServer(InferenceService):
         )
 
     def __serve_build_asgi_app__(self) -> FastAPI:  # Serve's hook: the app is built in the replica
-        app = create_app(lambda: self._control.store, self._settings, replica=self._replica, control=self._control)
+        app = create_app(
+            lambda: self._control.store, self._settings, replica=self._replica, control=self._control, alone=_alone
+        )
         self._core = app.state.core
         gate.is_open = self._core.admission.is_open
         self.serve_grpc(self._core, local_only=is_loopback(self._host))
@@ -224,6 +228,11 @@ def _controller() -> Any:
     """Return Serve's controller, which knows more than Serve's interface tells (ray 2.60): hence the private client."""
     client: Any = _get_global_client()
     return client._controller
+
+
+def _alone() -> bool:
+    """Whether this is the deployment's only replica, as Serve's controller last told it."""
+    return int(serve.get_replica_context().world_size) <= 1
 
 
 def _listening_host() -> str:

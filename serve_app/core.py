@@ -13,14 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from rlservo.export.bundle import Contract, DictSpec, SpaceSpec, TupleSpec
 from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError
 from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.control import Control
+from rlservo.serve_app.episodes import Episode, Episodes
 from rlservo.serve_app.gauges import drift, queue
 from rlservo.serve_app.keys import Guard, Keys
 from rlservo.serve_app.logs import RequestLog
 from rlservo.serve_app.metrics import Metrics
 from rlservo.serve_app.policy import Policy
+from rlservo.serve_app.sessions import Session
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.shadow import Shadows
 from rlservo.serve_app.store import Decision, PolicyStore
@@ -38,10 +41,12 @@ class Core:
         *,
         replica: str = "",
         control: Control | None = None,
+        alone: Callable[[], bool] = lambda: True,
     ) -> None:
         """Read the keys that `settings` name; `replica` names this process in the metrics. Raises UsageError.
 
-        With a `control` what is served can change while the server runs.
+        With a `control` what is served can change while the server runs. `alone` says whether every request comes to
+        this process, as sessions by id need.
         """
         self._store_provider = store_provider
         self.control = control
@@ -58,6 +63,7 @@ class Core:
             max_incoming=settings.max_incoming,
             max_streams=settings.max_streams,
         )
+        self.episodes = Episodes(max_sessions=settings.max_sessions, idle_s=settings.session_idle_s, alone=alone)
 
     def store(self) -> PolicyStore:
         """Return the policies. Raises UnavailableError while they are being loaded."""
@@ -76,6 +82,11 @@ class Core:
         store = self._store_provider()
         return store is not None and name in store.names and (version is None or version in store.versions(name))
 
+    def contract(self, name: str, version: str | None, session_id: str | None = None) -> Contract:
+        """Return the contract that a request's tensors follow: a session's own, whatever the default is meanwhile."""
+        session = None if session_id is None else self.episodes.sessions.peek(name, session_id)
+        return (self.store().get(name, version) if session is None else session.policy).contract
+
     def act(
         self,
         name: str,
@@ -87,11 +98,14 @@ class Core:
         seed: int | None = None,
         seq: int | None = None,
         deadline_ms: float | None = None,
+        episode: Episode | None = None,
+        stream: Session | None = None,
         session: str | None = None,
     ) -> Decision:
         """Decide for `obs`, unless `deadline_ms` have passed since `received` (`time.perf_counter`).
 
-        All requests of a `session` get the same version where a canary runs.
+        `episode` is what the request says of its episode, `stream` the session of the stream it came on. All requests
+        of a `session` get the same version where a canary runs.
 
         Raises DeadlineError, TooLargeError, UnavailableError and what `PolicyStore.act` raises.
         """
@@ -103,12 +117,26 @@ class Core:
                     f"the deadline of {deadline_ms:g} ms passed before the policy was asked: nothing computed",
                     {"deadline_ms": deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": seq},
                 )
-        rows = _rows(obs)
-        if rows > self.settings.max_batch:
-            shape = getattr(store.get(name, version).contract.observation_space, "shape", ())
-            if type(obs) is dict or rows != (shape or (0,))[0]:  # not one long observation
+        if _rows(obs) > self.settings.max_batch:
+            space = store.get(name, version).contract.observation_space
+            rows = _batch(space, obs)
+            if rows > self.settings.max_batch:
                 raise TooLargeError(f"a batch of {rows} observations is too large: at most {self.settings.max_batch}")
-        decision = store.act(name, version, obs, explore=explore, seed=seed, session=session)
+        if episode is None and stream is None:
+            decision = store.act(name, version, obs, explore=explore, seed=seed, session=session)
+        else:
+            decision = self.episodes.act(
+                store,
+                name,
+                version,
+                obs,
+                episode or NO_EPISODE,
+                stream=stream,
+                explore=explore,
+                seed=seed,
+                seq=seq,
+                session=session,
+            )
         shadow = store.shadow(name)
         if shadow is not None and decision.version == shadow.of and not explore:
             self.shadows.offer(shadow, obs, decision)
@@ -140,6 +168,22 @@ class Core:
             default = store.default(name)
             versions[name] = (*(version for version in store.versions(name) if version != default), default)
         return self.metrics.exposition(versions, self.shadows.families(self.replica))
+
+
+NO_EPISODE = Episode()
+
+
+def _batch(space: SpaceSpec, obs: Any) -> int:
+    """Return how many observations a large `obs` holds; an array as long as the space's own is one."""
+    if isinstance(space, DictSpec | TupleSpec):
+        if isinstance(space, DictSpec) and type(obs) is list:
+            return len(obs)  # of single observations
+        inside = space.spaces.items() if isinstance(space, DictSpec) else enumerate(space.spaces)
+        parts = obs if type(obs) in (dict, list, tuple) else {}
+        found = dict(parts) if type(parts) is dict else dict(enumerate(parts))
+        return max((_batch(child, found[key]) for key, child in inside if key in found), default=0)
+    rows = _rows(obs)
+    return rows if type(obs) is dict or rows != (space.shape or (0,))[0] else 1
 
 
 def _rows(obs: Any) -> int:

@@ -5,6 +5,7 @@ It knows numpy and one leaf of the contract's action space; nothing of graphs.
 
 from __future__ import annotations
 
+from operator import ge, le
 from typing import Any
 
 import numpy as np
@@ -31,17 +32,16 @@ class ActionGuard:
             largest = float(np.finfo(self._dtype).max)
             low, high = np.maximum(low, -largest), np.minimum(high, largest)
         self._low, self._high = low, high
-        self._small_bounds: list[tuple[float, float]] = []
+        self._small_bounds: tuple[list[float], list[float]] | None = None
         if space.size <= SMALL_ACTION:
-            self._small_bounds = list(zip(low.ravel().tolist(), high.ravel().tolist(), strict=True))
+            self._small_bounds = (low.ravel().tolist(), high.ravel().tolist())
 
     def check(self, action: NDArray[Any]) -> None:
         """Raise ActionError unless `action` `[batch, *shape]` is of the space; rounding is clipped in place."""
-        if self._small_bounds and len(action) == 1:
-            for value, (low, high) in zip(action.ravel().tolist(), self._small_bounds, strict=True):
-                if not low <= value <= high:  # so written, it holds for not-a-number too
-                    break
-            else:
+        if self._small_bounds is not None and len(action) == 1:
+            values = action.ravel().tolist()
+            low, high = self._small_bounds
+            if all(map(le, low, values)) and all(map(ge, high, values)):  # so written, it holds for not-a-number too
                 return
         elif ((action >= self._low) & (action <= self._high)).all():
             return

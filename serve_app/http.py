@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -42,13 +42,14 @@ def create_app(
     *,
     replica: str = "",
     control: Control | None = None,
+    alone: Callable[[], bool] = lambda: True,
 ) -> FastAPI:
     """Return the application; `store_provider` gives None for as long as the policies are being loaded.
 
-    With a `control` what is served can be administered. The application's `state.core` is the core under it.
-    Raises UsageError when the API keys that `settings` name cannot be read.
+    With a `control` what is served can be administered. `replica` and `alone` are the `Core`'s, which is the
+    application's `state.core`. Raises UsageError when the API keys that `settings` name cannot be read.
     """
-    core = Core(store_provider, settings, replica=replica, control=control)
+    core = Core(store_provider, settings, replica=replica, control=control, alone=alone)
     act = Endpoint("json", _Act(core), _check_headers, core)
     infer = oip.endpoint(core)
     app = PolicyApp(
@@ -127,6 +128,8 @@ class _Act:
     def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
         self._core.store()  # not ready comes before any fault of the request
         request = wire.read_request(body)
+        if request.non_finite and request.episode is not None:
+            wire.refuse_non_finite()  # before a session moves on
         params = scope["path_params"]
         try:
             decision = self._core.act(
@@ -138,7 +141,8 @@ class _Act:
                 seed=request.seed,
                 seq=request.seq,
                 deadline_ms=request.deadline_ms,
-                session=request.session or edge.session_of(scope),
+                episode=request.episode,
+                session=edge.session_of(scope),
             )
         except ObservationError as error:
             if request.non_finite:
@@ -146,7 +150,8 @@ class _Act:
             raise
         if request.non_finite:
             wire.refuse_non_finite()
-        return wire.encode_decision(decision, request.seq), JSON_HEADERS, decision
+        clock = None if request.timestamp is None else wire.clock(request.timestamp, received)
+        return wire.encode_decision(decision, request.seq, clock), JSON_HEADERS, decision
 
 
 def _add_act(app: FastAPI, act: ASGIApp) -> None:
@@ -163,7 +168,7 @@ def _add_act(app: FastAPI, act: ASGIApp) -> None:
                 summary=summary,
                 reply=wire.ActReply,
                 body={"application/json": {"schema": wire.ActRequest.model_json_schema()}},
-                responses=edge.error_models(400, 404, 408, 413, 415, 422, 500, 503),
+                responses=edge.error_models(400, 404, 408, 409, 410, 413, 415, 422, 500, 503),
             )
         )
 

@@ -69,7 +69,8 @@ class Memory:
         for name, spec in self._specs.items():
             expected = (rows, *spec.shape) if batch else spec.shape
             try:
-                array = np.asarray(state[name], spec.dtype)
+                with np.errstate(over="ignore"):  # the infinity is refused below
+                    array = np.asarray(state[name], spec.dtype)
             except (ValueError, TypeError, OverflowError) as error:
                 raise RequestError(f"state '{name}' of policy '{self._policy}' cannot be read: {error}") from error
             if array.shape != expected:
@@ -89,8 +90,9 @@ class Memory:
                 f"policy '{self._policy}' was trained to see the reward of its last action: give act(obs, reward=...)"
             )
         try:
-            array = np.asarray(reward, np.float32).reshape(-1)
-        except (ValueError, TypeError) as error:
+            with np.errstate(over="ignore"):
+                array = np.asarray(reward, np.float32).reshape(-1)
+        except (ValueError, TypeError, OverflowError) as error:
             raise RequestError(f"the reward for policy '{self._policy}' cannot be read: {error}") from error
         if len(array) != rows or not np.isfinite(array).all():
             raise RequestError(

@@ -4,13 +4,15 @@ An observation arrives as an array, as nested lists out of JSON, or as a map fro
 batch. `ObservationReader` turns each into `[batch, ...]` of the graph's dtype. Strict where a robot could be hurt:
 shape, dtype, non-finite numbers and names are errors, never guesses. It knows numpy and the contract's space only.
 
-An observation outside the space's bounds is accepted here: RLlib's own pipeline computes an action for it, too.
+What happens to a Box observation outside the space's bounds is the policy's options' affair: RLlib's own pipeline
+computes an action for it, too.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from operator import ge, itemgetter, le
 from typing import Any, NoReturn
 
 import numpy as np
@@ -18,16 +20,27 @@ from numpy.typing import NDArray
 
 from rlservo.export.bundle import BoxSpec, LeafSpec, iter_elements
 from rlservo.export.errors import ObservationError, first_line
+from rlservo.serve_app.options import DEFAULT_OPTIONS, PolicyOptions
 
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
 SMALL = 128  # elements up to which Python's own sum is faster than numpy's isfinite(...).all()
+BOUND_SLACK = 1e-5  # relative to the bound: what rounding to float32 may put outside of it
 LISTED = 8  # names listed in a message before "and N more"
 
 
 class ObservationReader:
     """Reads one array of a policy's observations: the whole of it, or the leaf `name` of a nested one."""
 
-    def __init__(self, policy: str, space: LeafSpec, name: str = "obs") -> None:
+    def __init__(
+        self,
+        policy: str,
+        space: LeafSpec,
+        name: str = "obs",
+        *,
+        options: PolicyOptions = DEFAULT_OPTIONS,
+        notice: Callable[[str], None] | None = None,
+    ) -> None:
+        """`notice` is told, in a sentence, of what is out of bounds and used all the same."""
         self._policy = policy
         self._name = name
         self._space = space
@@ -38,6 +51,9 @@ class ObservationReader:
         self._is_float = self._dtype.kind == "f"
         # Of a choice that does not exist RLlib makes an error or a one-hot of nothing; a Box may be left.
         self._choices = None if isinstance(space, BoxSpec) else space.bounds()
+        self._out_of_bounds = options.out_of_bounds
+        self._notice = notice
+        self._bounded = isinstance(space, BoxSpec) and self._take_bounds(space)
         self._names = tuple(element.name for element in space.elements)
         self.watch: Callable[[NDArray[Any]], None] | None = None  # is shown every array that passed the checks
         self._named = bool(self._names) and len(set(self._names)) == len(self._names)
@@ -65,16 +81,62 @@ class ObservationReader:
             self._refuse_shape(array.shape)
         if array.dtype is not self._dtype and array.dtype != self._dtype:
             array = self._cast(array)
+        values: list[float] | None = array.ravel().tolist() if array.size <= SMALL else None
         if self._is_float:
             # One not-a-number or infinity makes the sum one. A sum that merely overflows is looked at again.
-            total = sum(array.ravel().tolist()) if array.size <= SMALL else math.inf
-            if not math.isfinite(total):
+            if values is None or not math.isfinite(sum(values)):
                 self._check_finite(array)
         elif self._choices is not None:
             self._check_range(array, *self._choices)
         if self.watch is not None:
             self.watch(array)
+        if self._bounded:
+            if values is not None and len(array) == 1:
+                checked = self._pick(values)
+                if all(map(le, self._lows, checked)) and all(map(ge, self._highs, checked)):
+                    return array, batch
+            array = self._keep_bounds(array)
         return array, batch
+
+    def _take_bounds(self, space: BoxSpec) -> bool:
+        """Remember the bounds with their slack; return whether there is anything to check."""
+        low, high = space.bounds()
+        if self._dtype.kind in "iu":  # integers round nothing, and an image's 0..255 is its dtype's own range
+            info = np.iinfo(self._dtype)
+            checked = bool((low > info.min).any() or (high < info.max).any())
+            slack: Any = 0.0
+        else:
+            checked = bool(np.isfinite(low).any() or np.isfinite(high).any())
+            slack = BOUND_SLACK * np.maximum(1.0, np.minimum(np.abs(low), np.abs(high)))
+        self._low, self._high = low, high
+        self._loosest = (low - slack, high + slack)
+        # The elements that have a bound, for the one observation that a control loop sends at a time.
+        bounded = np.flatnonzero(np.isfinite(low.ravel()) | np.isfinite(high.ravel())).tolist()
+        self._lows: list[float] = self._loosest[0].ravel()[bounded].tolist()
+        self._highs: list[float] = self._loosest[1].ravel()[bounded].tolist()
+        # itemgetter of a single index gives no tuple; repeating it does no harm, since map stops at the shortest.
+        self._pick: Callable[[list[float]], Sequence[float]] = itemgetter(*bounded, *bounded[:1]) if bounded else tuple
+        return checked and self._out_of_bounds != "accept"
+
+    def _keep_bounds(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Do with what is outside the bounds as the options say."""
+        outside = np.asarray((array < self._loosest[0]) | (array > self._loosest[1]))
+        if not outside.any():
+            return array
+        label, index = self._first(array, outside)
+        low, high = self._low[index[1:]], self._high[index[1:]]
+        if self._out_of_bounds == "refuse":
+            self._refuse_element(array, outside, f"outside the observation space's [{low:g}, {high:g}]")
+        clips = self._out_of_bounds == "clip"
+        if self._notice is not None:
+            count = int(np.count_nonzero(outside))
+            more = f" and {count - 1} more" if count > 1 else ""
+            of = "" if self._name == "obs" else f" of {self._name}"
+            self._notice(
+                f"element {label}{of}{more} outside the observation space's [{low:g}, {high:g}]"
+                f"{': clipped' if clips else ''}"
+            )
+        return np.clip(array, self._low, self._high).astype(self._dtype) if clips else array
 
     # How each form becomes an array.
 
@@ -189,16 +251,19 @@ class ObservationReader:
 
     def _refuse_element(self, array: NDArray[Any], bad: NDArray[np.bool_], why: str) -> NoReturn:
         """Name the first element of the batch `array` where `bad` is true."""
-        index = tuple(int(i) for i in np.argwhere(bad)[0])
-        flat = int(np.ravel_multi_index(index[1:], self._shape)) if self._shape else 0
-        label = dict(iter_elements(self._space))[flat]
-        if len(array) > 1:
-            label += f" of observation {index[0]}"
+        label, index = self._first(array, bad)
         value = array[index]
         raise ObservationError(
             f"policy '{self._policy}' cannot use {self._name}: element {label} is {value}, {why}",
             {"policy": self._policy, "index": list(index), "value": str(value)},
         )
+
+    def _first(self, array: NDArray[Any], bad: NDArray[np.bool_]) -> tuple[str, tuple[int, ...]]:
+        """Return (what the first bad element is called, where it is in the batch)."""
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        flat = int(np.ravel_multi_index(index[1:], self._shape)) if self._shape else 0
+        label = dict(iter_elements(self._space))[flat]
+        return f"{label} of observation {index[0]}" if len(array) > 1 else label, index
 
     def _refuse(self, why: str) -> NoReturn:
         raise ObservationError(

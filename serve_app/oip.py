@@ -1,7 +1,9 @@
 """The Open Inference Protocol v2 over HTTP, with binary tensors: what Triton's and KServe's clients speak.
 
-A policy is a model with the contract's inputs and one output, `action`; every call is for a batch, as the protocol's
-shapes say. The request parameters `explore`, `seed`, `seq` and `deadline_ms` mean what they mean in the JSON protocol.
+A policy is a model with the contract's inputs (`obs`, or `obs.<path>` for each leaf of a nested space,
+`state_in.<name>` and `reward`) and outputs (`action` or `action.<path>`, `state_out.<name>`); every call is for a
+batch, as the protocol's shapes say. The request parameters `explore`, `seed`, `seq`, `deadline_ms` and `timestamp` mean
+what they mean in the JSON protocol; `sequence_id`, `sequence_start` and `sequence_end` are its sessions.
 It knows HTTP's headers and the protocol's documents; tensors are `tensors.py`'s, decisions the core's.
 
 Specification: github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
@@ -12,6 +14,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -38,16 +41,19 @@ from rlservo.serve_app.edge import (
     session_of,
     too_large,
 )
+from rlservo.serve_app.episodes import Episode
 from rlservo.serve_app.listing import states_of
+from rlservo.serve_app.memory import REWARD
 from rlservo.serve_app.store import Decision
+from rlservo.serve_app.structure import action_leaves, build_action
 from rlservo.serve_app.tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor
 
 INFER_PATTERN = re.compile(r"/v2/models/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/infer")
 LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
 BINARY = b"application/octet-stream"
 PLATFORM = "onnx_onnxv1"
-OUTPUT = "action"
-EXTENSIONS = ("binary_tensor_data", "parameters")
+STATE_IN, STATE_OUT = "state_in.", "state_out."
+EXTENSIONS = ("binary_tensor_data", "parameters", "sequence")
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
 # What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
 PARAMETERS = frozenset({*wire.OPTIONS, "binary_data_output", "sequence_id", "sequence_start", "sequence_end"})
@@ -76,7 +82,9 @@ class InferRequest(BaseModel):
 
     id: str | None = Field(None, description="Echoed.")
     parameters: dict[str, Any] | None = Field(
-        None, description="`explore`, `seed`, `seq`, `deadline_ms`, `binary_data_output`."
+        None,
+        description="`explore`, `seed`, `seq`, `deadline_ms`, `timestamp`, `sequence_id`, `sequence_start`, "
+        "`sequence_end`, `binary_data_output`.",
     )
     inputs: list[Tensor]
     outputs: list[dict[str, Any]] | None = Field(
@@ -152,7 +160,9 @@ class _Infer:
             inputs, non_finite = {contract.inputs[0].name: _raw_input(contract, view)}, False
         else:
             document, inputs, non_finite = _read_request(view, length)
-        decision, seq, binary = decide(
+        if non_finite and (document.get("parameters") or {}).get("sequence_id"):
+            wire.refuse_non_finite()  # before the sequence moves on
+        answer = decide(
             self._core,
             params["name"],
             params.get("version"),
@@ -163,10 +173,20 @@ class _Infer:
         )
         if non_finite:
             wire.refuse_non_finite()
-        content, headers = _encode_reply(decision, document.get("id"), seq, binary=binary)
+        content, headers = _encode_reply(answer, document.get("id"))
         if accepted and len(content) >= SMALLEST_COMPRESSED:
             content, headers = _compress(content, headers, accepted)
-        return content, headers, decision
+        return content, headers, answer.decision
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a request of either transport comes to."""
+
+    decision: Decision
+    parameters: dict[str, Any]
+    outputs: dict[str, NDArray[Any]]  # in the order they were asked for
+    binary: dict[str, bool]  # the same names: as bytes, or in the JSON
 
 
 def decide(
@@ -174,22 +194,23 @@ def decide(
     name: str,
     version: str | None,
     document: Mapping[str, Any],
-    inputs: Mapping[str, NDArray[Any]],
+    inputs: dict[str, NDArray[Any]],
     *,
     received: float,
     deadline_ms: float | None = None,
     session: str | None = None,
-) -> tuple[Decision, int | None, bool]:
-    """Return (decision, seq, whether the output is to be binary) for a request of either transport.
-
-    Of the JSON `document`, `parameters` and `outputs` are read; `deadline_ms` is the transport's own.
-    """
+) -> Answer:
+    """Answer a request, whose `parameters` and `outputs` are in `document`; `deadline_ms` is the transport's own."""
     parameters = document.get("parameters") or {}
     explore, seed, seq, wanted_ms = _options(parameters) if parameters else (False, None, None, None)
     if wanted_ms is not None:
         deadline_ms = wanted_ms if deadline_ms is None else min(wanted_ms, deadline_ms)
-    binary = _wants_binary(document, parameters)
-    obs = _observation(core.store().get(name, version).contract, inputs)
+    timestamp = wire.read_timestamp(parameters) if parameters else None
+    sequence = parameters.get("sequence_id")
+    contract = core.contract(name, version, _session_id(sequence) if sequence else None)
+    binary = _wanted_outputs(contract, document, parameters)
+    obs = _observation(contract, inputs)
+    episode = _episode(contract, inputs, parameters) if parameters or len(inputs) > 1 else None
     decision = core.act(
         name,
         version,
@@ -199,26 +220,52 @@ def decide(
         seed=seed,
         seq=seq,
         deadline_ms=deadline_ms,
+        episode=episode,
         session=session,
     )
-    return decision, seq, binary
-
-
-def _encode_reply(
-    decision: Decision, request_id: str | None, seq: int | None, *, binary: bool
-) -> tuple[bytes, Headers]:
-    tensor, raw = write_tensor(OUTPUT, decision.action, binary=binary)
-    parameters: dict[str, Any] = {"infer_ms": round(decision.infer_ms, 4)}
+    said: dict[str, Any] = {"infer_ms": round(decision.infer_ms, 4)}
     if seq is not None:
-        parameters["seq"] = seq
-    reply: dict[str, Any] = {"model_name": decision.name, "model_version": decision.version, "parameters": parameters}
+        said["seq"] = seq
+    if decision.notices:
+        said["warnings"] = "; ".join(decision.notices)
+    if decision.episode is not None:
+        told = wire.describe_episode(decision.episode)
+        if "session_id" in told:
+            told["sequence_id"] = parameters["sequence_id"]
+            del told["session_id"]
+        said.update(told)
+    if timestamp is not None:
+        said.update(wire.clock(timestamp, received))
+    outputs = _outputs(contract, decision)
+    if not binary:  # everything there is
+        binary = dict.fromkeys(outputs, bool(flag(parameters, "binary_data_output")))
+    return Answer(decision, said, {name: outputs[name] for name in binary}, binary)
+
+
+def _encode_reply(answer: Answer, request_id: str | None) -> tuple[bytes, Headers]:
+    decision = answer.decision
+    reply: dict[str, Any] = {
+        "model_name": decision.name,
+        "model_version": decision.version,
+        "parameters": answer.parameters,
+    }
     if request_id is not None:
         reply["id"] = request_id
-    reply["outputs"] = [tensor]
+    written = [write_tensor(name, array, binary=answer.binary[name]) for name, array in answer.outputs.items()]
+    reply["outputs"] = [tensor for tensor, _ in written]
     content = orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
-    if not binary:
+    if not any(answer.binary.values()):
         return content, JSON_HEADERS
+    raw = b"".join(part for _, part in written)
     return content + raw, ((b"content-type", BINARY), (LENGTH_HEADER, b"%d" % len(content)))
+
+
+def _outputs(contract: Contract, decision: Decision) -> dict[str, NDArray[Any]]:
+    """Return everything the model can answer with, by tensor name."""
+    outputs: dict[str, NDArray[Any]] = action_leaves(contract.action_space, decision.action)
+    if decision.episode is not None and decision.episode.state is not None:
+        outputs.update({STATE_OUT + name: leaf for name, leaf in decision.episode.state.items()})
+    return outputs
 
 
 def _read_request(view: memoryview, length: int | None) -> tuple[dict[str, Any], dict[str, NDArray[Any]], bool]:
@@ -264,21 +311,52 @@ def _raw_input(contract: Contract, view: memoryview) -> NDArray[Any]:
     return from_bytes(view, (len(view) // row, *tensor.shape[1:]), dtype)
 
 
-def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return the policy's observation batch out of the named inputs."""
-    expected = contract.inputs[0]
-    unknown = sorted(inputs.keys() - {expected.name})
-    if unknown or expected.name not in inputs:
-        wrong = f"has no input '{unknown[0][:64]}'" if unknown else "did not get it"
-        raise ObservationError(f"policy '{contract.name}' has the input '{expected.name}' and {wrong}")
-    array = inputs[expected.name]
-    if array.shape[1:] != expected.shape[1:] or array.ndim != len(expected.shape):
+def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
+    """Return the policy's observation batch out of the named inputs, whose names and shapes are checked."""
+    known = [tensor.name for tensor in contract.inputs]
+    unknown = next((name for name in inputs if name not in known), None)
+    if unknown is not None:
         raise ObservationError(
-            f"policy '{contract.name}' expects input '{expected.name}' of shape {list(expected.shape)} "
-            f"(-1 is the batch), got {list(array.shape)}",
-            {"policy": contract.name, "expected_shape": list(expected.shape), "shape": list(array.shape)},
+            f"policy '{contract.name}' has the input {quoted(known)} and has no input '{unknown[:64]}'"
         )
-    return array
+    rows: dict[str, int] = {}
+    for expected in contract.inputs:
+        array = inputs.get(expected.name)
+        if array is None:
+            if expected.name == REWARD or expected.name.startswith(STATE_IN):
+                continue
+            raise ObservationError(f"policy '{contract.name}' has the input '{expected.name}' and did not get it")
+        if array.shape[1:] != expected.shape[1:] or array.ndim != len(expected.shape):
+            raise ObservationError(
+                f"policy '{contract.name}' expects input '{expected.name}' of shape {list(expected.shape)} "
+                f"(-1 is the batch), got {list(array.shape)}",
+                {"policy": contract.name, "expected_shape": list(expected.shape), "shape": list(array.shape)},
+            )
+        rows[expected.name] = len(array)
+    if len(set(rows.values())) > 1:
+        told = ", ".join(f"{name} {count}" for name, count in rows.items())
+        raise ObservationError(f"the inputs of policy '{contract.name}' are not of one batch: {told}")
+    return build_action(contract.observation_space, inputs, "obs")
+
+
+def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Episode | None:
+    """Return what the inputs and parameters say of the episode. Raises RequestError."""
+    states = {name.removeprefix(STATE_IN): array for name, array in inputs.items() if name.startswith(STATE_IN)}
+    reward = inputs.get(REWARD)
+    start, end = bool(flag(parameters, "sequence_start")), bool(flag(parameters, "sequence_end"))
+    sequence_id = parameters.get("sequence_id")
+    if sequence_id in (None, 0, ""):
+        if start and not states and contract.state:  # a single step, for whoever carries the state from there
+            return Episode(state={}, reward=reward)
+        return Episode(state=states or None, reward=reward) if states or reward is not None else None
+    return Episode(state=states or None, session_id=_session_id(sequence_id), reset=start, end=end, reward=reward)
+
+
+def _session_id(sequence_id: Any) -> str:
+    """Return a sequence's id as a session's; an integer and a string of its digits are two. Raises RequestError."""
+    if type(sequence_id) not in (int, str) or len(str(sequence_id)) >= wire.LONGEST_SESSION_ID:
+        raise RequestError("'sequence_id' must be an integer, or a string of fewer than 128 characters")
+    return f"#{sequence_id}" if type(sequence_id) is int else str(sequence_id)
 
 
 def _options(parameters: Mapping[str, Any]) -> tuple[bool, int | None, int | None, float | None]:
@@ -289,8 +367,6 @@ def _options(parameters: Mapping[str, Any]) -> tuple[bool, int | None, int | Non
                 f"unknown parameter '{name[:64]}': known are {', '.join(sorted(PARAMETERS | IGNORED))}",
                 {"known": sorted(PARAMETERS | IGNORED)},
             )
-    if parameters.get("sequence_id") not in (None, 0, ""):
-        raise RequestError("'sequence_id' is for recurrent policies; this one keeps no state: leave it out")
     explore, seed, seq, deadline_ms = wire.read_options(parameters)
     timeout_us = wire.read_integer(parameters, TIMEOUT)
     if deadline_ms is None and timeout_us:
@@ -298,18 +374,27 @@ def _options(parameters: Mapping[str, Any]) -> tuple[bool, int | None, int | Non
     return explore, seed, seq, deadline_ms
 
 
-def _wants_binary(document: Mapping[str, Any], parameters: Mapping[str, Any]) -> bool:
-    """Whether the one output is to be binary. Raises RequestError for outputs that do not exist."""
-    binary = flag(parameters, "binary_data_output") if parameters else None
+def _wanted_outputs(contract: Contract, document: Mapping[str, Any], parameters: Mapping[str, Any]) -> dict[str, bool]:
+    """Return the outputs that were asked for, and whether as bytes; none asked for means all.
+
+    Raises RequestError for outputs that do not exist.
+    """
+    binary = bool(flag(parameters, "binary_data_output")) if parameters else False
     outputs = document.get("outputs")
     if not outputs:
-        return bool(binary)
+        return {}
     if type(outputs) is not list:
         raise RequestError(f"'outputs' must be a list of {{\"name\": ...}}, got {wire.json_type(outputs)}")
+    known = output_names(contract)
+    wanted: dict[str, bool] = {}
     for output in outputs:
-        if type(output) is not dict or output.get("name") != OUTPUT:
+        name = output.get("name") if type(output) is dict else None
+        if type(name) is not str or name not in known:
             given = wire.json_type(output.get("name") if type(output) is dict else output)
-            raise RequestError(f"an output {given} does not exist: the model's output is '{OUTPUT}'")
+            shown = f" '{name[:64]}'" if type(name) is str else f" {given}"
+            raise RequestError(f"an output{shown} does not exist: the model's output is {quoted(known)}")
+        if name.startswith(STATE_OUT) and parameters.get("sequence_id"):
+            raise RequestError(f"the output '{name}' stays with the sequence: ask for the action, or carry the state")
         own = output.get("parameters") or {}
         if type(own) is not dict:
             raise RequestError(f"an output's 'parameters' must be an object, got {wire.json_type(own)}")
@@ -317,8 +402,21 @@ def _wants_binary(document: Mapping[str, Any], parameters: Mapping[str, Any]) ->
         if refused is not None:
             raise RequestError(f"the output parameter '{refused}' is not offered: leave it out")
         chosen = flag(own, "binary_data")
-        binary = binary if chosen is None else chosen
-    return bool(binary)
+        wanted[name] = binary if chosen is None else chosen
+    return wanted
+
+
+def quoted(names: list[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)
+
+
+def output_names(contract: Contract) -> list[str]:
+    """Return the outputs this protocol offers: actions and states, not the network's inner values."""
+    return [
+        tensor.name
+        for tensor in contract.outputs
+        if tensor.name == "action" or tensor.name.startswith(("action.", STATE_OUT))
+    ]
 
 
 # Bytes: lengths and compression.
@@ -394,7 +492,7 @@ def add_routes(app: FastAPI, core: Core, infer: Endpoint) -> None:
                     "application/json": {"schema": _request_schema()},
                     "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
                 },
-                responses=error_models(400, 404, 408, 413, 415, 422, 500, 503),
+                responses=error_models(400, 404, 408, 409, 410, 413, 415, 422, 500, 503),
             )
         )
 
@@ -498,7 +596,7 @@ def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]
         "versions": versions,
         "platform": PLATFORM,
         "inputs": [described(tensor) for tensor in contract.inputs],
-        "outputs": [described(tensor) for tensor in contract.outputs if tensor.name == OUTPUT],
+        "outputs": [described(tensor) for tensor in contract.outputs if tensor.name in output_names(contract)],
     }
 
 

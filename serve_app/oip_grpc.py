@@ -34,7 +34,6 @@ from rlservo.serve_app import oip_messages as messages
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import BUG, RETRY_AFTER_S, status_of
 from rlservo.serve_app.grpc_ingress import Incoming
-from rlservo.serve_app.store import Decision
 from rlservo.serve_app.tensors import DTYPES, MAX_AXES, datatype_of, from_bytes
 
 logger = logging.getLogger(__name__)
@@ -215,7 +214,7 @@ class Grpc:
                     {"name": output.name, "parameters": _parameters(output.parameters)} for output in asked.outputs
                 ],
             }
-            decision, seq, _ = oip.decide(
+            answer = oip.decide(
                 self._core,
                 name,
                 version,
@@ -231,7 +230,8 @@ class Grpc:
         except Exception:
             self._core.metrics.failed(PROTOCOL, "", "", "internal")
             raise
-        reply = _reply(decision, asked.id, seq, raw=bool(asked.raw_input_contents))
+        decision = answer.decision
+        reply = _reply(answer, asked.id, raw=bool(asked.raw_input_contents))
         taken, batch = time.perf_counter() - received, decision.batch or 1
         self._core.metrics.answered(PROTOCOL, decision, batch, taken)
         if self._core.log.every:
@@ -241,20 +241,33 @@ class Grpc:
         return reply
 
 
-def _reply(decision: Decision, request_id: str, seq: int | None, *, raw: bool) -> Any:
-    action = np.ascontiguousarray(decision.action)
-    datatype = datatype_of(action.dtype.name)
+def _reply(answer: oip.Answer, request_id: str, *, raw: bool) -> Any:
+    decision = answer.decision
     reply = messages.ModelInferResponse(model_name=decision.name, model_version=decision.version, id=request_id)
-    reply.parameters["infer_ms"].double_param = round(decision.infer_ms, 4)
-    if seq is not None:
-        reply.parameters["seq"].int64_param = seq
-    output = reply.outputs.add(name=oip.OUTPUT, datatype=datatype, shape=action.shape)
-    field = FIELDS.get(datatype)
-    if raw or field is None:
-        reply.raw_output_contents.append(action.astype(DTYPES[datatype], copy=False).tobytes())
-    else:
-        getattr(output.contents, field).extend(action.ravel().tolist())
+    for name, value in answer.parameters.items():
+        _set(reply.parameters[name], value)
+    arrays = {name: np.ascontiguousarray(array) for name, array in answer.outputs.items()}
+    datatypes = {name: datatype_of(array.dtype.name) for name, array in arrays.items()}
+    # A reply is bytes altogether or typed fields altogether, and not every type has a field.
+    raw = raw or any(datatype not in FIELDS for datatype in datatypes.values())
+    for name, array in arrays.items():
+        output = reply.outputs.add(name=name, datatype=datatypes[name], shape=array.shape)
+        if raw:
+            reply.raw_output_contents.append(array.astype(DTYPES[datatypes[name]], copy=False).tobytes())
+        else:
+            getattr(output.contents, FIELDS[datatypes[name]]).extend(array.ravel().tolist())
     return reply
+
+
+def _set(parameter: Any, value: Any) -> None:
+    if isinstance(value, bool):
+        parameter.bool_param = value
+    elif isinstance(value, int):
+        setattr(parameter, "int64_param" if value < 2**63 else "uint64_param", value)
+    elif isinstance(value, float):
+        parameter.double_param = value
+    else:
+        parameter.string_param = str(value)
 
 
 def _inputs(asked: Any) -> dict[str, NDArray[Any]]:

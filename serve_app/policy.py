@@ -7,7 +7,10 @@ nothing of the web, ray, torch or gymnasium. The server is a thin edge over it (
 from __future__ import annotations
 
 import logging
+import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -46,9 +49,11 @@ from rlservo.serve_app.acting import Observation
 from rlservo.serve_app.drift import Drift
 from rlservo.serve_app.exploring import distribution_size, sample_leaves
 from rlservo.serve_app.guard import ActionGuard
+from rlservo.serve_app.limits import StepLimit
 from rlservo.serve_app.memory import REWARD, Memory, State
 from rlservo.serve_app.observation import ObservationReader
-from rlservo.serve_app.structure import StructureReader, build_action
+from rlservo.serve_app.options import DEFAULT_OPTIONS, PolicyOptions
+from rlservo.serve_app.structure import StructureReader, action_leaves, build_action
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -59,6 +64,7 @@ GOLDEN_RTOL = (
     1e-4  # machines differ in the last bits of exp and in the order of sums; a wrong graph differs in the first
 )
 GOLDEN_ATOL = 1e-5  # the same for actions near zero
+NOTICE_EVERY_S = 60.0  # an observation out of bounds comes a hundred times a second, and is worth a line a minute
 
 # onnxruntime's names of the types a policy's tensors have.
 ONNX_TYPES = {
@@ -67,6 +73,20 @@ ONNX_TYPES = {
 }  # fmt: skip
 
 _Run = Callable[[list[str], dict[str, NDArray[Any]]], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What one step of an episode came to."""
+
+    action: Any
+    """In the action space's own form, a batch with its axis on every leaf."""
+    leaves: dict[str, NDArray[Any]]
+    """The action by tensor name, `[batch, *shape]`."""
+    state: State
+    """What the next step needs, `[batch, *shape]`; empty for a stateless policy."""
+    batch: int | None
+    """How many observations there were; None for one that came alone."""
 
 
 class Policy:
@@ -78,22 +98,38 @@ class Policy:
     ```
     """
 
-    def __init__(self, bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
+    def __init__(
+        self, bundle: Bundle, session: onnxruntime.InferenceSession, options: PolicyOptions = DEFAULT_OPTIONS
+    ) -> None:
         """Wrap a session whose graph fits `bundle.contract`; use `Policy.load`."""
         contract = bundle.contract
         self._bundle = bundle
         self._contract = contract
         self._run: _Run = session.run
         self._rng = np.random.default_rng()
-        self._reader = StructureReader(contract.name, contract.observation_space)
+        self.options = options
+        self.notices: deque[str] = deque(maxlen=16)
+        """What was out of bounds or beyond a limit and used all the same, for who answers to a client."""
+        self._unlogged = 0
+        self._logged_at = -NOTICE_EVERY_S
+        self._reader = StructureReader(
+            contract.name, contract.observation_space, options=options, notice=self._take_notice
+        )
         actions = leaf_specs(contract.action_space, "action")
         self._guards = {name: ActionGuard(contract.name, name, leaf) for name, leaf in actions.items()}
         self._memory = Memory(contract)
+        self._limit = StepLimit(contract.name, actions, options)
         self._state: State | None = None
+        self._last: dict[str, NDArray[Any]] | None = None
+        self.limited = bool(self._limit)
+        self.episodic = bool(contract.state) or self.limited
+        """Whether an action depends on what came before: on a state, or by a limit on the last action."""
         # Most policies read one array and give one: those few microseconds are what a control loop asks for.
         observations = leaf_specs(contract.observation_space, "obs")
-        self._simple = len(observations) == len(actions) == 1 and len(contract.inputs) == 1
-        self._leaf_reader = ObservationReader(contract.name, next(iter(observations.values())))
+        self._simple = len(observations) == len(actions) == len(contract.inputs) == 1 and not self.episodic
+        self._leaf_reader = ObservationReader(
+            contract.name, next(iter(observations.values())), options=options, notice=self._take_notice
+        )
         self.drift = Drift.of(contract)
         if self.drift is not None:
             self._leaf_reader.watch = self.drift.see
@@ -104,13 +140,22 @@ class Policy:
         self._dist_only = ["action_dist_inputs"]
 
     @classmethod
-    def load(cls, path: str | Path, *, threads: int = 1, check_golden: bool = True) -> Self:
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        threads: int = 1,
+        check_golden: bool = True,
+        options: PolicyOptions = DEFAULT_OPTIONS,
+    ) -> Self:
         """Load the bundle at `path` (a bundle, a policy folder or a repository with one policy).
 
         Checks hashes, the graph against the contract and, unless `check_golden` is off, that this machine reproduces
         the golden vectors. `threads` is onnxruntime's intra-op thread count; one is fastest for networks of this size.
 
-        Raises BundleError, BundleTamperedError or GoldenMismatchError.
+        `options` say how strict it is at its edges.
+
+        Raises BundleError, BundleTamperedError or GoldenMismatchError, and UsageError where the options do not fit.
         """
         if threads < 1:
             raise UsageError(f"threads must be 1 or more, got {threads}")
@@ -121,7 +166,7 @@ class Policy:
         _check_copy(bundle, session)
         if check_golden:
             check_golden_vectors(bundle, session.run)
-        return cls(bundle, session)
+        return cls(bundle, session, options)
 
     @property
     def contract(self) -> Contract:
@@ -170,18 +215,56 @@ class Policy:
         `state` is what this method returned for the step before, by state name, with a batch axis where `obs` has one;
         None begins an episode. Raises RequestError when it does not fit the contract, and what `act` raises.
         """
+        step = self.step(obs, state=state, explore=explore, seed=seed, reward=reward)
+        if step.batch is not None:
+            return step.action, step.state
+        return step.action, {name: leaf[0, ...] for name, leaf in step.state.items()}
+
+    def step(
+        self,
+        obs: Observation,
+        *,
+        before: State | None = None,
+        state: Mapping[str, ArrayLike] | None = None,
+        last: Mapping[str, NDArray[Any]] | None = None,
+        last_action: Any = None,
+        explore: bool = False,
+        seed: int | None = None,
+        reward: ArrayLike | None = None,
+    ) -> Step:
+        """Decide one step of an episode and remember nothing.
+
+        `before` and `last` are an earlier step's `state` and `leaves`; `state` and `last_action` the same as a caller
+        sends them, which is checked. None of a pair begins an episode. Raises RequestError when they do not fit, and
+        what `act` raises.
+        """
         feed, batch = self._reader.read(obs)
         rows = len(next(iter(feed.values())))
-        before = None if state is None else self._memory.read(state, rows, batch=batch)
+        known = next((len(leaf) for leaf in (*(before or {}).values(), *(last or {}).values())), rows)
+        if known != rows:
+            raise RequestError(
+                f"policy '{self._contract.name}' remembers {known} episode{'s' if known > 1 else ''} and got {rows} "
+                f"observation{'s' if rows > 1 else ''}: reset to begin others"
+            )
+        if state is not None:
+            before = self._memory.read(state, rows, batch=batch)
+        if last_action is not None:
+            given = action_leaves(self._contract.action_space, last_action, "action")
+            last = self._limit.read(given, rows, batch=batch)
         action, after = self._decide(feed, rows, before, explore, seed, reward)
-        if batch:
-            return build_action(self._contract.action_space, action), after
-        one = {name: leaf[0, ...] for name, leaf in action.items()}
-        return build_action(self._contract.action_space, one), {name: leaf[0, ...] for name, leaf in after.items()}
+        if self._limit and last is not None:
+            action, limited = self._limit.apply(action, last)
+            for sentence in limited:
+                self._take_notice(sentence)
+            for name, guard in self._guards.items():
+                guard.check(action[name])
+        space = self._contract.action_space
+        own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
+        return Step(build_action(space, own), action, after, rows if batch else None)
 
     def reset(self) -> None:
         """Start an episode: a recurrent policy forgets. Nothing to do for a stateless one."""
-        self._state = None
+        self._state = self._last = None
 
     def close(self) -> None:
         """Drop the session; `act` raises UsageError from now on."""
@@ -196,19 +279,18 @@ class Policy:
         self.close()
 
     def _act_on(self, obs: Observation, explore: bool, seed: int | None, reward: ArrayLike | None) -> Any:
-        feed, batch = self._reader.read(obs)
-        rows = len(next(iter(feed.values())))
-        known = rows if self._state is None else len(next(iter(self._state.values())))
-        if known != rows:
-            raise RequestError(
-                f"policy '{self._contract.name}' remembers {known} episode{'s' if known > 1 else ''} and got {rows} "
-                f"observation{'s' if rows > 1 else ''}: call reset() to begin others"
-            )
-        action, after = self._decide(feed, rows, self._state, explore, seed, reward)
-        self._state = after or None
-        if not batch:
-            action = {name: leaf[0, ...] for name, leaf in action.items()}
-        return build_action(self._contract.action_space, action)
+        step = self.step(obs, before=self._state, last=self._last, explore=explore, seed=seed, reward=reward)
+        self._state = step.state or None
+        self._last = step.leaves if self._limit else None
+        return step.action
+
+    def _take_notice(self, sentence: str) -> None:
+        self.notices.append(sentence)
+        self._unlogged += 1
+        now = time.monotonic()
+        if now - self._logged_at >= NOTICE_EVERY_S:
+            logger.warning("policy '%s': %s (%d times)", self._contract.name, sentence, self._unlogged)
+            self._unlogged, self._logged_at = 0, now
 
     def _decide(
         self,

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from typing_extensions import Self
 
 from rlservo.export.errors import UsageError
+from rlservo.serve_app.options import PolicyOptions
 
 PREFIX = "RLSERVO_"
 
@@ -76,6 +78,14 @@ class ServerSettings(BaseModel):
 
     log_values: bool = False
     """Log the sentences of errors, which may name values of observations."""
+    max_sessions: int = Field(1024, ge=1)
+    """Sessions one replica remembers at once; a further one is answered 503."""
+
+    session_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
+    """[s] A session that nobody asks anything for so long is forgotten; a stream's lives as long as the stream."""
+
+    policy_options: dict[str, PolicyOptions] = {}
+    """How strict each policy is at its edges, by policy name; '*' is for the others. As a variable: a JSON object."""
 
     docs: bool = True
     """Serve the interactive API documentation at /docs, from files that come with the server."""
@@ -85,6 +95,11 @@ class ServerSettings(BaseModel):
     def _absolute(cls, value: str | None) -> str | None:
         """A replica's working directory is not the caller's."""
         return None if value is None else str(Path(value).expanduser().absolute())
+
+    @field_validator("policy_options", mode="before")
+    @classmethod
+    def _parse(cls, value: Any) -> Any:
+        return json.loads(value) if isinstance(value, str) else value
 
     @classmethod
     def from_environment(

@@ -44,7 +44,13 @@ class Shadows:
         self._series: dict[tuple[str, str, str], _Series] = {}
 
     def offer(self, shadow: Shadow, obs: Any, decision: Decision) -> None:
-        """Have the candidate compute on `obs` some time later. Never waits."""
+        """Have the candidate compute on `obs` some time later. Never waits.
+
+        One that remembers its episode is left out: it would need a memory of its own beside every caller's.
+        """
+        if shadow.policy.episodic:
+            self._of(shadow, decision).left_out += 1
+            return
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="shadow", daemon=True)
             self._thread.start()

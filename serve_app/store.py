@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.bundle import find_bundles, version_key
+from rlservo.export.bundle import DictSpec, SpaceSpec, TupleSpec, find_bundles, read_contract, version_key
 from rlservo.export.errors import (
     BundleError,
     RequestError,
@@ -24,11 +24,21 @@ from rlservo.export.errors import (
     UsageError,
 )
 from rlservo.serve_app.acting import Observation
+from rlservo.serve_app.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.plan import PolicyPlan
 from rlservo.serve_app.policy import Policy
 
 
 @dataclass(frozen=True, slots=True)
+class EpisodeNote:
+    """What a reply says of its episode."""
+
+    state: Mapping[str, Any] | None = None  # for the client to carry: arrays by state name
+    session_id: str | None = None
+    step: int | None = None  # how many actions this session or stream has given since its episode began
+
+
+@dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
 class Decision:
     """An action, and who decided it how fast."""
 
@@ -38,6 +48,8 @@ class Decision:
     version: str
     infer_ms: float  # [ms] checking the observation, the network, checking the action
     batch: int | None = None  # how many observations there were; None for one that came alone
+    notices: tuple[str, ...] = ()  # what was out of bounds or limited, and used all the same
+    episode: EpisodeNote | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +101,16 @@ class PolicyStore:
             self._arrange(name, versions, (plans or {}).get(name) or PolicyPlan(versions=dict.fromkeys(versions, "")))
 
     @classmethod
-    def load(cls, paths: Iterable[str | Path], *, threads: int = 1) -> PolicyStore:
+    def load(
+        cls,
+        paths: Iterable[str | Path],
+        *,
+        threads: int = 1,
+        options: Mapping[str, PolicyOptions] | None = None,
+    ) -> PolicyStore:
         """Load every bundle at or below `paths` (bundles, policy folders, repositories).
+
+        `options` are by policy name; '*' is for those not named.
 
         Hashes, graphs and golden vectors are checked. A server with some of its policies would be found out by a
         robot, so one bad bundle refuses the start: raises BundleError that lists every bad one, or UsageError.
@@ -105,7 +125,7 @@ class PolicyStore:
         policies: list[Policy] = []
         for folder in folders.values():
             try:
-                policies.append(Policy.load(folder, threads=threads))
+                policies.append(_load(folder, threads, options or {}))
             except BundleError as error:
                 failures.append(error)
         if len(failures) == 1:
@@ -186,17 +206,16 @@ class PolicyStore:
         Raises UnknownPolicyError, UnknownVersionError and what `Policy.act` raises.
         """
         policy = self.choose(name, version, session)
-        if policy.contract.state:  # its memory belongs to one episode, and a server has many callers
-            raise RequestError(
-                f"policy '{name}' remembers its episode (state {', '.join(s.name for s in policy.contract.state)}), "
-                "which this server does not keep yet: use Policy.load in process"
-            )
+        if policy.episodic:  # its memory belongs to one episode, and a server has many callers
+            raise RequestError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}")
+        if policy.notices:
+            policy.notices.clear()
         started = time.perf_counter()
         action = policy.act(obs, explore=explore, seed=seed)
         infer_ms = (time.perf_counter() - started) * 1e3
         contract = policy.contract
-        batch = len(action) if action.ndim > len(contract.action_space.shape) else None
-        return Decision(action, name, contract.version, infer_ms, batch)
+        notices = take_notices(policy) if policy.notices else ()
+        return Decision(action, name, contract.version, infer_ms, batch_of(action, contract.action_space), notices)
 
     def close(self) -> None:
         """Close every policy."""
@@ -210,7 +229,7 @@ class PolicyStore:
         self._default[name] = default
         canary = plan.canary and versions.get(plan.version_of(plan.canary.version) or "")
         if canary and plan.canary:
-            self._canary[name] = _Canary(canary, plan.canary.share, bool(canary.contract.state))
+            self._canary[name] = _Canary(canary, plan.canary.share, canary.episodic)
         shadow = versions.get((plan.shadow and plan.version_of(plan.shadow)) or "")
         if shadow is not None and shadow is not default:
             self._shadow[name] = Shadow(default.contract.version, shadow.contract.version, shadow)
@@ -231,3 +250,31 @@ def _draw(name: str, session: str | None, needs_session: bool) -> float:
         return 1.0 if needs_session else random.random()
     digest = hashlib.blake2b(f"{name}/{session}".encode("utf-8", "surrogatepass"), digest_size=8).digest()
     return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
+
+
+NEEDS_STATE = (
+    "remembers its episode: send 'state' ({} begins one, then what the last reply gave), or a 'session_id' with 'reset'"
+)
+NEEDS_LAST = "has a limit on the step from one action to the next: send 'last_action', or a 'session_id' with 'reset'"
+
+
+def batch_of(action: Any, space: SpaceSpec) -> int | None:
+    """Return how many actions a batch holds; None for a single one. The first leaf tells."""
+    while isinstance(space, DictSpec | TupleSpec):
+        key: Any = next(iter(space.spaces)) if isinstance(space, DictSpec) else 0
+        action, space = action[key], space.spaces[key]
+    return len(action) if action.ndim > len(space.shape) else None
+
+
+def take_notices(policy: Policy) -> tuple[str, ...]:
+    """Return what the policy noticed since it was last asked."""
+    taken = tuple(policy.notices)
+    policy.notices.clear()
+    return taken
+
+
+def _load(folder: Path, threads: int, options: Mapping[str, PolicyOptions]) -> Policy:
+    if not options:
+        return Policy.load(folder, threads=threads)
+    name = read_contract(folder).name
+    return Policy.load(folder, threads=threads, options=options.get(name, options.get("*", DEFAULT_OPTIONS)))

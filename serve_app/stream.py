@@ -3,7 +3,11 @@
 On connecting the server sends one msgpack map, the metadata; then request and response alternate as binary frames. A
 request is `{"obs": ...}` with the JSON protocol's options, or the observation map itself, from element name to value.
 `actions` in the reply is a chunk of one action, `(1, ...)`, as openpi's clients expect; a batch of observations gets
-one chunk each. An error is a text frame with the JSON protocol's error body, then close 1011.
+one chunk each. An error is a text frame with the JSON protocol's error body, then close 1011; a client that connects
+with `?errors=keep` gets the text frame alone, with the request's `seq`, and goes on.
+
+A recurrent policy's memory is the connection's: at its start when the connection opens and after `reset`, gone with the
+connection. A client that would rather carry it sends `state`, as over JSON.
 
 It knows WebSockets as ASGI shows them; decisions are the core's. Source of the protocol:
 github.com/Physical-Intelligence/openpi, websocket_policy_server.py.
@@ -13,6 +17,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import logging
 import re
 import secrets
@@ -23,21 +28,25 @@ from typing import Any
 
 from starlette.types import Message, Receive, Scope, Send
 
-from rlservo.export.bundle import Contract
+from rlservo.export.bundle import Contract, DictSpec
 from rlservo.export.errors import RequestError, RlservoError, TooLargeError, UnknownPolicyError
 from rlservo.serve_app import wire
 from rlservo.serve_app.admission import IdleTimer
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.edge import encode_bug, error_answer, request_id, session_of, status_of
+from rlservo.serve_app.edge import encode_bug, encode_error, error_answer, request_id, session_of, status_of
 from rlservo.serve_app.keys import check_origin
+from rlservo.serve_app.policy import Policy
+from rlservo.serve_app.sessions import Session
+from rlservo.serve_app.store import Decision
 
 logger = logging.getLogger(__name__)
 
 STREAM_PATTERN = re.compile(r"/(?:v1/policies/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/stream)?")
 GOING_AWAY = 1001
 FAILED = 1011  # the close code openpi's server uses for every error
-KNOWN = frozenset({"obs", *wire.OPTIONS, "reset"})
+KEEP = b"errors=keep"
+KNOWN = frozenset({"obs", *wire.OPTIONS, *wire.OF_EPISODE})
 PROTOCOL = "websocket"
 NO_OPTIONS: dict[str, Any] = {}
 DENIAL = "websocket.http.response"  # the ASGI extension that answers an upgrade with an HTTP error
@@ -57,7 +66,9 @@ class Stream:
         try:
             check_origin(scope)
             name, version = self._addressed(scope["path"].removeprefix(scope.get("root_path", "")))
-            contract = self._core.store().get(name, version).contract
+            # All requests of a stream get the same version where a canary runs.
+            label = session_of(scope) or secrets.token_hex(8)
+            policy = self._core.store().choose(name, version, label)
         except RlservoError as error:
             self._core.failed(PROTOCOL, name, version, error.code)
             await refuse(scope, receive, send, error)
@@ -68,9 +79,10 @@ class Stream:
         idle = IdleTimer(self._core.settings.stream_idle_s)
         try:
             with self._core.admission.streaming():
-                await send(_binary(pack(_metadata(contract))))
-                session = session_of(scope) or secrets.token_hex(8)
-                await self._answer(name, version, session, receive, send, idle)
+                await send(_binary(pack(_metadata(policy.contract))))
+                session = Session(policy) if policy.episodic else None
+                keep = KEEP in scope.get("query_string", b"").split(b"&")
+                await self._answer(name, version, label, session, receive, send, idle, keep=keep)
         except asyncio.CancelledError:
             if not idle.expired:
                 raise
@@ -93,7 +105,16 @@ class Stream:
             self._core.metrics.stream(name, -1)
 
     async def _answer(
-        self, name: str, version: str | None, session: str, receive: Receive, send: Send, idle: IdleTimer
+        self,
+        name: str,
+        version: str | None,
+        label: str,
+        session: Session | None,
+        receive: Receive,
+        send: Send,
+        idle: IdleTimer,
+        *,
+        keep: bool,
     ) -> None:
         previous_ms: float | None = None
         while True:
@@ -102,35 +123,66 @@ class Stream:
             idle.touch()
             if message["type"] == "websocket.disconnect":
                 return
-            obs, options = self._read(message)
-            explore, seed, seq, deadline_ms = wire.read_options(options) if options else (False, None, None, None)
-            decision = self._core.act(
-                name,
-                version,
-                obs,
-                received=received,
-                explore=explore,
-                seed=seed,
-                seq=seq,
-                deadline_ms=deadline_ms,
-                session=session,
-            )
-            timing = {"infer_ms": decision.infer_ms}
+            options: Mapping[str, Any] = NO_OPTIONS
+            try:
+                obs, options = self._read(message, session)
+                reply, decision = self._decide(name, version, label, session, obs, options, received)
+            except RlservoError as error:
+                if not keep:
+                    raise
+                self._core.failed(PROTOCOL, name, version, error.code)
+                await send({"type": "websocket.send", "text": _with_seq(error, options.get("seq"))})
+                continue
             if previous_ms is not None:
-                timing["prev_total_ms"] = previous_ms
-            action = decision.action
-            reply: dict[str, Any] = {
-                "actions": action[None, ...] if decision.batch is None else action[:, None, ...],
-                "policy": decision.name,
-                "version": decision.version,
-                "server_timing": timing,
-            }
-            if seq is not None:
-                reply["seq"] = seq
+                reply["server_timing"]["prev_total_ms"] = previous_ms
             await send(_binary(pack(reply)))
             taken = time.perf_counter() - received
             previous_ms = taken * 1e3
             self._core.metrics.answered(PROTOCOL, decision, decision.batch or 1, taken)
+
+    def _decide(
+        self,
+        name: str,
+        version: str | None,
+        label: str,
+        session: Session | None,
+        obs: Any,
+        options: Mapping[str, Any],
+        received: float,
+    ) -> tuple[dict[str, Any], Decision]:
+        """Return (reply, decision) for one request."""
+        explore, seed, seq, deadline_ms = wire.read_options(options) if options else (False, None, None, None)
+        timestamp = wire.read_timestamp(options) if options else None
+        decision = self._core.act(
+            name,
+            version,
+            obs,
+            received=received,
+            explore=explore,
+            seed=seed,
+            seq=seq,
+            deadline_ms=deadline_ms,
+            episode=wire.read_episode(options) if options else None,
+            stream=session,
+            session=label,
+        )
+        reply: dict[str, Any] = {
+            "actions": _chunks(decision.action, batch=decision.batch is not None),
+            "policy": decision.name,
+            "version": decision.version,
+            "server_timing": {"infer_ms": decision.infer_ms},
+        }
+        if seq is not None:
+            reply["seq"] = seq
+        if decision.notices:
+            reply["warnings"] = decision.notices
+        if decision.episode is not None:
+            reply.update(wire.describe_episode(decision.episode))
+            if decision.episode.state is not None:
+                reply["state"] = decision.episode.state
+        if timestamp is not None:
+            reply.update(wire.clock(timestamp, received))
+        return reply, decision
 
     def _addressed(self, path: str) -> tuple[str, str | None]:
         """Return (policy, version) that a path means; `/` is the default policy."""
@@ -149,7 +201,7 @@ class Stream:
             )
         return default, None
 
-    def _read(self, message: Message) -> tuple[Any, Mapping[str, Any]]:
+    def _read(self, message: Message, session: Session | None) -> tuple[Any, Mapping[str, Any]]:
         """Return (observation, options) of one frame."""
         content = message.get("bytes")
         if content is None:
@@ -159,8 +211,11 @@ class Stream:
         document = unpack(content)
         if type(document) is not dict:
             raise RequestError(f"the message must be a map such as {{'obs': ...}}, got {type(document).__name__}")
-        if "obs" not in document:
-            return document, NO_OPTIONS  # element names and values
+        if "obs" not in document:  # element names and values
+            if session is not None and type(document.get("reset")) is bool and not _has(session.policy, "reset"):
+                named = {name: value for name, value in document.items() if name != "reset"}
+                return named, {"reset": document["reset"]}
+            return document, NO_OPTIONS
         if len(document) == 1:
             return document["obs"], NO_OPTIONS
         unknown = sorted(str(key)[:64] for key in document.keys() - KNOWN)
@@ -178,6 +233,29 @@ def _metadata(contract: Contract) -> dict[str, Any]:
         "control_rate_hz": contract.control_rate_hz,
         "contract": contract.model_dump(mode="json"),
     }
+
+
+def _has(policy: Policy, name: str) -> bool:
+    """Whether an observation of the policy has a part or an element of that name."""
+    space = policy.contract.observation_space
+    return name in (space.spaces if isinstance(space, DictSpec) else {element.name for element in space.elements})
+
+
+def _chunks(action: Any, *, batch: bool) -> Any:
+    """Return the action as chunks of one; each leaf of a nested one is a chunk."""
+    if isinstance(action, dict):
+        return {key: _chunks(part, batch=batch) for key, part in action.items()}
+    if isinstance(action, tuple):
+        return [_chunks(part, batch=batch) for part in action]
+    return action[:, None, ...] if batch else action[None, ...]
+
+
+def _with_seq(error: RlservoError, seq: Any) -> str:
+    """Return an error's body, with the number of the request that it answers."""
+    content = encode_error(error)
+    if type(seq) is not int:
+        return content.decode()
+    return wire.encode_json({**json.loads(content), "seq": seq}).decode()
 
 
 async def refuse(scope: Scope, receive: Receive, send: Send, error: RlservoError) -> None:

@@ -14,17 +14,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.bundle import DictSpec, SpaceSpec, TupleSpec, leaf_specs
-from rlservo.export.errors import ObservationError
+from rlservo.export.errors import ObservationError, RequestError
 from rlservo.serve_app.observation import ObservationReader
+from rlservo.serve_app.options import DEFAULT_OPTIONS, PolicyOptions
 
 
 class StructureReader:
     """Reads observations of any space for one policy."""
 
-    def __init__(self, policy: str, space: SpaceSpec) -> None:
+    def __init__(
+        self,
+        policy: str,
+        space: SpaceSpec,
+        *,
+        options: PolicyOptions = DEFAULT_OPTIONS,
+        notice: Callable[[str], None] | None = None,
+    ) -> None:
         self._policy = policy
         self._space = space
-        self._readers = {name: ObservationReader(policy, leaf, name) for name, leaf in leaf_specs(space, "obs").items()}
+        self._readers = {
+            name: ObservationReader(policy, leaf, name, options=options, notice=notice)
+            for name, leaf in leaf_specs(space, "obs").items()
+        }
 
     def watch(self, name: str, see: Callable[[NDArray[Any]], None]) -> None:
         """Show `see` the checked observations of the leaf `name`."""
@@ -97,6 +108,24 @@ def build_action(space: SpaceSpec, leaves: Mapping[str, Any], path: str = "actio
     if isinstance(space, TupleSpec):
         return tuple(build_action(child, leaves, f"{path}.{index}") for index, child in enumerate(space.spaces))
     return leaves[path]
+
+
+def action_leaves(space: SpaceSpec, action: Any, path: str = "action") -> dict[str, Any]:
+    """Return a nested action's leaves by tensor name: `build_action`, undone.
+
+    Raises RequestError where it is not of the space's form.
+    """
+    if isinstance(space, DictSpec):
+        if not isinstance(action, Mapping) or set(action) != set(space.spaces):
+            raise RequestError(f"{path} must be a map with the keys {', '.join(sorted(space.spaces))}")
+        parts = [action_leaves(child, action[key], f"{path}.{key}") for key, child in space.spaces.items()]
+    elif isinstance(space, TupleSpec):
+        if not isinstance(action, list | tuple) or len(action) != len(space.spaces):
+            raise RequestError(f"{path} must be a list of {len(space.spaces)} parts")
+        parts = [action_leaves(child, action[i], f"{path}.{i}") for i, child in enumerate(space.spaces)]
+    else:
+        return {path: action}
+    return {name: leaf for part in parts for name, leaf in part.items()}
 
 
 def _kind(value: Any) -> str:

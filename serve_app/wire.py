@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -17,13 +18,16 @@ import orjson
 from pydantic import BaseModel, ConfigDict, Field
 
 from rlservo.export.errors import ObservationError, RequestError
-from rlservo.serve_app.store import Decision
+from rlservo.serve_app.episodes import Episode
+from rlservo.serve_app.store import Decision, EpisodeNote
 
 MAX_SEED = 2**63 - 1
+LONGEST_SESSION_ID = 128
 LONGEST_LENIENT_BODY = 1 << 20  # a larger body with NaN in it is refused without saying where the NaN is
 OBS = (
     "One observation or a batch (told apart by shape): nested lists as the observation space is shaped, or, where the "
-    "contract names the elements, a map from each name to a number (a batch: to a list of numbers)."
+    "contract names the elements, a map from each name to a number (a batch: to a list of numbers). Dict spaces are "
+    "maps, Tuple spaces lists of their parts."
 )
 
 
@@ -41,9 +45,26 @@ class ActRequest(BaseModel):
         description="Milliseconds left, from when the server receives the request. Work that cannot arrive in time is "
         "not done: 408.",
     )
-    state: Any = Field(None, description="Recurrent state. Refused: the policies this server runs are stateless.")
+    timestamp: float | None = Field(
+        None, description="Your clock [s], echoed together with the server's when it received and answered."
+    )
+    state: dict[str, Any] | None = Field(
+        None,
+        description="A recurrent policy's memory, carried by you: {} begins an episode, then what the last reply gave.",
+    )
     session_id: str | None = Field(
-        None, description="All requests of a session get the same version where a canary runs (or header x-session-id)."
+        None,
+        min_length=1,
+        max_length=LONGEST_SESSION_ID,
+        description="An id of your choice for requests that belong together. Where a canary runs they get the same "
+        "version. A recurrent policy's memory stays with the server under it; its requests are computed one at a "
+        "time, in the order they arrive, and one with the seq of the last gets its answer again.",
+    )
+    reset: bool = Field(False, description="Begin an episode: the first request of a recurrent policy's session.")
+    end: bool = Field(False, description="Forget the session after this request.")
+    reward: Any = Field(None, description="What the last action brought, for policies trained to see it.")
+    last_action: Any = Field(
+        None, description="What the robot was last commanded, where the policy's action is limited in its step."
     )
 
 
@@ -55,6 +76,13 @@ class ActReply(BaseModel):
     version: str
     seq: int | None = Field(None, description="As sent.")
     infer_ms: float = Field(description="Milliseconds spent on checking the observation, the network and the action.")
+    state: dict[str, Any] | None = Field(None, description="For the next request, where you carry the state.")
+    session_id: str | None = Field(None, description="As sent.")
+    session_step: int | None = Field(None, description="Which action of the session's episode this is, from 1.")
+    warnings: list[str] | None = Field(None, description="What was out of bounds or limited, and used all the same.")
+    timestamp: float | None = Field(None, description="As sent.")
+    received_at: float | None = Field(None, description="The server's clock [s since 1970] when the request came.")
+    sent_at: float | None = Field(None, description="The same when the reply was written.")
 
 
 class ErrorReply(BaseModel):
@@ -65,7 +93,7 @@ class ErrorReply(BaseModel):
     details: dict[str, Any] | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen, as `Decision`
 class Act:
     """An act request whose form has been checked; the observation itself is the policy's to judge."""
 
@@ -75,12 +103,13 @@ class Act:
     seq: int | None
     deadline_ms: float | None
     non_finite: bool = False  # the body held NaN or Infinity, which JSON does not have
-    session: str | None = None
+    episode: Episode | None = None
+    timestamp: float | None = None
 
 
 KNOWN = frozenset(ActRequest.model_fields)
-OPTIONS = ("explore", "seed", "seq", "deadline_ms")
-STATEFUL = ("state",)
+OPTIONS = ("explore", "seed", "seq", "deadline_ms", "timestamp")
+OF_EPISODE = frozenset({"state", "session_id", "reset", "end", "reward", "last_action"})
 
 
 def read_request(body: bytes | bytearray) -> Act:
@@ -95,10 +124,7 @@ def read_request(body: bytes | bytearray) -> Act:
     if len(document) == 1 and not non_finite:  # the usual request
         return Act(document["obs"], False, None, None, None)
     _check_fields(document)
-    session = document.get("session_id")
-    if session is not None and type(session) is not str:
-        raise RequestError(f"'session_id' must be a string, got {json_type(session)}")
-    return Act(document["obs"], *read_options(document), non_finite, session)
+    return Act(document["obs"], *read_options(document), non_finite, read_episode(document), read_timestamp(document))
 
 
 def read_json(body: bytes | bytearray | memoryview, *, such_as: str) -> tuple[dict[str, Any], bool]:
@@ -117,8 +143,8 @@ def read_json(body: bytes | bytearray | memoryview, *, such_as: str) -> tuple[di
     return document, non_finite
 
 
-def encode_decision(decision: Decision, seq: int | None) -> bytes:
-    """Return the reply's JSON."""
+def encode_decision(decision: Decision, seq: int | None, clock: Mapping[str, float] | None = None) -> bytes:
+    """Return the reply's JSON; `clock` is what `clock()` gave."""
     action = decision.action
     reply = {
         "action": _plain(action),
@@ -128,7 +154,27 @@ def encode_decision(decision: Decision, seq: int | None) -> bytes:
     }
     if seq is not None:
         reply["seq"] = seq
+    if decision.notices:
+        reply["warnings"] = decision.notices
+    if decision.episode is not None:
+        reply.update(describe_episode(decision.episode))
+        if decision.episode.state is not None:
+            reply["state"] = _plain(decision.episode.state)
+    if clock is not None:
+        reply.update(clock)
     return orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
+
+
+def describe_episode(note: EpisodeNote) -> dict[str, Any]:
+    """Return what a reply says of its session, in every protocol's names."""
+    found = {"session_id": note.session_id, "session_step": note.step}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def clock(timestamp: float, received: float) -> dict[str, float]:
+    """Return the client's timestamp and the server's clock at receiving (`time.perf_counter`) and now."""
+    now = time.time()
+    return {"timestamp": timestamp, "received_at": now - (time.perf_counter() - received), "sent_at": now}
 
 
 def _plain(action: Any) -> Any:
@@ -171,9 +217,6 @@ def _check_fields(document: dict[str, Any]) -> None:
             f"unknown field{'s' if len(unknown) > 1 else ''} {shown}: known are {', '.join(sorted(KNOWN))}",
             {"known": sorted(KNOWN)},
         )
-    for name in STATEFUL:
-        if document.get(name) is not None:
-            raise RequestError(f"'{name}' is for recurrent policies; this one keeps no state: leave it out")
 
 
 def read_options(document: Mapping[str, Any]) -> tuple[bool, int | None, int | None, float | None]:
@@ -185,6 +228,34 @@ def read_options(document: Mapping[str, Any]) -> tuple[bool, int | None, int | N
     if seed is not None and not 0 <= seed <= MAX_SEED:
         raise RequestError(f"'seed' must be in 0..{MAX_SEED}, got {seed}")
     return bool(explore), seed, read_integer(document, "seq"), read_deadline(document)
+
+
+def read_episode(document: Mapping[str, Any]) -> Episode | None:
+    """Return what a request says of its episode; None when it says nothing. Raises RequestError."""
+    if OF_EPISODE.isdisjoint(document):
+        return None
+    found = {name: document[name] for name in OF_EPISODE if document.get(name) is not None}
+    if not found:
+        return None
+    if type(found.get("state", {})) is not dict:
+        raise RequestError(f"'state' must be an object, state names to numbers, got {json_type(found['state'])}")
+    session_id = found.get("session_id", "-")
+    if type(session_id) is not str or not 0 < len(session_id) <= LONGEST_SESSION_ID:
+        raise RequestError(f"'session_id' must be a string of 1 to {LONGEST_SESSION_ID} characters")
+    for name in ("reset", "end"):
+        if type(found.get(name, False)) is not bool:
+            raise RequestError(f"'{name}' must be true or false, got {json_type(found[name])}")
+    return Episode(**found)
+
+
+def read_timestamp(document: Mapping[str, Any]) -> float | None:
+    """Return the optional field `timestamp`. Raises RequestError when it is not a finite number."""
+    value = document.get("timestamp")
+    if value is None:
+        return None
+    if type(value) not in (int, float) or not math.isfinite(value):
+        raise RequestError(f"'timestamp' must be a number of seconds, got {json_type(value)}")
+    return float(value)
 
 
 def read_integer(document: Mapping[str, Any], name: str) -> int | None:
@@ -212,6 +283,8 @@ def json_type(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     names: dict[type, str] = {str: "a string", list: "a list", dict: "an object"}
+    if type(value) not in (int, float, *names):  # msgpack brings other things than JSON
+        return f"a {type(value).__name__}"
     return names.get(type(value)) or f"the number {value!r:.40}"
 
 

@@ -6,9 +6,13 @@ They are written with `onnx.helper` and `rlservo.export.bundle` alone, so that t
 from __future__ import annotations
 
 import contextlib
+import os
+import secrets
+import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import warnings
@@ -275,6 +279,32 @@ def box_policy() -> Callable[..., Path]:
 def discrete_policy() -> Callable[..., Path]:
     """`write_discrete_policy`."""
     return write_discrete_policy
+
+
+RECURRENT = ("lstm_box", "lstm_previous", "act_nested")
+
+
+@pytest.fixture(scope="session")
+def recurrent(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A repository of three LSTM policies, trained for one iteration by RLlib and exported.
+
+    lstm_box: 3 numbers to a Box; lstm_previous: sees its last actions and rewards; act_nested: nested both ways.
+    """
+    from rlservo.export.exporter import export_checkpoint
+
+    scripts = Path(__file__).resolve().parents[1] / "export"
+    root = tmp_path_factory.mktemp("recurrent")
+    folder = Path(tempfile.mkdtemp(prefix="zoo-"))  # a short path: Ray's sockets live below it
+    environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
+    command = [sys.executable, "-W", "ignore", str(scripts / "train_wide_zoo.py"), str(folder), *RECURRENT]
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+        assert done.returncode == 0, done.stderr[-3000:]
+        for name in RECURRENT:
+            export_checkpoint(folder / name, root, name=name, app_dir=scripts / "app", notify=lambda line: None)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return root
 
 
 @contextlib.contextmanager

@@ -134,8 +134,11 @@ def test_exploring_is_repeatable_by_seed(ask: Ask) -> None:
         ({}, 422, "bad-observation", "no 'obs'"),
         ({"obs": OBS, "observation": OBS}, 400, "bad-request", "unknown field 'observation': known are deadline_ms"),
         ({"observation": OBS}, 400, "bad-request", "unknown field 'observation'"),
-        ({"obs": OBS, "state": {}}, 400, "bad-request", "'state' is for recurrent policies"),
-        ({"obs": OBS, "session_id": 7}, 400, "bad-request", "'session_id' must be a string"),
+        ({"obs": OBS, "state": {"h": [0]}}, 400, "bad-request", "does not fit policy 'ur5' (its state: none"),
+        ({"obs": OBS, "state": [0]}, 400, "bad-request", "'state' must be an object, state names to numbers, got a l"),
+        ({"obs": OBS, "session_id": 7}, 400, "bad-request", "'session_id' must be a string of 1 to 128 characters"),
+        ({"obs": OBS, "reset": True}, 400, "bad-request", "'reset' is for a session: send its 'session_id', too"),
+        ({"obs": OBS, "timestamp": "now"}, 400, "bad-request", "'timestamp' must be a number of seconds"),
         ({"obs": OBS, "explore": 1}, 400, "bad-request", "'explore' must be true or false"),
         ({"obs": OBS, "seed": -1}, 400, "bad-request", "'seed' must be in 0"),
         ({"obs": OBS, "seed": True}, 400, "bad-request", "'seed' must be an integer, got true"),
@@ -290,7 +293,8 @@ def test_the_openapi_document_is_valid_3_0_and_describes_every_route(ask: Ask) -
     request = document["paths"]["/v1/policies/{name}/act"]["post"]["requestBody"]["content"]["application/json"][
         "schema"
     ]
-    assert set(request["properties"]) == {"obs", "explore", "seed", "seq", "deadline_ms", "state", "session_id"}
+    of_episode = {"state", "session_id", "reset", "end", "reward", "last_action"}
+    assert set(request["properties"]) == {"obs", "explore", "seed", "seq", "deadline_ms", "timestamp", *of_episode}
 
     def walk(node: Any) -> None:
         if isinstance(node, list):

@@ -1,0 +1,33 @@
+"""What may be chosen about one policy beyond its contract: how strict to be at its edges.
+
+One small model, so that whoever configures policies (the server's settings, a deployment's file) can hold it by name.
+It knows nothing of servers.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Step = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class PolicyOptions(BaseModel):
+    """How one policy treats what lies outside."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    out_of_bounds: Literal["accept", "warn", "clip", "refuse"] = "warn"
+    """An observation outside the space's bounds: use it as it is, use it and say so, use it clipped and say so, or
+    refuse it. RLlib itself accepts; a policy has seldom been trained there."""
+
+    max_action_step: Step | tuple[Step | None, ...] | dict[str, Step | tuple[Step | None, ...]] | None = None
+    """The most by which an action's element may differ from the last action's, in the action's own unit: one number,
+    one per element in row-major order (null: any), or for a nested action a map from `action.<path>` to such."""
+
+    beyond_action_step: Literal["limit", "refuse"] = "limit"
+    """What happens to a larger step: made as large as is allowed, and said so, or refused."""
+
+
+DEFAULT_OPTIONS = PolicyOptions()
