@@ -35,7 +35,7 @@ from speed.catalogue import RLLIB, RLSERVO, Case, case_of, servers
 from speed.machine import REPLICA, pss_mb
 from speed.report import Result, verdicts
 from speed.rounds import Rounds, check_answers
-from speed.servers import Server, running
+from speed.servers import Server, StartError, running
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "bench"
@@ -112,15 +112,23 @@ def measure(
         [one for one in compared if one.name in (RLSERVO, RLLIB)], folder, mark, arguments.starts, console
     )
     with ExitStack() as cleanup:
+        started, missing = [], {}
         for server in compared:
             console.print(f"starting {server.name} ...")
-            cleanup.enter_context(running(server, folder, mark))
-            cold.setdefault(server.name, server.cold_start_s)
-        check_answers(compared, case)
-        samples = Rounds(case, compared, folder, arguments.seconds).run(arguments.rounds, console.print)
-        replica_mb, server_mb = memory(compared)
+            try:
+                cleanup.enter_context(running(server, folder, mark))
+            except StartError as error:
+                if server.name == RLSERVO:
+                    raise SystemExit(str(error)) from None
+                missing[server.name] = str(error)
+            else:
+                cold.setdefault(server.name, server.cold_start_s)
+                started.append(server)
+        check_answers(started, case)
+        samples = Rounds(case, started, folder, arguments.seconds).run(arguments.rounds, console.print)
+        replica_mb, server_mb = memory(started)
         console.print("stopping the servers ...")
-    return Result(samples, cold, replica_mb, server_mb, {})
+    return Result(samples, cold, replica_mb, server_mb, missing)
 
 
 def cold_starts(pair: list[Server], folder: Path, mark: str, times: int, console: Console) -> dict[str, float]:

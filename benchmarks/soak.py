@@ -123,8 +123,18 @@ def mix(case: Case, server: Server, cleanup: ExitStack) -> dict[str, Ask]:
 
     def kept() -> Ask:
         line = open_stream(server)
-        cleanup.callback(line.close)
-        return lambda: _same(_streamed(line()), case.action)
+        cleanup.callback(lambda: line.close())
+
+        def ask() -> None:
+            nonlocal line
+            try:
+                _same(_streamed(line()), case.action)
+            except (LoadError, OSError):  # that counts as wrong; the next one is on a new connection
+                line.close()
+                line = open_stream(server)
+                raise
+
+        return ask
 
     def anew() -> None:
         line = open_stream(server)
@@ -217,6 +227,7 @@ def soak(
             counts[name] += 1
         except (LoadError, OSError) as error:
             failures[f"{name}: {str(error)[:200]}"] += 1
+            console.print(f"WRONG: {name}: {str(error)[:200]}", style="red", markup=False)
         number += 1
         time.sleep(max(0.0, began + number / rate - time.monotonic()))  # behind the rate: no catching up faster
         now = time.monotonic()

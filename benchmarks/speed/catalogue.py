@@ -45,7 +45,8 @@ class Case:
     def batch(self, rows: int) -> NDArray[np.float32]:
         """Return so many different observations around the one."""
         noise = np.random.default_rng(0).standard_normal((rows, len(self.obs))).astype(np.float32)
-        return self.obs + np.float32(0.01) * noise
+        rows_of_obs: NDArray[np.float32] = self.obs + np.float32(0.01) * noise
+        return rows_of_obs
 
 
 def case_of(bundle: Path, checkpoint: Path) -> Case:

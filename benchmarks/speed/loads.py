@@ -188,17 +188,19 @@ class WebSocketLine(Line):
             content, self._held = held[start : start + length], held[start + length :]
             if kind == 2:
                 return content
-            if kind != 9:  # a ping needs no answer within a round
+            if kind == 9:  # a ping: uvicorn closes a connection whose client does not answer
+                self._socket.sendall(_frame(content, kind=0x8A))
+            else:
                 raise LoadError(f"the server sent a frame of kind {kind}: {content[:300]!r}")
 
 
-def _frame(message: bytes) -> bytes:
-    """Return a masked binary frame; the mask is zeros, which leaves the message as it is."""
+def _frame(message: bytes, *, kind: int = 0x82) -> bytes:
+    """Return a masked frame, binary or another; the mask is zeros, which leaves the message as it is."""
     size = len(message)
     if size < 126:
-        head = struct.pack("!BB", 0x82, 0x80 | size)
+        head = struct.pack("!BB", kind, 0x80 | size)
     else:
-        head = struct.pack("!BBH", 0x82, 0xFE, size) if size < 1 << 16 else struct.pack("!BBQ", 0x82, 0xFF, size)
+        head = struct.pack("!BBH", kind, 0xFE, size) if size < 1 << 16 else struct.pack("!BBQ", kind, 0xFF, size)
     return head + b"\0\0\0\0" + message
 
 

@@ -83,7 +83,7 @@ def _has_mark(pid: int, needle: bytes) -> bool:
 
 def cpu_by_role(members: dict[int, Process]) -> dict[str, float]:
     """Return the CPU seconds that these processes have used since they began."""
-    used = dict.fromkeys((REPLICA, PROXY, OTHER), 0.0)
+    used: dict[str, float] = {REPLICA: 0.0, PROXY: 0.0, OTHER: 0.0}
     for pid, process in members.items():
         with suppress(OSError, IndexError, ValueError):
             fields = (PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()

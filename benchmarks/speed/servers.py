@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -18,7 +19,12 @@ from speed.machine import MARK, Process, family
 
 START_S = 180.0  # a cold Ray on a small machine needs most of a minute
 STOP_S = 30.0
+PORTS = range(20_000, 29_000)  # below Ray Serve's own (30000 and up) and those of outgoing connections (32768 and up)
 LINGER_S = 5.0  # what a server's other processes get after its first one has ended
+
+
+class StartError(Exception):
+    """A server that cannot be measured, and why."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +90,7 @@ def running(server: Server, folder: Path, mark: str) -> Iterator[None]:
 
 
 def wait_until_answering(server: Server, log: Path) -> None:
-    """Return when the server has given its first action; exit with the end of its log when it does not."""
+    """Return when the server has given its first action. Raises StartError with the end of its log."""
     assert server.process is not None
     deadline = time.monotonic() + START_S
     while time.monotonic() < deadline and server.process.poll() is None:
@@ -93,10 +99,10 @@ def wait_until_answering(server: Server, log: Path) -> None:
             if status == 200:
                 return
             if status in (400, 422):  # it is up, and this benchmark asks it wrongly
-                raise SystemExit(f"{server.name} refuses the observation: {answer[:500].decode(errors='replace')}")
+                raise StartError(f"{server.name} refuses the observation: {answer[:500].decode(errors='replace')}")
         time.sleep(0.05)
     text = log.read_text(errors="replace")[-3000:]
-    raise SystemExit(f"{server.name} did not come up within {START_S:g} s; the end of its log:\n{text}")
+    raise StartError(f"{server.name} did not come up; the end of its log: {text}")
 
 
 def ask(server: Server) -> tuple[int, bytes]:
@@ -144,12 +150,16 @@ def environment(mark: str, extra: dict[str, str]) -> dict[str, str]:
 
 
 def free_ports(count: int) -> list[int]:
-    """Return ports that are free now, all different because all are held at once."""
+    """Return free ports that no outgoing connection takes meanwhile: a busy machine starts a server in a minute."""
     with ExitStack() as held:
-        sockets = [held.enter_context(socket.socket()) for _ in range(count)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [int(one.getsockname()[1]) for one in sockets]
+        found: list[int] = []
+        while len(found) < count:
+            one = held.enter_context(socket.socket())
+            port = PORTS[secrets.randbelow(len(PORTS))]
+            with suppress(OSError):
+                one.bind(("127.0.0.1", port))
+                found.append(port)
+        return found
 
 
 def listening(port: int) -> bool:

@@ -89,9 +89,9 @@ def test_lines_read_the_policys_action_over_every_protocol(server: Server, case:
 
 
 def test_line_refuses_an_answer_of_another_status(server: Server) -> None:
-    with closing(HttpLine(server.port, Exchange("POST", "/v1/policies/none/act", b'{"obs": [1]}'))) as line:
-        with pytest.raises(LoadError, match="404"):
-            line()
+    unknown = Exchange("POST", "/v1/policies/none/act", b'{"obs": [1]}')
+    with closing(HttpLine(server.port, unknown)) as line, pytest.raises(LoadError, match="404"):
+        line()
 
 
 def test_websocket_line_reads_messages_of_every_length_form(server: Server, case: Case) -> None:
