@@ -1,6 +1,9 @@
-"""The least that serves a policy with validation: uvicorn, FastAPI, pydantic and onnxruntime, nothing else.
+"""The least that serves a policy with validation: uvicorn, FastAPI, pydantic and onnxruntime, and a bare WebSocket.
 
-python benchmarks/peers/bare.py PORT POLICY.onnx
+    python benchmarks/peers/bare.py PORT POLICY.onnx
+
+uvicorn takes uvloop and httptools, which its extra `standard` brings. The WebSocket at /ws takes an observation's bytes
+and gives an action's, without a protocol around them.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import uvicorn
-from fastapi import FastAPI
+from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from pydantic import BaseModel
 
 
@@ -33,6 +36,17 @@ def build(onnx_file: str) -> FastAPI:
     async def act(request: Request) -> Reply:
         outputs: list[Any] = list(session.run(["action"], {"obs": np.array([request.obs], np.float32)}))
         return Reply(action=outputs[0][0].tolist())
+
+    @app.websocket("/ws")
+    async def stream(socket: WebSocket) -> None:
+        await socket.accept()
+        try:
+            while True:
+                obs = np.frombuffer(await socket.receive_bytes(), np.float32)[None]
+                outputs: list[Any] = list(session.run(["action"], {"obs": obs}))
+                await socket.send_bytes(outputs[0].tobytes())
+        except WebSocketDisconnect:
+            pass
 
     return app
 

@@ -1,0 +1,56 @@
+"""An environment of its own for each peer, installed from PyPI on demand and kept in the user's cache.
+
+Every package is pinned (`benchmarks/peers/requirements/`), and an environment is made anew when its list changes.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+REQUIREMENTS = Path(__file__).resolve().parent.parent / "peers" / "requirements"
+INSTALL_S = 900.0
+COMPLETE = ".complete"  # written last: an environment without it is half of one
+# None of these peers needs torch. Should a new version want it, pip says so instead of fetching gigabytes of CUDA.
+NO_TORCH = "torch<0\n"
+
+
+class InstallError(Exception):
+    """A peer that cannot be measured here, and why."""
+
+
+def python_of(name: str) -> Path:
+    """Return the Python of the environment `name`, made now if it is not there. Raises InstallError."""
+    requirements = REQUIREMENTS / f"{name}.txt"
+    digest = hashlib.sha256(requirements.read_bytes() + sys.version.encode()).hexdigest()[:12]
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rlservo-bench"
+    root.mkdir(parents=True, exist_ok=True)
+    folder = root / f"{name}-{digest}"
+    python = folder / "bin" / "python"
+    with (root / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / COMPLETE).exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            constraints = root / "constraints.txt"
+            constraints.write_text(NO_TORCH)
+            pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+            run([sys.executable, "-m", "venv", str(folder)], name)
+            run([*pip, "-c", str(constraints), "-r", str(requirements)], name)
+            (folder / COMPLETE).touch()
+    return python
+
+
+def run(command: list[str], name: str) -> None:
+    """Run one step of an installation. Raises InstallError."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=INSTALL_S)
+    except subprocess.TimeoutExpired:
+        raise InstallError(f"installing {name} took longer than {INSTALL_S:g} s") from None
+    if done.returncode != 0:
+        errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR")]
+        raise InstallError(f"{name} could not be installed: {(errors or ['pip gave no reason'])[-1][:300]}")

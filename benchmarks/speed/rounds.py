@@ -1,0 +1,153 @@
+"""Measuring in turns: every server has its turn in every round, so that a slow moment of the machine falls on all.
+
+A sample is one server's turn at one measure: what the load gave, and what the server's processes used meanwhile.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from speed import loads
+from speed.catalogue import BARE, BATCH, RLLIB, RLSERVO, TWO, Case
+from speed.loads import GrpcLine, HttpLine, Load, WebSocketLine
+from speed.machine import OTHER, PROXY, REPLICA, cpu_by_role
+from speed.servers import Server, ask
+
+IN_PROCESS = "onnxruntime in process"
+JSON1, JSON16, LINE, STREAM, GRPC = "json, 1 connection", "json, 16 connections", "json line", "websocket", "grpc"
+LARGE, HEAVY = f"binary, batch of {BATCH}", "binary, batch of 64, 16 connections"
+ONE = "one observation"
+CONNECTIONS = 16
+
+Turn = Callable[[], Load]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One turn."""
+
+    load: Load
+    cpu_s: dict[str, float]  # by role, of the server's processes
+
+    @property
+    def cpu_us(self) -> float:
+        """CPU time of the whole server per request [us]."""
+        return 1e6 * sum(self.cpu_s.values()) / self.load.count
+
+    @property
+    def cores(self) -> dict[str, float]:
+        """How many cores each part kept busy."""
+        busy = {role: used / self.load.seconds for role, used in self.cpu_s.items()}
+        return {"generator": self.load.generator_cpu_s / self.load.seconds, **busy}
+
+
+Samples = dict[tuple[str, str], list[Sample]]
+
+
+class Rounds:
+    """The measures, each with its servers' turns."""
+
+    def __init__(self, case: Case, servers: Iterable[Server], folder: Path, seconds: int) -> None:
+        self._servers = {server.name: server for server in servers}
+        self._turns: list[tuple[str, str, Turn]] = []
+        session = session_of(case)
+        single, many = {"obs": case.obs[None]}, {"obs": case.batch(BATCH)}
+
+        def over_wrk(server: Server, exchange: Any, connections: int) -> Turn:
+            return lambda: loads.wrk(server.port, exchange, folder, connections=connections, seconds=seconds)
+
+        def over(open_line: Callable[[], Any]) -> Turn:
+            def turn() -> Load:
+                # Opened for each turn: uvicorn closes a connection that was quiet while the others had theirs.
+                with closing(open_line()) as line:
+                    return loads.timed(line, seconds)
+
+            return turn
+
+        def in_process(feed: dict[str, Any]) -> Turn:
+            return lambda: loads.timed(lambda: session.run(["action"], feed), seconds)
+
+        ours = [server for server in self._servers.values() if server.name in (RLSERVO, BARE)]
+        compared = [server for server in self._servers.values() if server.name != TWO]
+        two = [server for server in self._servers.values() if server.name in (RLSERVO, TWO)]
+        self._add(ONE, [(IN_PROCESS, in_process(single))])
+        self._add(JSON1, [(server.name, over_wrk(server, server.act, 1)) for server in compared])
+        self._add(
+            JSON16, [(server.name, over_wrk(server, server.act, CONNECTIONS)) for server in self._servers.values()]
+        )
+        self._add(LINE, [(one.name, over(partial(HttpLine, one.port, one.act))) for one in ours])
+        streams = [
+            (one.name, over(partial(WebSocketLine, one.port, one.stream, one.message, greets=one.greets)))
+            for one in ours
+            if one.stream is not None
+        ]
+        self._add(STREAM, streams)
+        calls = [
+            (one.name, over(partial(GrpcLine, one.grpc_port, case.name, case.obs[None])))
+            for one in compared
+            if one.grpc_port is not None
+        ]
+        self._add(GRPC, calls)
+        large = [(one.name, over(partial(HttpLine, one.port, one.batch))) for one in ours if one.batch is not None]
+        self._add(LARGE, [(IN_PROCESS, in_process(many)), *large])
+        heavy = [(one.name, over_wrk(one, one.heavy, CONNECTIONS)) for one in two if one.heavy is not None]
+        self._add(HEAVY, heavy)
+
+    def _add(self, measure: str, turns: list[tuple[str, Turn]]) -> None:
+        self._turns += [(measure, name, turn) for name, turn in turns]
+
+    def run(self, rounds: int, tell: Callable[[str], None]) -> Samples:
+        """Take every turn once per round; the order within a measure turns by one each round."""
+        samples: Samples = {(measure, name): [] for measure, name, _ in self._turns}
+        measures = list(dict.fromkeys(measure for measure, _, _ in self._turns))
+        self._warm()
+        for number in range(rounds):
+            began = time.monotonic()
+            for measure in measures:
+                turns = [(name, turn) for other, name, turn in self._turns if other == measure]
+                shift = number % len(turns)
+                for name, turn in turns[shift:] + turns[:shift]:
+                    samples[measure, name].append(self._sample(name, turn))
+            tell(f"round {number + 1} of {rounds}: {time.monotonic() - began:.0f} s")
+        return samples
+
+    def _sample(self, name: str, turn: Turn) -> Sample:
+        server = self._servers.get(name)
+        members = {} if server is None else server.members()
+        before = cpu_by_role(members)
+        load = turn()
+        after = cpu_by_role(members)
+        return Sample(load, {role: after[role] - before[role] for role in (REPLICA, PROXY, OTHER)})
+
+    def _warm(self) -> None:
+        for _, _, turn in self._turns:
+            turn()
+
+
+def session_of(case: Case) -> Any:
+    """Return a session as every server here has one: on one thread."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(case.onnx_file, options, providers=["CPUExecutionProvider"])
+
+
+def check_answers(servers: Iterable[Server], case: Case) -> None:
+    """See that the servers give the policy's own action. RLlib's example answers an argmax, whatever the policy."""
+    for server in servers:
+        answer = json.loads(ask(server)[1])
+        if server.name == RLLIB:
+            continue
+        action = answer["outputs"][0]["data"] if "outputs" in answer else answer["action"]
+        if not np.allclose(action, case.action, atol=1e-4):
+            raise SystemExit(f"{server.name} answers {action}, the policy itself {case.action.tolist()}")

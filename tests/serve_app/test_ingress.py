@@ -1,0 +1,147 @@
+"""What stands before Serve's handling in a replica, on uvicorn's own protocols with a transport that records writes."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import uvicorn
+from starlette.responses import StreamingResponse
+from starlette.types import Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.server import ServerState
+
+from rlservo.serve_app.ingress import HEADER, Ingress
+
+PROTOCOLS = [HttpToolsProtocol, H11Protocol]
+
+
+class Recorder(asyncio.Transport):
+    """A transport that keeps what is written, write by write."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.writes: list[bytes] = []
+        self.closed = False
+
+    def write(self, data: Any) -> None:
+        self.writes.append(bytes(data))
+
+    def close(self) -> None:
+        self.closed = True
+
+    def is_closing(self) -> bool:
+        return self.closed
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        return ("127.0.0.1", 1) if name in ("peername", "sockname") else default
+
+    def pause_reading(self) -> None: ...
+
+    def resume_reading(self) -> None: ...
+
+    def set_protocol(self, protocol: Any) -> None: ...
+
+
+async def echo(scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer with the body, in the two messages of every ASGI answer."""
+    body = (await receive()).get("body", b"")
+    headers = [(b"content-length", b"%d" % len(body))]
+    await send({"type": "http.response.start", "status": 200, "headers": headers})
+    await send({"type": "http.response.body", "body": body})
+
+
+async def fails_after_the_head(scope: Scope, receive: Receive, send: Send) -> None:
+    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"5")]})
+    raise ValueError("the application's own fault")
+
+
+async def streams(scope: Scope, receive: Receive, send: Send) -> None:
+    async def parts() -> Any:
+        for part in ("one", "two", "three"):
+            yield part
+
+    await StreamingResponse(parts())(scope, receive, send)
+
+
+def exchange(protocol: Any, app: Any, *pieces: bytes) -> Recorder:
+    """Feed a request, piece by piece, to a connection; return what it wrote."""
+
+    async def run() -> Recorder:
+        config = uvicorn.Config(Ingress(app), lifespan="off", log_level="critical", access_log=False)
+        config.load()
+        state = ServerState()
+        connection = protocol(config=config, server_state=state, app_state={})
+        transport = Recorder()
+        connection.connection_made(transport)
+        for piece in pieces:
+            connection.data_received(piece)
+            for _ in range(3):
+                await asyncio.sleep(0)
+        while state.tasks:
+            await asyncio.gather(*state.tasks)
+        connection.connection_lost(None)  # stops its keep-alive timer, too
+        return transport
+
+    return asyncio.run(run())
+
+
+def post(body: bytes, *headers: bytes) -> bytes:
+    lines = [b"POST /act HTTP/1.1", b"host: x", b"content-length: %d" % len(body), *headers, b"", body]
+    return b"\r\n".join(lines)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_reply_to_post_is_one_write(protocol: Any) -> None:
+    writes = exchange(protocol, echo, post(b"hello")).writes
+    assert b"".join(writes).startswith(b"HTTP/1.1 200") and b"".join(writes).endswith(b"\r\n\r\nhello")
+    assert len([write for write in writes if write]) == 1
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_every_reply_of_a_kept_connection_is_joined(protocol: Any) -> None:
+    writes = exchange(protocol, echo, post(b"first"), post(b"second")).writes
+    assert [write.rpartition(b"\r\n\r\n")[2] for write in writes if write] == [b"first", b"second"]
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_client_that_waits_for_100_continue_gets_it_at_once(protocol: Any) -> None:
+    request = post(b"hello", b"expect: 100-continue")
+    writes = exchange(protocol, echo, request[:-5], request[-5:]).writes
+    assert writes[0].startswith(b"HTTP/1.1 100") and b"".join(writes[1:]).endswith(b"hello")
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_head_without_a_body_is_written_before_the_connection_closes(protocol: Any) -> None:
+    transport = exchange(protocol, fails_after_the_head, post(b"hello"))
+    assert b"".join(transport.writes).startswith(b"HTTP/1.1 200") and transport.closed
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_an_empty_body_does_not_hold_the_head_back(protocol: Any) -> None:
+    assert b"".join(exchange(protocol, echo, post(b"")).writes).startswith(b"HTTP/1.1 200")
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_head_requests_and_streamed_replies_arrive_whole(protocol: Any) -> None:
+    head = exchange(protocol, echo, b"HEAD / HTTP/1.1\r\nhost: x\r\n\r\n").writes
+    assert b"".join(head).startswith(b"HTTP/1.1 200")
+    streamed = b"".join(exchange(protocol, streams, post(b"x")).writes)
+    assert all(part in streamed for part in (b"HTTP/1.1 200", b"one", b"two", b"three", b"0\r\n\r\n"))
+
+
+def test_serve_is_told_not_to_watch_for_disconnects_and_websockets_pass_untouched() -> None:
+    seen: list[Scope] = []
+
+    async def app(scope: Scope, receive: Receive, send: Send) -> None:
+        seen.append(scope)
+
+    async def nothing(*_: object) -> Any: ...
+
+    call: Callable[..., Any] = Ingress(app)
+    asyncio.run(call({"type": "http", "method": "POST", "headers": []}, nothing, nothing))
+    asyncio.run(call({"type": "websocket", "headers": []}, nothing, nothing))
+    assert HEADER in seen[0]["headers"] and seen[1]["headers"] == []
