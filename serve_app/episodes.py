@@ -61,7 +61,8 @@ class Episodes:
         """
         if episode.session_id is not None:
             session = episode.session_id
-            if self.sessions.peek(name, session) is not None or store.choose(name, version, session).episodic:
+            begun = self.sessions.peek(name, session) is not None or (episode.reset and self._alone())
+            if begun or store.choose(name, version, session).episodic:
                 return self._in_session(store, name, version, obs, episode, explore=explore, seed=seed, seq=seq)
             # There is nothing to remember: the id says only which requests belong together.
             episode = replace(episode, session_id=None, reset=False, end=False)

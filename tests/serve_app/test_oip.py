@@ -244,7 +244,6 @@ ROW = ONE[0].tolist()
         (request(tensor(ROW, [1, 27]), parameters={"binary_data_output": 1}), 400, "must be true or false"),
         (request(tensor(ROW, [1, 27]), parameters={"explor": True}), 400, "unknown parameter 'explor'"),
         (request(tensor(ROW, [1, 27]), parameters={"seed": -1}), 400, "'seed' must be in 0.."),
-        (request(tensor(ROW, [1, 27]), parameters={"sequence_id": 3}), 410, "has no session '#3' of policy 'ur5'"),
         (request(tensor(ROW, [1, 27]), parameters={"sequence_id": True}), 400, "'sequence_id' must be an integer, or"),
         (request(tensor(ROW, [1, 27]), parameters={"deadline_ms": 0}), 408, "nothing computed"),
         (request(tensor([0.0] * 27 * 65, [65, 27])), 413, "a batch of 65 observations is too large: at most 64"),
