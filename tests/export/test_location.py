@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from rlservo.export.checkpoint import load_checkpoint
-from rlservo.export.errors import CheckpointError, UnsupportedError
+from rlservo.export.errors import CheckpointError
 from rlservo.export.exporter import export_checkpoint
-from rlservo.export.location import locate_checkpoint
+from rlservo.export.location import locate_checkpoint, locate_modules
 from rlservo.export.onnx import run_onnx
 from rlservo.export.unpickle import user_code
 
@@ -89,11 +89,13 @@ def test_several_trials_are_not_guessed_between(zoo: Path, tmp_path: Path) -> No
     assert locate_checkpoint(tmp_path).root == tmp_path / "a" / "checkpoint_000001"
 
 
-def test_several_modules_are_refused_by_name(copy_of: Callable[[str], Path]) -> None:
+def test_several_modules_are_not_guessed_between(copy_of: Callable[[str], Path]) -> None:
     damaged = copy_of("pendulum")
     (damaged / MODULE).parent.joinpath("other").symlink_to(damaged / MODULE)
-    with pytest.raises(UnsupportedError, match=r"multi-agent checkpoint \(modules default_policy, other\)"):
+    with pytest.raises(CheckpointError, match=r"holds 2 modules \(default_policy, other\): name the one to export"):
         locate_checkpoint(damaged)
+    assert locate_checkpoint(damaged, "other").module_id == "other"
+    assert [files.module_id for files in locate_modules(damaged)] == ["default_policy", "other"]
 
 
 def test_the_hash_covers_weights_filter_and_scaling(zoo: Path, copy_of: Callable[[str], Path]) -> None:
