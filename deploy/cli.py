@@ -11,7 +11,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from enum import Enum
 from importlib.metadata import version
 from pathlib import Path
@@ -131,47 +131,44 @@ def export(
     started = time.perf_counter()
     if all_modules and (module_id is not None or agent_id is not None):
         raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
-    with _err.status("importing") as status, _extra("train"):
-        from rlservo.export.experiment import best_checkpoint
-        from rlservo.export.exporter import LOADING_RUNS_CODE, export_all_modules, export_checkpoint
-        from rlservo.export.remote import fetched
-        from rlservo.export.report import export_report, peak_memory_mb
+    with _err.status("importing") as status, ExitStack() as fetching:
+        with _extra("train"):
+            from rlservo.export.experiment import best_checkpoint
+            from rlservo.export.exporter import LOADING_RUNS_CODE, export_all_modules, export_checkpoint
+            from rlservo.export.remote import fetched
+            from rlservo.export.report import export_report, peak_memory_mb
 
-        with fetched(checkpoint, status.update) as local:
-            found: str | Path = checkpoint
-            if metric is not None:
-                _note(LOADING_RUNS_CODE.format(path=checkpoint))
-                best = best_checkpoint(local, metric, mode.value, app_dir=app_dir, notify=_note)
-                _note(f"{best.path} has the {mode.value} {metric}: {best.score:g}")
-                found = best.path
-            elif local != Path(checkpoint):
-                found = local
-            if all_modules:
-                results = export_all_modules(
-                    found,
-                    out,
-                    name=name,
-                    version=version,
-                    description=description,
-                    app_dir=app_dir,
-                    notify=_note,
-                    progress=status.update,
-                )
-            else:
-                results = [
-                    export_checkpoint(
-                        found,
-                        out,
-                        name=name,
-                        version=version,
-                        description=description,
-                        module_id=module_id,
-                        agent_id=agent_id,
-                        app_dir=app_dir,
-                        notify=_note,
-                        progress=status.update,
-                    )
-                ]
+        if metric is not None:
+            _note(LOADING_RUNS_CODE.format(path=checkpoint))
+            local = fetching.enter_context(fetched(checkpoint, status.update))
+            best = best_checkpoint(local, metric, mode.value, app_dir=app_dir, notify=_note)
+            _note(f"{best.path} has the {mode.value} {metric}: {best.score:g}")
+            checkpoint = str(best.path)
+        if all_modules:
+            results = export_all_modules(
+                checkpoint,
+                out,
+                name=name,
+                version=version,
+                description=description,
+                app_dir=app_dir,
+                notify=_note,
+                progress=status.update,
+            )
+        else:
+            one = export_checkpoint(
+                checkpoint,
+                out,
+                name=name,
+                version=version,
+                description=description,
+                module_id=module_id,
+                agent_id=agent_id,
+                app_dir=app_dir,
+                notify=_note,
+                progress=status.update,
+            )
+            results = [one]
     cost = {"seconds": round(time.perf_counter() - started, 2), "peak_memory_mb": round(peak_memory_mb())}
     if as_json:
         documents = [

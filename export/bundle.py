@@ -288,7 +288,7 @@ class Parity(_Model):
     """How the export was proven equal to what RLlib itself would send to env.step."""
 
     reference: str
-    samples: Size
+    samples: int = Field(ge=0)
     batch_sizes: tuple[Size, ...]
     rtol: Tolerance
     atol: Tolerance

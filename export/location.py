@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
-from rlservo.export.errors import CheckpointError
+from rlservo.export.errors import CheckpointError, UnsupportedError
 from rlservo.export.old_location import OldStackFiles, locate_policy, old_stack_root, policy_ids
 
 MODULES = Path("learner_group") / "learner" / "rl_module"
@@ -27,6 +27,7 @@ DEFAULT_MODULE = "default_policy"
 FACTS_FILE = "rlservo_facts.json"
 """Written by `prune.py` in place of RLlib's own configuration pickles."""
 
+_BEFORE_COMPONENTS = Path("learner") / "module_state"
 _TUNE_CHECKPOINT = re.compile(r"checkpoint_(\d{6,})")
 
 
@@ -147,6 +148,12 @@ def _find_root(given: Path) -> Path:
     for folder in (given, *given.parents):
         if (folder / MODULES).is_dir():
             return folder
+    if (given / _BEFORE_COMPONENTS).is_dir():
+        raise UnsupportedError(
+            f"{given} holds its modules in {_BEFORE_COMPONENTS}/, as a Ray before 2.33 wrote them on the new API "
+            "stack, without connectors and in a form today's RLlib cannot restore: train again with a later Ray and "
+            "export that"
+        )
     if old := old_stack_root(given):
         return old
     if newest := _newest_checkpoint(given):
@@ -199,6 +206,12 @@ def _choose_module(root: Path, module_id: str | None) -> str:
 
 
 def _check_complete(files: CheckpointFiles) -> None:
+    if (files.module / "state.pkl").is_file() and not _is_module(files.module):
+        raise UnsupportedError(
+            f"{files.module} holds its weights in state.pkl, as the first Rays with such checkpoints wrote them "
+            "(2.33 and some after it), where today's RLlib looks for module_state.pkl: it cannot restore them; train "
+            "again with a later Ray and export that"
+        )
     needed = [(files.module, STATE_STEMS["module"], "the weights")]
     pipelines = (
         (files.env_to_module, STATE_STEMS["connector"], "the observation filter and other steps before the network"),

@@ -4,11 +4,10 @@ It compares functions from observations to named outputs and does not know what 
 is compared over whole sequences, each side fed with its own state.
 
 A difference passes when it is at most `RTOL * max(|reference|, scale) + ATOL`. The scale is half the range of a
-bounded action element. Elsewhere the rounding of a matrix product grows with its terms and not with their sum, which
-may cancel, so the scale is the size that the output reaches for such observations: its largest number over all
-observations of the same kind (likely, wide or extreme), at least 1. The kinds are apart, so that an extreme observation
-excuses nothing in a likely one. A discrete action must be the same, unless RLlib's own scores for the two choices are
-that close.
+bounded action element; elsewhere the largest number in the same row of the output, at least 1, because the rounding
+of a matrix product grows with its terms and not with their sum. `value` has one number a row, which may be a small
+difference of large terms: its scale is the largest value seen over all observations. A discrete action must be the
+same, unless RLlib's own scores for the two choices are that close.
 
 Far outside the usual, a network takes the small difference of huge terms, and no two orders of adding them agree. What
 is still rounding there, RLlib itself tells: a difference also passes when it is at most ROUNDING times what RLlib's own
@@ -38,12 +37,12 @@ ATOL = 1e-6
 ROUNDING = 8.0
 MASKED = 1e30
 """A score beyond this stands for 'not allowed' (RLlib's action masks add -3.4e38); it measures nothing."""
-SCORES = ("q_values", "action_dist_inputs")
-"""The outputs that a discrete choice is made by, the first that is there."""
 RULE = (
-    "a difference passes up to rtol * scale + atol; the scale is half the range of a bounded action, else the output's "
-    "largest number over all observations of the same kind (likely, wide, extreme), at least 1"
+    "a difference passes up to rtol * scale + atol; the scale is half the range of a bounded action, else the largest "
+    "number in the output's row (of value: over all observations), at least 1; also up to 8 times what RLlib's own numbers "
+    "move by when the observation moves by its last bit"
 )
+"""What the contract says of the tolerances."""
 REFERENCES: dict[str, str] = {
     "new": "RLlib's own env-to-module connectors, inference forward and module-to-env connectors, restored from the "
     "checkpoint, observation filter frozen, exploration off",
@@ -238,7 +237,7 @@ def _prove_format(
     rounding: _Rounding,
 ) -> FormatParity:
     max_abs = max_rel = 0.0
-    sizes = _sizes(recorded)
+    largest_value = max((_largest(one.outputs["value"]) for one in recorded if "value" in one.outputs), default=1.0)
     actions = recipe.action_leaves
     running = replay(recorded, run, recipe.state)
     for number, one in enumerate(recorded):
@@ -253,10 +252,10 @@ def _prove_format(
             space = actions.get(output)
             _check_form(where, output, got.get(output), expected, space)
             if space is not None and not isinstance(space, Box):
-                which = next((score for score in SCORES if score in one.outputs), SCORES[-1])
-                _check_choices(where, output, got[output], one, recipe, sizes, partial(rounding.of, number, which))
+                scores = "q_values" if "q_values" in one.outputs else "action_dist_inputs"
+                _check_choices(where, output, got[output], one, recipe, partial(rounding.of, number, scores))
                 continue
-            least = sizes[one.batch.kind, output]
+            least = largest_value if output == "value" else 1.0
             moves = partial(rounding.of, number, output)
             difference, scale = _compare(where, output, got[output], expected, space, one, labels, least, moves)
             max_abs = max(max_abs, float(difference.max(initial=0.0)))
@@ -291,7 +290,7 @@ def _compare(
     with np.errstate(invalid="ignore"):
         same = (a == b) | (np.isnan(a) & np.isnan(b))  # overflow in both is no difference
         difference = np.where(same, 0.0, np.abs(a - b))
-    scale = np.maximum(np.where(np.isfinite(b), np.abs(b), 1.0), _scale(space, least_scale))
+    scale = np.maximum(np.where(np.isfinite(b), np.abs(b), 1.0), _scale(b, space, least_scale))
     allowed = RTOL * scale + ATOL
     bad = ~(difference <= allowed)
     if bad.any():
@@ -313,30 +312,19 @@ def _compare(
     return difference, scale
 
 
-def _scale(space: Any, least: float) -> NDArray[np.float64]:
-    """Return the size of number that rounding is measured against, for one element of an action or for all."""
+def _scale(expected: NDArray[np.float64], space: Any, least: float) -> NDArray[np.float64]:
+    """Return the size of number that rounding is measured against, broadcastable to `expected`."""
     if isinstance(space, Box) and bool((space.bounded_below & space.bounded_above).all()):
         return (space.high.astype(np.float64) - space.low.astype(np.float64))[None] / 2
-    return np.asarray(least)
+    measured = np.isfinite(expected) & (np.abs(np.nan_to_num(expected)) < MASKED)
+    finite = np.where(measured, np.abs(expected), 0.0)
+    axes = tuple(range(1, expected.ndim))
+    return np.maximum(finite.max(axis=axes, keepdims=True) if axes else finite, least)
 
 
-Sizes: TypeAlias = dict[tuple[str, str], float]
-"""The largest number, at least 1, by kind of observation and output."""
-
-
-def _sizes(recorded: Sequence[Recorded]) -> Sizes:
-    found: Sizes = {}
-    for one in recorded:
-        for output, values in one.outputs.items():
-            key = one.batch.kind, output
-            found[key] = max(found.get(key, 1.0), float(_measured(values.astype(np.float64)).max(initial=0.0)))
-    return found
-
-
-def _measured(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sizes that count: what is not finite, or stands for 'not allowed', measures nothing."""
-    size = np.abs(np.nan_to_num(values))
-    return np.where(np.isfinite(values) & (size < MASKED), size, 0.0)
+def _largest(values: NDArray[Any]) -> float:
+    finite = values[np.isfinite(values)]
+    return max(1.0, float(np.abs(finite).max(initial=0.0)))
 
 
 def _row(batch: Batch, row: int) -> Any:
@@ -350,15 +338,13 @@ def _check_choices(
     got: NDArray[Any],
     one: Recorded,
     recipe: Recipe,
-    sizes: Sizes,
     moves: Callable[[], NDArray[np.float64] | float],
 ) -> None:
     """Compare discrete actions; a tie in RLlib's scores excuses a difference, and so do scores that are no numbers."""
     columns = _columns(one.outputs[output])
     scored = choice_scores(recipe, one.outputs).get(output) or [np.full((len(c), 1), np.inf) for c in columns]
     for part, (exported, wanted, scores) in enumerate(zip(_columns(got), columns, scored, strict=True)):
-        size = max(sizes.get((one.batch.kind, name), 1.0) for name in SCORES)
-        width = _tie_width(scores, size)
+        width = _tie_width(scores)
         for row in np.flatnonzero(exported != wanted):
             chosen, right = int(exported[row]), int(wanted[row])
             if np.isnan(scores[row]).any():
@@ -382,7 +368,7 @@ def ties(recipe: Recipe, outputs: Outputs) -> NDArray[np.bool_]:
     tied = np.zeros(rows, np.bool_)
     for parts in choice_scores(recipe, outputs).values():
         for scores in parts:
-            tied |= _tied(scores, 1.0) | np.isnan(scores).any(axis=1)
+            tied |= _tied(scores) | np.isnan(scores).any(axis=1)
     return tied
 
 
@@ -393,7 +379,7 @@ def choice_scores(recipe: Recipe, outputs: Outputs) -> dict[str, list[NDArray[np
     """
     if recipe.mode == "given":
         return {}
-    scores = next(outputs[name] for name in SCORES if name in outputs).astype(np.float64)
+    scores = outputs["q_values" if "q_values" in outputs else "action_dist_inputs"].astype(np.float64)
     return split_scores(scores, space_spec(recipe.action_space, action=True))
 
 
@@ -401,15 +387,16 @@ def _columns(choices: NDArray[Any]) -> list[NDArray[Any]]:
     return [choices] if choices.ndim == 1 else list(choices.reshape(len(choices), -1).T)
 
 
-def _tied(scores: NDArray[np.float64], least: float) -> NDArray[np.bool_]:
+def _tied(scores: NDArray[np.float64]) -> NDArray[np.bool_]:
     if scores.shape[1] < 2:
         return np.zeros(len(scores), np.bool_)
     best = np.sort(scores, axis=1)[:, -2:]
-    return np.asarray(best[:, 1] - best[:, 0] <= _tie_width(scores, least))
+    return np.asarray(best[:, 1] - best[:, 0] <= _tie_width(scores))
 
 
-def _tie_width(scores: NDArray[np.float64], least: float) -> NDArray[np.float64]:
-    return np.asarray(RTOL * np.maximum(_measured(scores).max(axis=1), least) + ATOL)
+def _tie_width(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    measured = np.where(np.abs(np.nan_to_num(scores)) < MASKED, np.abs(np.nan_to_num(scores)), 0.0)
+    return np.asarray(RTOL * np.maximum(measured.max(axis=1), 1.0) + ATOL)
 
 
 def _copied(inputs: Inputs) -> Inputs:

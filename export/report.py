@@ -134,7 +134,7 @@ def _table(
     title: str, *columns: str, right: Sequence[str] = (), fold: Sequence[str] = ()
 ) -> tuple[Table, RenderableType]:
     """Return (a table, what to print): the title stands above it, whose width it would be broken to otherwise."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
     for column in columns:
         justify: JustifyMethod = "right" if column in right else "left"
         table.add_column(column, justify=justify, no_wrap=column not in fold, overflow="fold")
@@ -171,7 +171,8 @@ def _elements(title: str, space: LeafSpec, frozen: BakedStep | None) -> Renderab
     kind = f"one of {space.n} choices" if isinstance(space, DiscreteSpec) else f"{_shape(space.shape)}, {space.dtype}"
     mean, std = _seen(frozen, space.size)
     named = ["name", "unit"] if space.elements else []
-    seen = ["filter mean", "filter std"] if mean else []
+    seen = ["mean", "std"] if mean else []
+    kind += "; mean and std are the filter's" if mean else ""
     columns = ["#", *named, "low", "high", *seen]
     table, shown = _table(f"{title} ({kind})", *columns, right=("#", "low", "high", *seen))
     low, high = (bound.ravel().tolist() for bound in space.bounds())

@@ -54,7 +54,8 @@ def test_export_says_what_it_proved_and_where_it_wrote(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     print(f"export took {time.monotonic() - began:.1f} s")
     assert str(tmp_path / "arm" / "1.2.0") in done.stdout
-    assert "checkpoints are pickles and run code when loaded" in done.stderr
+    assert done.stderr.count("checkpoints are pickles and run code when loaded") == 1
+    assert "MB at the peak" in done.stdout
     files = {path.name for path in (tmp_path / "arm" / "1.2.0").iterdir()}
     assert files == {"policy.onnx", "policy.ts", "contract.json", "golden.npz", "SHA256SUMS"}
     checked = subprocess.run(["sha256sum", "-c", "SHA256SUMS"], cwd=tmp_path / "arm" / "1.2.0", capture_output=True)
@@ -65,8 +66,22 @@ def test_export_as_json_prints_one_document(tmp_path: Path) -> None:
     done = rlservo("export", UR5, "--out", tmp_path, "--json")
     document = json.loads(done.stdout)
     assert Path(document["path"]).is_dir()
+    assert 0 < document["seconds"] < 300 and 50 < document["peak_memory_mb"] < 5000
     assert document["contract"]["observation_space"]["elements"][0] == {"name": "target_r", "unit": "m"}
     assert document["contract"]["control_rate_hz"] == 10.0
+
+
+def test_all_modules_of_a_checkpoint_behind_a_uri_are_exported_as_one_list(tmp_path: Path) -> None:
+    done = rlservo("export", UR5.as_uri(), "--out", tmp_path, "--all-modules", "--json")
+    assert done.returncode == 0, done.stderr
+    (document,) = json.loads(done.stdout)
+    assert Path(document["path"]) == tmp_path / "end-effector-positioning-ur" / "1"
+    assert f"loading {UR5.as_uri()}: checkpoints are pickles" in done.stderr
+    refused(
+        rlservo("export", UR5, "--out", tmp_path, "--all-modules", "--module-id", "default_policy"),
+        2,
+        "--all-modules exports every module: leave --module-id and --agent-id out",
+    )
 
 
 def test_exporting_twice_makes_the_next_version(policies: Path, tmp_path: Path) -> None:

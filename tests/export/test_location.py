@@ -14,7 +14,7 @@ import pytest
 from rlservo.export.checkpoint import load_checkpoint
 from rlservo.export.errors import CheckpointError, UnsupportedError
 from rlservo.export.exporter import export_checkpoint
-from rlservo.export.location import locate_checkpoint
+from rlservo.export.location import locate_checkpoint, locate_modules
 from rlservo.export.onnx import run_onnx
 from rlservo.export.unpickle import user_code
 
@@ -89,11 +89,25 @@ def test_several_trials_are_not_guessed_between(zoo: Path, tmp_path: Path) -> No
     assert locate_checkpoint(tmp_path).root == tmp_path / "a" / "checkpoint_000001"
 
 
-def test_several_modules_are_refused_by_name(copy_of: Callable[[str], Path]) -> None:
+def test_several_modules_are_not_guessed_between(copy_of: Callable[[str], Path]) -> None:
     damaged = copy_of("pendulum")
     (damaged / MODULE).parent.joinpath("other").symlink_to(damaged / MODULE)
-    with pytest.raises(UnsupportedError, match=r"multi-agent checkpoint \(modules default_policy, other\)"):
+    with pytest.raises(CheckpointError, match=r"holds 2 modules \(default_policy, other\): name the one to export"):
         locate_checkpoint(damaged)
+    assert locate_checkpoint(damaged, "other").module_id == "other"
+    assert [files.module_id for files in locate_modules(damaged)] == ["default_policy", "other"]
+
+
+def test_what_an_older_ray_wrote_is_refused_with_the_reason(copy_of: Callable[[str], Path], tmp_path: Path) -> None:
+    (tmp_path / "old" / "learner" / "module_state" / "default_policy").mkdir(parents=True)
+    (tmp_path / "old" / "policies" / "default_policy").mkdir(parents=True)
+    (tmp_path / "old" / "policies" / "default_policy" / "policy_state.pkl").write_bytes(b"")
+    with pytest.raises(UnsupportedError, match=r"as a Ray before 2\.33 wrote them .*: train again"):
+        locate_checkpoint(tmp_path / "old")
+    renamed = copy_of("pendulum")
+    (renamed / MODULE / "module_state.pkl").rename(renamed / MODULE / "state.pkl")
+    with pytest.raises(UnsupportedError, match=r"weights in state\.pkl, .*train again with a later Ray"):
+        locate_checkpoint(renamed)
 
 
 def test_the_hash_covers_weights_filter_and_scaling(zoo: Path, copy_of: Callable[[str], Path]) -> None:

@@ -103,9 +103,9 @@ def test_a_pruned_module_of_several_exports_to_the_same_policy(
     wide_zoo: Path, app: Path, tmp_path: Path, notices: list[str]
 ) -> None:
     given: dict[str, Any] = {"app_dir": app, "notify": notices.append}
-    prune_checkpoint(wide_zoo / "team", tmp_path / "small", module_id="wheels", **given)
-    assert not (tmp_path / "small" / MODULES / "arms").exists()
-    whole = export_checkpoint(wide_zoo / "team", tmp_path / "whole", module_id="wheels", **given).contract
+    prune_checkpoint(wide_zoo / "plain_team", tmp_path / "small", module_id="arms", **given)
+    assert not (tmp_path / "small" / MODULES / "wheels").exists()
+    whole = export_checkpoint(wide_zoo / "plain_team", tmp_path / "whole", module_id="arms", **given).contract
     pruned = export_checkpoint(tmp_path / "small", tmp_path / "pruned", **given).contract
     now = {"exported_at": whole.provenance.exported_at}
     assert pruned.model_copy(update={"provenance": pruned.provenance.model_copy(update=now)}) == whole
