@@ -145,6 +145,12 @@ class ActionLeaf(nn.Module):
         self.nvec = space.nvec.ravel().tolist() if isinstance(space, MultiDiscrete) else None
         if not isinstance(space, Box):
             return
+        self.integer = np.dtype(space.dtype).kind in "iu"
+        if self.integer:
+            self.dtype = torch.from_numpy(np.zeros(0, space.dtype)).dtype
+            self.register_buffer("low", torch.tensor(space.low.astype(np.int64)))
+            self.register_buffer("high", torch.tensor(space.high.astype(np.int64)))
+            return
         self.dtype = torch.float64 if space.dtype == np.float64 else torch.float32
         self.width = int(np.prod(space.shape))
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
@@ -169,12 +175,22 @@ class ActionLeaf(nn.Module):
         """Return what goes to the environment."""
         if not self.box:
             return action
+        if self.integer:
+            return self._count(action)
         action = _cast(action, self.dtype)
         if self.transform == "unsquash" and self.is_scaled:
             action = action * self.half_range
         if self.transform == "unsquash" and self.is_moved:
             action = action + self.middle
         return action if self.transform == "none" else self._clip(action)
+
+    def _count(self, choice: Tensor) -> Tensor:
+        """Return integers: a choice counted from the lower bound (`unsquash_action`), or clipped, or as it is."""
+        if self.transform == "unsquash":
+            choice = choice + self.low
+        elif self.transform == "clip":
+            choice = torch.minimum(torch.maximum(choice, self.low), self.high)
+        return _cast(choice, self.dtype)
 
     def _clip(self, action: Tensor) -> Tensor:
         if self.limits is not None:

@@ -323,7 +323,7 @@ def _check_weights(files: CheckpointFiles, module: Any) -> str:
     RLlib ignores weights that are missing and leaves them random. Raises CheckpointError where an action needs them,
     and where a weight is not a finite number.
     """
-    unneeded = module.get_non_inference_attributes() if isinstance(module, InferenceOnlyAPI) else []
+    unneeded = _unneeded(module)
     for key, weights in module.state_dict().items():
         if not torch.isfinite(weights).all() and not any(key.startswith(f"{prefix}.") for prefix in unneeded):
             raise CheckpointError(f"{files.module}: the weights '{key}' are not all finite: training diverged")
@@ -336,6 +336,11 @@ def _check_weights(files: CheckpointFiles, module: Any) -> str:
     if needed := sorted(key for key in missing if not any(key.startswith(f"{prefix}.") for prefix in unneeded)):
         raise CheckpointError(f"{state_file} lacks weights that {type(module).__name__} needs: {', '.join(needed[:3])}")
     return f"{len(missing)} weights are missing" if missing else ""
+
+
+def _unneeded(module: Any) -> list[str]:
+    """Return the names of the parts that inference does without."""
+    return module.get_non_inference_attributes() if isinstance(module, InferenceOnlyAPI) else []
 
 
 def _network_state(module: Any) -> tuple[StateLeaf, ...]:

@@ -68,8 +68,11 @@ class Seat:
 ALONE = Seat()
 
 
-def check_spaces(observation_space: Any, action_space: Any) -> None:
-    """Raise UnsupportedError unless every leaf of both spaces is of a kind that is exported."""
+def check_spaces(observation_space: Any, action_space: Any, *, integer_actions: bool = False) -> None:
+    """Raise UnsupportedError unless every leaf of both spaces is of a kind that is exported.
+
+    `integer_actions` allows Boxes of integers as actions, for which only RLlib's old stack has a distribution.
+    """
     for name, space in space_leaves(observation_space, "obs").items():
         if not isinstance(space, Box | Discrete | MultiDiscrete | MultiBinary):
             raise UnsupportedError(f"{name}: the observation space {space} is not exported: it has no fixed shape")
@@ -82,7 +85,8 @@ def check_spaces(observation_space: Any, action_space: Any) -> None:
             raise UnsupportedError(
                 f"{name}: the action space {space} is not exported: RLlib has no action distribution for it"
             )
-        if isinstance(space, Box) and space.dtype not in (np.float32, np.float64):
+        whole = integer_actions and np.dtype(space.dtype).kind in "iu"
+        if isinstance(space, Box) and space.dtype not in (np.float32, np.float64) and not whole:
             raise UnsupportedError(f"{name}: the action space {space} is not exported: only float Boxes are")
         if isinstance(space, MultiDiscrete) and space.nvec.ndim != 1:
             raise UnsupportedError(f"{name}: the action space {space} is not exported: only one-dimensional ones are")

@@ -301,7 +301,7 @@ def _prepare(policy: Any) -> None:
 
 def _check_spaces(policy: Any, observation_space: Any, action_space: Any) -> None:
     """Raise UnsupportedError unless both spaces are of a kind that is exported."""
-    check_spaces(observation_space, action_space)
+    check_spaces(observation_space, action_space, integer_actions=True)
     if policy.observation_space.shape is None:
         raise UnsupportedError(
             f"observations {observation_space} reach model {type(policy.model).__name__} in parts, as RLlib's "

@@ -39,8 +39,8 @@ MASKED = 1e30
 """A score beyond this stands for 'not allowed' (RLlib's action masks add -3.4e38); it measures nothing."""
 RULE = (
     "a difference passes up to rtol * scale + atol; the scale is half the range of a bounded action, else the largest "
-    "number in the output's row (of value: over all observations), at least 1; also up to 8 times what RLlib's own numbers "
-    "move by when the observation moves by its last bit"
+    "number in the output's row (of value: over all observations), at least 1; also up to 8 times what RLlib's own "
+    "numbers move by when the observation moves by its last bit"
 )
 """What the contract says of the tolerances."""
 REFERENCES: dict[str, str] = {
@@ -216,10 +216,10 @@ class _Rounding:
         self._ask = moved
         self._moved: list[Recorded] | None = None
 
-    def of(self, number: int, output: str) -> NDArray[np.float64] | float:
+    def of(self, number: int, output: str) -> NDArray[np.float64]:
         """Return the largest movement in each row of an output, broadcastable to it."""
         if self._ask is None:
-            return 0.0
+            return np.zeros(())
         if self._moved is None:
             self._moved = self._ask()
         before, after = (one[number].outputs[output].astype(np.float64) for one in (self._recorded, self._moved))
@@ -283,7 +283,7 @@ def _compare(
     one: Recorded,
     labels: Sequence[str],
     least_scale: float,
-    moves: Callable[[], NDArray[np.float64] | float],
+    moves: Callable[[], NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return (difference, scale), both of the output's shape."""
     a, b = got.astype(np.float64), expected.astype(np.float64)
@@ -338,7 +338,7 @@ def _check_choices(
     got: NDArray[Any],
     one: Recorded,
     recipe: Recipe,
-    moves: Callable[[], NDArray[np.float64] | float],
+    moves: Callable[[], NDArray[np.float64]],
 ) -> None:
     """Compare discrete actions; a tie in RLlib's scores excuses a difference, and so do scores that are no numbers."""
     columns = _columns(one.outputs[output])
@@ -358,8 +358,8 @@ def _check_choices(
                 )
 
 
-def _at(by_row: NDArray[np.float64] | float, row: int) -> float:
-    return by_row if isinstance(by_row, float) else float(by_row[row].max())
+def _at(by_row: NDArray[np.float64], row: int) -> float:
+    return float(by_row[row].max()) if by_row.ndim else float(by_row)
 
 
 def ties(recipe: Recipe, outputs: Outputs) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 
 from rlservo.export.bundle import BakedStep
@@ -147,4 +148,7 @@ def _mode_detail(recipe: Recipe) -> str:
 def _transform_step(recipe: Recipe) -> BakedStep:
     if recipe.transform == "clip":
         return BakedStep(step="clip", detail="to the action space's bounds")
+    boxes = [leaf for leaf in recipe.action_leaves.values() if isinstance(leaf, Box)]
+    if all(np.dtype(leaf.dtype).kind in "iu" for leaf in boxes):
+        return BakedStep(step="unsquash", detail="the choice is counted from the action space's lower bound")
     return BakedStep(step="unsquash", detail="[-1, 1] to the action space's bounds, then clipped to them")

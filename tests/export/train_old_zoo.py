@@ -179,6 +179,7 @@ def configurations(out: Path) -> dict[str, Any]:
         "filtered_nested": toy("nested", filtered="MeanStdFilter"),
         "camera": toy("camera", model=picture),
         "levers": toy("levers"),
+        "counts": toy("counts"),
         "limbs": toy("limbs"),
         "clipped_limbs": toy("limbs", clip_actions=True),
         "masked": toy("masked", model={"custom_model": TorchActionMaskModel}),

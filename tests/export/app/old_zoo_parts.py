@@ -53,6 +53,7 @@ SPACES: dict[str, tuple[gym.Space[Any], gym.Space[Any]]] = {
         Discrete(3),
     ),
     "levers": (Box(-1.0, 1.0, (3,), np.float32), gym.spaces.MultiDiscrete([2, 3])),
+    "counts": (Box(-1.0, 1.0, (3,), np.float32), Box(-2, 4, (2,), np.int32)),
     "limbs": (
         Box(-1.0, 1.0, (3,), np.float32),
         gym.spaces.Dict(
