@@ -105,7 +105,8 @@ def measure(env: str, runners: int, envs: int, vectorize: str, iterations: int) 
     config.debugging(seed=0)
     with training_run.built(config.build_algo()) as algorithm:
         algorithm.train()
-        taken: list[tuple[float, float, float, float, dict[str, float]]] = []
+        taken: list[tuple[float, float, float, float]] = []
+        shares: list[dict[str, float]] = []
         sampled = 0.0
         for _ in range(iterations):
             began = time.perf_counter()
@@ -115,15 +116,12 @@ def measure(env: str, runners: int, envs: int, vectorize: str, iterations: int) 
             sampled = float(result[training_run.STEPS])
             timers = result["timers"]
             steps = sampled - before if before else float(result["env_runners"]["num_env_steps_sampled"])
-            taken.append(
-                (steps / wall, wall, timers["env_runner_sampling_timer"], timers["learner_update_timer"], parts(result))
-            )
-    rate, wall, sample, learn = (statistics.median(column[i] for column in taken) for i in range(4))
-    shares = {name: statistics.median(column[4][name] for column in taken) for name in taken[0][4]}
-    return Row(
-        runners, envs, vectorize, rate, wall, sample, learn, max(0.0, wall - sample - learn),
-        shares["env_step_timer"], shares["rlmodule_inference_timer"], shares["connectors"],
-    )  # fmt: skip
+            taken.append((steps / wall, wall, timers["env_runner_sampling_timer"], timers["learner_update_timer"]))
+            shares.append(parts(result))
+    rate, wall, sample, learn = (statistics.median(column) for column in zip(*taken, strict=True))
+    env_share, network, connectors = (statistics.median(one[name] for one in shares) for name in shares[0])
+    rest = max(0.0, wall - sample - learn)
+    return Row(runners, envs, vectorize, rate, wall, sample, learn, rest, env_share, network, connectors)
 
 
 def parts(result: dict[str, Any]) -> dict[str, float]:

@@ -161,7 +161,7 @@ def ray_session(
                 ray.init(
                     "local",
                     num_cpus=num_cpus or None,
-                    num_gpus=num_gpus or None,
+                    num_gpus=math.ceil(num_gpus) or None,
                     include_dashboard=False,
                     _temp_dir=folder,
                     **quiet,
@@ -392,7 +392,7 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
     except KeyboardInterrupt:
         raise Interrupted(folder) from None
     trials, failed, unfinished = [], [], False
-    for result in results:
+    for result in (results[index] for index in range(len(results))):
         if result.error is not None:
             failed.append(result)
         elif not (result.metrics or {}).get("done"):
