@@ -146,7 +146,7 @@ def film(settings: Settings, bundle: Path, env_id: str, **arguments: Any) -> Non
         env.close()
     print(f"the exported policy: return {total:.2f} in {steps} steps")
     if settings.video:
-        print(f"video: {next(folder.glob('*.mp4'))}")
+        print(f"video: {next((settings.out / 'videos' / policy.contract.name).glob('*.mp4'))}")
 
 
 # CartPole: PPO with Tune, as one trains in earnest.

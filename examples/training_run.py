@@ -449,10 +449,10 @@ def _first_line(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def _cause(error: BaseException) -> str:
+def _cause(error: BaseException | None) -> str:
     """Return the line that names the exception at the bottom of a Ray error, which is a traceback in itself."""
     lines = [line for line in str(error).splitlines() if line and not line.startswith((" ", "\t", "Traceback"))]
-    return lines[-1] if lines else _first_line(error)
+    return lines[-1] if lines else type(error).__name__
 
 
 def best_checkpoint_of(outcome: Outcome) -> Path:
