@@ -377,6 +377,7 @@ def resume(folder: Path) -> Outcome:
     """
     folder = folder.expanduser().resolve()
     run, swept = read_run(folder)
+    default_config(run.algorithm)  # registers the algorithms, quietly
     if not tune.Tuner.can_restore(str(folder)):
         raise UsageError(f"--resume {folder}: the run was stopped before Tune saved anything; start it anew")
     try:
