@@ -158,14 +158,7 @@ def ray_session(
                 # A short path: Ray's sockets live below it, and a socket's path may have 107 characters.
                 folder = tempfile.mkdtemp(prefix="train-", dir="/tmp" if Path("/tmp").is_dir() else None)
                 os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(16))
-                ray.init(
-                    "local",
-                    num_cpus=num_cpus or None,
-                    num_gpus=math.ceil(num_gpus) or None,
-                    include_dashboard=False,
-                    _temp_dir=folder,
-                    **quiet,
-                )
+                _start(folder, num_cpus, num_gpus, quiet)
             else:
                 _join(address, quiet)
             take_sigterm()  # Ray has set a handler of its own
@@ -174,6 +167,26 @@ def ray_session(
             ray.shutdown()
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def _start(folder: str, num_cpus: int, num_gpus: float, quiet: Mapping[str, Any], attempts: int = 3) -> None:
+    """Start a private Ray; on a busy machine it may miss Ray's own 30 s (ray 2.60), so it is tried again."""
+    for attempt in range(attempts):
+        try:
+            ray.init(
+                "local",
+                num_cpus=num_cpus or None,
+                num_gpus=math.ceil(num_gpus) or None,
+                include_dashboard=False,
+                _temp_dir=folder,
+                **quiet,
+            )
+            return
+        except Exception as error:  # Ray raises plain Exception, RuntimeError, and its own
+            ray.shutdown()
+            if attempt == attempts - 1:
+                raise RlservoError(f"Ray did not start: {_first_line(error)}") from error
+            print(f"Ray did not start ({_first_line(error)}); once more", file=sys.stderr, flush=True)
 
 
 def _join(address: str, quiet: Mapping[str, Any]) -> None:
