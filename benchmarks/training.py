@@ -130,7 +130,7 @@ def measure(env: str, runners: int, envs: int, vectorize: str, iterations: int, 
 def cpu_seconds(algorithm: Any) -> float:
     """Return the processor time of the driver, which learns, and of its env runners so far."""
     runners = algorithm.env_runner_group.foreach_env_runner(lambda _: time.process_time(), local_env_runner=False)
-    return time.process_time() + sum(runners)
+    return time.process_time() + float(sum(runners))
 
 
 def parts(result: dict[str, Any]) -> dict[str, float]:
