@@ -4,7 +4,7 @@
     python benchmarks/training.py --env CartPole-v1 --iterations 5
 
 Prints a table and writes `bench/training.json` and `bench/training.png`. Each row is the median of `--iterations`
-iterations after one of warm-up: PPO as the UR5 script trains it, a batch of 4,096 steps, 4 epochs. `--vectorised`
+iterations after one of warm-up: PPO as the UR5 script trains it, a batch of `--batch` steps, 4 epochs. `--vectorised`
 measures the same with Gymnasium's AsyncVectorEnv (a process per simulator), and MuJoCo alone: stepping substep by
 substep (as our simulators do), in one call, and many robots on MuJoCo's own threads (`mujoco.rollout`).
 """
@@ -25,7 +25,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 import training_run
 
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
-BATCH = 4096
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,9 @@ class Row:
     envs: int
     vectorize: str
     steps_per_s: float
+    steps_per_cpu_s: (
+        float  # the driver's and the runners' processor time together: what a busy machine leaves comparable
+    )
     iteration_s: float
     sample_s: float  # waiting for the runners (RLlib's own timer, smoothed over iterations, as the next ones)
     learn_s: float
@@ -51,19 +53,20 @@ def main() -> None:
     parser.add_argument("--runners", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--envs", type=int, nargs="+", default=[1, 2, 4, 8, 16])
     parser.add_argument("--iterations", type=int, default=3)
+    parser.add_argument("--batch", type=int, default=4096, help="environment steps an iteration")
     parser.add_argument("--vectorised", action="store_true", help="also the other ways to step several simulators")
     parser.add_argument("--out", type=Path, default=Path("bench"))
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
-    print(f"PPO on {args.env}, {BATCH:,} steps an iteration, median of {args.iterations}\n{HEADER}")
+    print(f"PPO on {args.env}, {args.batch:,} steps an iteration, median of {args.iterations}\n{HEADER}")
     with training_run.ray_session(num_cpus=max(args.runners) + 1):
         for runners in args.runners:
             for envs in args.envs:
-                rows.append(measure(args.env, runners, envs, "sync", args.iterations))
+                rows.append(measure(args.env, runners, envs, "sync", args.iterations, args.batch))
                 print(line(rows[-1]), flush=True)
         if args.vectorised:
-            rows.append(measure(args.env, 1, 2, "async", args.iterations))
+            rows.append(measure(args.env, 1, 2, "async", args.iterations, args.batch))
             print(line(rows[-1]), flush=True)
     physics = measure_physics() if args.vectorised else []
     for name, rate in physics:
@@ -74,21 +77,19 @@ def main() -> None:
     print(f"written: {args.out / 'training.json'}, {args.out / 'training.png'}")
 
 
-HEADER = (
-    f"{'runners x envs':>16} {'steps/s':>9} {'iteration':>10} {'sampling':>9} {'learning':>9} {'rest':>7}   "
-    "of sampling: env, network, connectors"
-)
+COLUMNS = ("runners x envs", "steps/s", "per CPU s", "iteration", "sampling", "learning", "rest")
+HEADER = " ".join(f"{column:>14}" for column in COLUMNS) + "   of sampling: env, network, connectors"
 
 
 def line(row: Row) -> str:
     name = f"{row.runners} x {row.envs}" + (f" {row.vectorize}" if row.vectorize != "sync" else "")
-    return (
-        f"{name:>16} {row.steps_per_s:>9,.0f} {row.iteration_s:>8.2f} s {row.sample_s:>7.2f} s {row.learn_s:>7.2f} s "
-        f"{row.rest_s:>5.2f} s   {row.env_step_share:.0%}, {row.inference_share:.0%}, {row.connectors_share:.0%}"
-    )
+    seconds = (row.iteration_s, row.sample_s, row.learn_s, row.rest_s)
+    cells = [name, f"{row.steps_per_s:,.0f}", f"{row.steps_per_cpu_s:,.0f}", *(f"{one:.2f} s" for one in seconds)]
+    shares = f"{row.env_step_share:.0%}, {row.inference_share:.0%}, {row.connectors_share:.0%}"
+    return " ".join(f"{cell:>14}" for cell in cells) + f"   {shares}"
 
 
-def measure(env: str, runners: int, envs: int, vectorize: str, iterations: int) -> Row:
+def measure(env: str, runners: int, envs: int, vectorize: str, iterations: int, batch: int) -> Row:
     """Train a few iterations and return the medians."""
     from ray.rllib.algorithms.ppo import PPOConfig
 
@@ -100,30 +101,36 @@ def measure(env: str, runners: int, envs: int, vectorize: str, iterations: int) 
         num_envs_per_env_runner=envs,
         gym_env_vectorize_mode=cast(Any, vectorize),  # its annotation names the old strings only
     )
-    config.training(train_batch_size_per_learner=BATCH, minibatch_size=512, num_epochs=4)
+    config.training(train_batch_size_per_learner=batch, minibatch_size=512, num_epochs=4)
     config.rl_module(model_config={"fcnet_hiddens": [256, 256], "fcnet_activation": "tanh", "vf_share_layers": False})
     config.debugging(seed=0)
     with training_run.built(config.build_algo()) as algorithm:
         algorithm.train()
-        taken: list[tuple[float, float, float, float, dict[str, float]]] = []
+        taken: list[tuple[float, float, float, float, float]] = []
+        shares: list[dict[str, float]] = []
         sampled = 0.0
         for _ in range(iterations):
-            began = time.perf_counter()
+            began, cpu = time.perf_counter(), cpu_seconds(algorithm)
             before = sampled
             result = algorithm.train()
-            wall = time.perf_counter() - began
+            wall, cpu = time.perf_counter() - began, cpu_seconds(algorithm) - cpu
             sampled = float(result[training_run.STEPS])
             timers = result["timers"]
             steps = sampled - before if before else float(result["env_runners"]["num_env_steps_sampled"])
             taken.append(
-                (steps / wall, wall, timers["env_runner_sampling_timer"], timers["learner_update_timer"], parts(result))
+                (steps / wall, steps / cpu, wall, timers["env_runner_sampling_timer"], timers["learner_update_timer"])
             )
-    rate, wall, sample, learn = (statistics.median(column[i] for column in taken) for i in range(4))
-    shares = {name: statistics.median(column[4][name] for column in taken) for name in taken[0][4]}
-    return Row(
-        runners, envs, vectorize, rate, wall, sample, learn, max(0.0, wall - sample - learn),
-        shares["env_step_timer"], shares["rlmodule_inference_timer"], shares["connectors"],
-    )  # fmt: skip
+            shares.append(parts(result))
+    rate, per_cpu, wall, sample, learn = (statistics.median(column) for column in zip(*taken, strict=True))
+    env_share, network, connectors = (statistics.median(one[name] for one in shares) for name in shares[0])
+    rest = max(0.0, wall - sample - learn)
+    return Row(runners, envs, vectorize, rate, per_cpu, wall, sample, learn, rest, env_share, network, connectors)
+
+
+def cpu_seconds(algorithm: Any) -> float:
+    """Return the processor time of the driver, which learns, and of its env runners so far."""
+    runners = algorithm.env_runner_group.foreach_env_runner(lambda _: time.process_time(), local_env_runner=False)
+    return time.process_time() + float(sum(runners))
 
 
 def parts(result: dict[str, Any]) -> dict[str, float]:

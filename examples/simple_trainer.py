@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import episode_traces
+import numpy as np
 import search_space
 import training_run
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
@@ -225,6 +226,11 @@ def check_machine(args: argparse.Namespace, cores: int, gpus: float, where: str)
         )
 
 
+def session_cores(run: Run) -> int:
+    """Return the cores a private Ray is started with: of as many trials at once as the machine holds."""
+    return run.num_cpus * max(1, (os.cpu_count() or 1) // run.num_cpus)
+
+
 def local_gpus() -> float:
     """Return how many GPUs torch sees here."""
     import torch
@@ -269,12 +275,15 @@ def algorithm_config(
         # By default a result comes every second, however slow the machine: then --stop-iters means nothing.
         config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=1000)
     if args.run == "DQN" and args.use_lstm:
-        config.training(replay_buffer_config={"type": "EpisodeReplayBuffer"})  # the prioritised one has no sequences
+        cast(Any, config).training(
+            replay_buffer_config={"type": "EpisodeReplayBuffer"}
+        )  # the prioritised one has no sequences
     config.callbacks(
         on_episode_end=training_run.log_success,
         on_train_result=training_run.fill_return(args.metric, args.mode),
-        **({"on_sample_end": episode_traces.trace_writer(args.output.resolve())} if args.output else {}),
     )
+    if args.output:
+        config.callbacks(on_sample_end=episode_traces.trace_writer(args.output.resolve()))
     config.debugging(seed=args.seed, log_level=args.log_level)
     return config
 
@@ -287,7 +296,7 @@ def observation_steps(space: Any, kind: str) -> Any:
     """
     flatten = not (isinstance(space, Box) and (len(space.shape) == 1 or _is_known_image(space)))
     filtered = kind == "MeanStdFilter"
-    if filtered and (not isinstance(space, Box) or space.dtype.kind != "f"):
+    if filtered and (not isinstance(space, Box) or np.dtype(space.dtype).kind != "f"):
         raise UsageError(f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, {space} is none")
     if not (flatten or filtered):
         return None
@@ -404,7 +413,7 @@ def main() -> None:
             raise UsageError(f"--resume goes on with the run as it was set up: leave --{more[0].replace('_', '-')} out")
         run, _ = training_run.read_run(args.resume)
         with training_run.ray_session(
-            num_cpus=run.num_cpus,
+            num_cpus=session_cores(run),
             num_gpus=run.num_gpus,
             address=args.address,
             log_level=run.rest["log_level"],
@@ -416,9 +425,8 @@ def main() -> None:
         if args.address is None:
             check_machine(args, os.cpu_count() or 1, local_gpus() if gpus_needed(args) else 0.0, "this machine")
         config, run, swept = set_up(args)
-        trials_at_once = max(1, (os.cpu_count() or 1) // run.num_cpus) if args.address is None else 1
         with training_run.ray_session(
-            num_cpus=run.num_cpus * trials_at_once,
+            num_cpus=session_cores(run),
             num_gpus=run.num_gpus,
             address=args.address,
             log_level=args.log_level,

@@ -108,7 +108,7 @@ def random_baseline(env_id: str, episodes: int, **arguments: Any) -> float:
     return float(np.mean(returns))
 
 
-class Mp4(RecordVideo):
+class Mp4(RecordVideo[Any, Any, Any]):
     """Gymnasium's RecordVideo, written with the ffmpeg that rlservo brings: moviepy cannot share its Pillow with us."""
 
     def __init__(self, env: Any, video_folder: str, **arguments: Any) -> None:
@@ -146,7 +146,7 @@ def film(settings: Settings, bundle: Path, env_id: str, **arguments: Any) -> Non
         env.close()
     print(f"the exported policy: return {total:.2f} in {steps} steps")
     if settings.video:
-        print(f"video: {next(folder.glob('*.mp4'))}")
+        print(f"video: {next((settings.out / 'videos' / policy.contract.name).glob('*.mp4'))}")
 
 
 # CartPole: PPO with Tune, as one trains in earnest.
@@ -283,17 +283,18 @@ def frozen_lake(settings: Settings) -> None:
     config.env_runners(
         env_to_module_connector=cast(Any, lambda env, spaces, device: FlattenObservations()),
         num_envs_per_env_runner=8,
-        rollout_fragment_length=4,  # 32 steps, then one update
+        rollout_fragment_length=1,  # 8 steps, then one update
     )
     config.training(
-        lr=2e-3,
+        lr=1e-3,
         gamma=0.95,
-        epsilon=[[0, 1.0], [12_000, 0.1]],
+        n_step=3,
+        epsilon=[[0, 1.0], [8_000, 0.05]],
         num_steps_sampled_before_learning_starts=1000,
         target_network_update_freq=500,
         dueling=False,
         double_q=True,
-        train_batch_size_per_learner=256,
+        train_batch_size_per_learner=128,
     )
     config.rl_module(model_config={"fcnet_hiddens": [64]})
     config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=1000)
@@ -302,7 +303,7 @@ def frozen_lake(settings: Settings) -> None:
     log.mkdir(parents=True)
     config.debugging(seed=1)
     with training_run.ray_session(num_cpus=1), training_run.built(config.build_algo()) as algorithm:
-        for iteration in range(2 if settings.quick else 20):
+        for iteration in range(2 if settings.quick else 14):
             result = algorithm.train()
             mean = result["env_runners"].get("episode_return_mean", float("nan"))
             print(f"iteration {iteration}: {result[STEPS]:,.0f} steps, mean return {mean:.2f}", flush=True)

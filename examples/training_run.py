@@ -158,14 +158,7 @@ def ray_session(
                 # A short path: Ray's sockets live below it, and a socket's path may have 107 characters.
                 folder = tempfile.mkdtemp(prefix="train-", dir="/tmp" if Path("/tmp").is_dir() else None)
                 os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(16))
-                ray.init(
-                    "local",
-                    num_cpus=num_cpus or None,
-                    num_gpus=num_gpus or None,
-                    include_dashboard=False,
-                    _temp_dir=folder,
-                    **quiet,
-                )
+                _start(folder, num_cpus, num_gpus, quiet)
             else:
                 _join(address, quiet)
             take_sigterm()  # Ray has set a handler of its own
@@ -174,6 +167,26 @@ def ray_session(
             ray.shutdown()
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def _start(folder: str, num_cpus: int, num_gpus: float, quiet: Mapping[str, Any], attempts: int = 3) -> None:
+    """Start a private Ray; on a busy machine it may miss Ray's own 30 s (ray 2.60), so it is tried again."""
+    for attempt in range(attempts):
+        try:
+            ray.init(
+                "local",
+                num_cpus=num_cpus or None,
+                num_gpus=math.ceil(num_gpus) or None,
+                include_dashboard=False,
+                _temp_dir=folder,
+                **quiet,
+            )
+            return
+        except Exception as error:  # Ray raises plain Exception, RuntimeError, and its own
+            ray.shutdown()
+            if attempt == attempts - 1:
+                raise RlservoError(f"Ray did not start: {_first_line(error)}") from error
+            print(f"Ray did not start ({_first_line(error)}); once more", file=sys.stderr, flush=True)
 
 
 def _join(address: str, quiet: Mapping[str, Any]) -> None:
@@ -377,6 +390,7 @@ def resume(folder: Path) -> Outcome:
     """
     folder = folder.expanduser().resolve()
     run, swept = read_run(folder)
+    default_config(run.algorithm)  # registers the algorithms, quietly
     if not tune.Tuner.can_restore(str(folder)):
         raise UsageError(f"--resume {folder}: the run was stopped before Tune saved anything; start it anew")
     try:
@@ -392,7 +406,7 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
     except KeyboardInterrupt:
         raise Interrupted(folder) from None
     trials, failed, unfinished = [], [], False
-    for result in results:
+    for result in (results[index] for index in range(len(results))):
         if result.error is not None:
             failed.append(result)
         elif not (result.metrics or {}).get("done"):
@@ -449,10 +463,10 @@ def _first_line(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def _cause(error: BaseException) -> str:
+def _cause(error: BaseException | None) -> str:
     """Return the line that names the exception at the bottom of a Ray error, which is a traceback in itself."""
     lines = [line for line in str(error).splitlines() if line and not line.startswith((" ", "\t", "Traceback"))]
-    return lines[-1] if lines else _first_line(error)
+    return lines[-1] if lines else type(error).__name__
 
 
 def best_checkpoint_of(outcome: Outcome) -> Path:

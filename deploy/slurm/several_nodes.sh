@@ -16,7 +16,7 @@ set -euo pipefail
 # Slurm runs a copy of this file from its spool: the checkout is where sbatch was called.
 cd "${RLSERVO_CHECKOUT:-${SLURM_SUBMIT_DIR:?submit this with sbatch, from the checkout}}"
 python="${RLSERVO_PYTHON:-.venv/bin/python}"
-ray="$(dirname "$python")/ray"
+ray=("$python" -m ray.scripts.scripts) # the command 'ray', whatever the path
 cores="${SLURM_CPUS_PER_TASK:?ask for the cores of each node with --cpus-per-task}"
 gpus="${SLURM_GPUS_ON_NODE:-0}"
 
@@ -49,10 +49,10 @@ trap finish EXIT
 
 address="$(srun --nodes=1 --ntasks=1 --overlap --nodelist="$head" hostname -I | awk '{print $1}')"
 [ -n "$address" ] || { echo "several_nodes.sh: node $head has no address" >&2; exit 1; }
-on_node "$head" "$ray" start --head --block --node-ip-address="$address" --port="$port" --temp-dir="$folder" \
+on_node "$head" "${ray[@]}" start --head --block --node-ip-address="$address" --port="$port" --temp-dir="$folder" \
   --num-cpus="$cores" --num-gpus="$gpus" --include-dashboard=false
 for node in "${nodes[@]:1}"; do
-  on_node "$node" "$ray" start --block --address="$address:$port" --num-cpus="$cores" --num-gpus="$gpus"
+  on_node "$node" "${ray[@]}" start --block --address="$address:$port" --num-cpus="$cores" --num-gpus="$gpus"
 done
 
 # Wait until all nodes are there: a trial that does not fit yet would wait without saying so.

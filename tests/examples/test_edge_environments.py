@@ -61,5 +61,5 @@ def test_training_survives_a_node_killed_on_the_way(tmp_path: Path, run_helper: 
     end = json.loads(out.splitlines()[-1])
     assert (end["before"], end["after"], end["code"]) == (2, 1, 0), out
     iterations = [int(n) for n in re.findall(r"^\w+_00000 +(\d+) ", out, re.MULTILINE)]
-    assert iterations[-1] == 8
+    assert iterations[-1] == 5
     assert list(tmp_path.glob("runs/policies/cart-pole/1/contract.json"))

@@ -50,6 +50,7 @@ def submit(script: str, *arguments: str, folder: Path, **more: str) -> subproces
         **os.environ,
         "PATH": f"{stubs}:{os.environ['PATH']}",
         "HOME": str(folder),
+        "RAY_worker_niceness": "0",
         "STUB_LOG": str(folder / "srun.log"),
         "SLURM_SUBMIT_DIR": str(ROOT),
         "SLURM_JOB_ID": str(os.getpid()),

@@ -20,8 +20,21 @@ RUNS = {
     "Promises32": ["--run", "DQN", "--stop-timesteps", "1000"],
     "Camera": [],
     "Endless": [],
-    "Crashing": ["--restart-failed-sub-environments", "--env-arg", "log=crashes.txt"],
-    "Crashing runner": ["--num-cpus", "1", "--env-arg", "log=runner_crashes.txt"],
+    "Crashing": [
+        "--restart-failed-sub-environments",
+        "--set",
+        "rollout_fragment_length=25",
+        "--env-arg",
+        "log=crashes.txt",
+    ],
+    "Crashing runner": [
+        "--num-cpus",
+        "1",
+        "--set",
+        "rollout_fragment_length=25",
+        "--env-arg",
+        "log=runner_crashes.txt",
+    ],
     "Crashing for good": ["--env-arg", "log=fatal_crashes.txt", "--stop-iters", "50"],
 }
 

@@ -34,9 +34,9 @@ def main(folder: Path) -> None:
         second = cluster.add_node(num_cpus=1)
         cluster.wait_for_nodes()
         command = [
-            sys.executable, str(TRAINER), "--address", cluster.address, "--num-cpus", "2", "--stop-iters", "8",
+            sys.executable, str(TRAINER), "--address", cluster.address, "--num-cpus", "2", "--stop-iters", "5",
             "--set", "train_batch_size_per_learner=400", "--hidden", "16", "--checkpoint-frequency", "1",
-            "--max-failures", "3", "--episodes", "1",
+            "--max-failures", "3", "--episodes", "1", "--set", "env_runner_health_probe_timeout_s=5",
         ]  # fmt: skip
         trainer = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         assert trainer.stdout is not None
