@@ -29,6 +29,7 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.tune.registry import get_trainable_cls
 
 SUPPORTED = ("PPO", "APPO", "IMPALA", "SAC")
+MILESTONE, MILESTONE_EPISODES = 0.95, 20  # the success rate whose time is printed, in an iteration with enough episodes
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,7 @@ class ProgressLine(tune.Callback):
     def __init__(self, args: argparse.Namespace) -> None:
         self._args = args
         self._started = time.monotonic()
+        self._milestone_reached = False
 
     def on_trial_result(self, iteration: int, trials: Any, trial: Any, result: dict[str, Any], **info: Any) -> None:
         runners: Mapping[str, Any] = result.get("env_runners", {})
@@ -136,6 +138,13 @@ class ProgressLine(tune.Callback):
             f"{steps / max(elapsed, 1e-9):6,.0f} steps/s  {int(elapsed) // 60:3d}:{int(elapsed) % 60:02d}",
             flush=True,
         )
+        if (
+            not self._milestone_reached
+            and runners.get("success_rate", 0.0) >= MILESTONE
+            and runners.get("num_episodes", 0) >= MILESTONE_EPISODES
+        ):
+            self._milestone_reached = True
+            print(f"{MILESTONE:.0%} success first reached after {steps:,.0f} steps, {elapsed:.0f} s", flush=True)
 
 
 def train(task: Task, args: argparse.Namespace) -> Path:
