@@ -242,7 +242,8 @@ def main() -> None:
     # Checkpoints hold functions of this file. Pickled by value, they load where it does not exist.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
     torch.set_num_threads(1)
-    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+    # Never another cluster that runs on this machine.
+    ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     try:
         rows = train(settings, seed, folder)
     finally:
