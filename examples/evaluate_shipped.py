@@ -1,4 +1,4 @@
-"""Measure the policies in examples/checkpoints as their cards state it: exported, deterministic, seeds never trained on.
+"""Measure the policies in examples/checkpoints as their cards state it: exported, deterministic, on fresh seeds.
 
     python examples/evaluate_shipped.py                          # all of them, 500 episodes each
     python examples/evaluate_shipped.py cartpole_dqn --write     # and put the figures into its card
@@ -74,7 +74,9 @@ def evaluate(policy: Policy, settings: Mapping[str, Any], episodes: int, seed: i
     return measured
 
 
-def _measured(wanted: Mapping[str, Any], env_config: dict[str, Any], rows: tuple[EpisodeRow, ...], seed: int) -> Measured:
+def _measured(
+    wanted: Mapping[str, Any], env_config: dict[str, Any], rows: tuple[EpisodeRow, ...], seed: int
+) -> Measured:
     threshold = wanted.get("success_return")
     judged = [row.success if threshold is None else row.episode_return >= threshold for row in rows]
     successes = None if None in judged else sum(bool(success) for success in judged)
@@ -98,7 +100,7 @@ def _measured(wanted: Mapping[str, Any], env_config: dict[str, Any], rows: tuple
 def render(measured: list[Measured]) -> str:
     """Return the Markdown table of a card."""
     lines = [
-        "| start | episodes | success | 95% interval | mean return (95% interval) | worst return | mean steps | endings |",
+        "| start | episodes | success | 95% interval | mean return (95% interval) | worst | mean steps | endings |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for one in measured:
@@ -109,8 +111,8 @@ def render(measured: list[Measured]) -> str:
         low, high = one.return_interval
         endings = ", ".join(f"{count} {status}" for status, count in sorted(one.endings.items())) or "-"
         lines.append(
-            f"| {one.start} | {one.episodes} | {success} | {interval} | {one.mean_return:.4g} ({low:.4g} to {high:.4g}) "
-            f"| {one.worst_return:.4g} | {one.mean_steps:.1f} | {endings} |"
+            f"| {one.start} | {one.episodes} | {success} | {interval} "
+            f"| {one.mean_return:.4g} ({low:.4g} to {high:.4g}) | {one.worst_return:.4g} | {one.mean_steps:.1f} | {endings} |"
         )
     return "\n".join(lines)
 

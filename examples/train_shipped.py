@@ -108,9 +108,8 @@ def change_setting(settings: dict[str, Any], change: str) -> None:
 
 def cpu_seconds() -> float:
     """Return the processor time of this process and of those it started that have ended [s]."""
-    return sum(
-        usage.ru_utime + usage.ru_stime for usage in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    )
+    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
@@ -120,7 +119,7 @@ def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
     while True:
         result = cast(dict[str, Any], algorithm.train())
         sums = {key: float(value) for key, value in result["env_runners"].get("shipped", {}).items()}
-        if sums.get("episodes"):
+        if sums.get("episodes", 0.0) > 0.0:  # RLlib gives NaN where no episode ended
             episodes += int(sums["episodes"])
             recent.append(sums)
             while sum(one["episodes"] for one in recent) - recent[0]["episodes"] >= window:
@@ -242,7 +241,8 @@ def main() -> None:
     # Checkpoints hold functions of this file. Pickled by value, they load where it does not exist.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
     torch.set_num_threads(1)
-    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+    # Never another cluster that runs on this machine.
+    ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     try:
         rows = train(settings, seed, folder)
     finally:

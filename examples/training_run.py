@@ -48,6 +48,9 @@ INTERRUPTED = 130  # the shell's exit code for Ctrl-C
 _out = Console(soft_wrap=True, highlight=False)
 
 
+MILESTONE, MILESTONE_EPISODES = 0.95, 20  # the success rate whose time is printed, in an iteration with enough episodes
+
+
 class Interrupted(Exception):
     """The user stopped the training; `folder` can be resumed."""
 
@@ -283,6 +286,7 @@ class ProgressTable(tune.Callback):
 
     def __init__(self) -> None:
         self._rows = 0
+        self._reached: set[str] = set()  # trials
 
     def on_trial_result(self, iteration: int, trials: Any, trial: Any, result: dict[str, Any], **info: Any) -> None:
         if self._rows % 25 == 0:
@@ -298,6 +302,10 @@ class ProgressTable(tune.Callback):
             f"{steps / max(seconds, 1e-9):>8,.0f} {int(seconds) // 60:>5}:{int(seconds) % 60:02d}",
             flush=True,
         )
+        enough = runners.get("num_episodes", 0) >= MILESTONE_EPISODES
+        if enough and runners.get("success_rate", 0.0) >= MILESTONE and trial.trial_id not in self._reached:
+            self._reached.add(trial.trial_id)
+            print(f"{MILESTONE:.0%} success first reached after {steps:,.0f} steps, {seconds:.0f} s", flush=True)
 
     def on_trial_error(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
         print(f"{trial.trial_id[-8:]:>8} failed; its error.txt is in {trial.path}", flush=True)
