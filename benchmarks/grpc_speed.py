@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ def main() -> None:
         obs = np.zeros([1, *map(int, shape["shape"][1:])], np.float32)
         given = module.InferInput(shape["name"], list(obs.shape), "FP32")
         given.set_data_from_numpy(obs)
-        calls[name] = lambda client=client, given=given: client.infer(asked.model, [given])
+        calls[name] = partial(client.infer, asked.model, [given])
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(ROUNDS):
         for name, call in calls.items():
