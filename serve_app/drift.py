@@ -66,7 +66,8 @@ class Drift:
     @property
     def shift(self) -> NDArray[np.float64]:
         """Mean of z per element: how far the observations have moved, in standard deviations of the training."""
-        return self._shift.copy()
+        shift: NDArray[np.float64] = self._shift.copy()
+        return shift
 
     @property
     def spread(self) -> NDArray[np.float64]:

@@ -27,7 +27,7 @@ def add_service(_servicer: Any, server: Any) -> None:
     """Register the service's methods at one of Serve's gRPC servers."""
     handlers = {name: grpc.unary_unary_rpc_method_handler(_nothing) for name in UNARY}
     handlers |= {name: grpc.stream_stream_rpc_method_handler(_nothing) for name in STREAMS}
-    service = grpc.method_handlers_generic_handler(SERVICE, handlers)
+    service: Any = grpc.method_handlers_generic_handler(SERVICE, handlers)
     server.add_generic_rpc_handlers((service,))
     # Serve has put its own functions in by now, and does not tell them the caller's deadline (ray 2.60).
     for path, handler in service._method_handlers.items():

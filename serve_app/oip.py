@@ -55,6 +55,7 @@ PLATFORM = "onnx_onnxv1"
 STATE_IN, STATE_OUT = "state_in.", "state_out."
 EXTENSIONS = ("binary_tensor_data", "parameters", "sequence")
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
+MODEL_NAME = "model_name"  # KServe's client says again what the path says
 # What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
 PARAMETERS = frozenset({*wire.OPTIONS, "binary_data_output", "sequence_id", "sequence_start", "sequence_end"})
 TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
@@ -86,6 +87,7 @@ class InferRequest(BaseModel):
         description="`explore`, `seed`, `seq`, `deadline_ms`, `timestamp`, `sequence_id`, `sequence_start`, "
         "`sequence_end`, `binary_data_output`.",
     )
+    model_name: str | None = Field(None, description="The path's, if given at all.")
     inputs: list[Tensor]
     outputs: list[dict[str, Any]] | None = Field(
         None, description='`[{"name": "action", "parameters": {"binary_data": true}}]` for bytes after the JSON.'
@@ -159,7 +161,7 @@ class _Infer:
             document: dict[str, Any] = {}
             inputs, non_finite = {contract.inputs[0].name: _raw_input(contract, view)}, False
         else:
-            document, inputs, non_finite = _read_request(view, length)
+            document, inputs, non_finite = _read_request(view, length, params["name"])
         if non_finite and (document.get("parameters") or {}).get("sequence_id"):
             wire.refuse_non_finite()  # before the sequence moves on
         answer = decide(
@@ -268,13 +270,19 @@ def _outputs(contract: Contract, decision: Decision) -> dict[str, NDArray[Any]]:
     return outputs
 
 
-def _read_request(view: memoryview, length: int | None) -> tuple[dict[str, Any], dict[str, NDArray[Any]], bool]:
+def _read_request(
+    view: memoryview, length: int | None, model: str
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]], bool]:
     """Return (the JSON document, the inputs by name, whether the JSON held NaN)."""
     if length is not None and length > len(view):
         raise RequestError(f"Inference-Header-Content-Length is {length}, and the body has {len(view)} bytes")
     header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
     document, non_finite = wire.read_json(header, such_as=SUCH_AS)
     unknown = sorted(document.keys() - REQUEST_FIELDS)
+    if unknown:
+        if document.get(MODEL_NAME) not in (None, model):
+            raise RequestError(f"'{MODEL_NAME}' is not '{model[:64]}', which the path names")
+        unknown = [field for field in unknown if field != MODEL_NAME]
     if unknown:
         raise RequestError(f"unknown field '{unknown[0][:64]}': known are {', '.join(sorted(REQUEST_FIELDS))}")
     if document.get("id") is not None and type(document["id"]) is not str:

@@ -208,6 +208,12 @@ def test_a_damaged_compressed_body_is_refused(ask: Ask, name: str) -> None:
 ROW = ONE[0].tolist()
 
 
+def test_the_models_name_may_be_said_again(ask: Ask) -> None:
+    """KServe's client does."""
+    status, reply = infer(ask, request(tensor(ROW, [1, 27])) | {"model_name": "ur5"})
+    assert (status, reply["model_name"]) == (200, "ur5")
+
+
 @pytest.mark.parametrize(
     ("body", "status", "sentence"),
     [
@@ -216,6 +222,7 @@ ROW = ONE[0].tolist()
         ({"inputs": []}, 400, "'inputs' must be a list of tensors"),
         ({"inputs": [7]}, 400, "must be an object, got the number 7"),
         (request(tensor(ROW, [1, 27])) | {"extra": 1}, 400, "unknown field 'extra'"),
+        (request(tensor(ROW, [1, 27])) | {"model_name": "ur10"}, 400, "'model_name' is not 'ur5'"),
         (request(tensor(ROW, [1, 27]), id=7), 400, "'id' must be a string, got the number 7"),
         (request(tensor(ROW, [27])), 422, "expects input 'obs' of shape [-1, 27] (-1 is the batch), got [27]"),
         (request(tensor([], [0, 27])), 422, "got an empty batch"),
