@@ -10,6 +10,7 @@ comes here through `cluster.py`. A replica imports neither torch nor ray.rllib.
 import asyncio
 import inspect
 import logging
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -31,13 +32,14 @@ from rlservo.serve_app.keys import check_exposure
 from rlservo.serve_app.ledger import GcsLedger
 from rlservo.serve_app.library import Library, Repository
 from rlservo.serve_app.plan import ServedConfig
+from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.settings import ServerSettings
 
 logger = logging.getLogger(__name__)
 
 APPLICATION = "rlservo"
 DEPLOYMENT = "PolicyServer"
-FOLLOW_TIMEOUT_S = 60.0  # [s] for every replica to load and prove what a change brought
+FOLLOW_TIMEOUT_S = 45.0  # [s] for every replica to load and prove what a change brought; HAProxy waits for 60
 # A rolling update starts the new replica before the old one stops; older Rays stop first.
 SURGE: dict[str, Any] = (
     {"max_surge_percent": 100} if "max_surge_percent" in inspect.signature(serve.deployment).parameters else {}
@@ -107,7 +109,7 @@ class PolicyServer:
         self._watch: asyncio.Task[None] | None = None
         try:
             check_exposure(_listening_host(), self._settings)
-            library = Library(Repository(folders), threads=self._settings.threads)
+            library = Library(Repository(folders), partial(Policy.load, threads=self._settings.threads))
         except RlservoError as error:
             raise _plain(error) from None
         self._control = Control(
@@ -179,6 +181,10 @@ class PolicyServer:
     async def _call_all(self, method: str, *arguments: Any) -> list[Any]:
         """Call a method of every running replica. Raises PartlyAppliedError when one of them does not answer."""
         handle: Any = serve.get_deployment_handle(self._id.name, self._id.app_name)
+        if not hasattr(type(handle), "broadcast"):  # Ray before 2.60; the handle itself has every attribute
+            raise PartlyAppliedError(
+                f"Ray {ray.__version__} cannot ask every replica at once: the others follow within a few seconds"
+            )
         try:
             replies = await handle.broadcast(method, *arguments).results_async(
                 timeout_s=FOLLOW_TIMEOUT_S, return_exceptions=True

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ class Core:
         self.settings = settings
         self.guard = Guard(Keys.from_settings(settings))
         self.metrics = Metrics(replica)
+        self.metrics.sources.append(partial(self.shadows.families, replica))
 
     def store(self) -> PolicyStore:
         """Return the policies. Raises UnavailableError while they are being loaded."""
@@ -108,7 +110,7 @@ class Core:
             assert store is not None
             default = store.default(name)
             versions[name] = (*(version for version in store.versions(name) if version != default), default)
-        return self.metrics.exposition(versions, self.shadows.families(self.replica))
+        return self.metrics.exposition(versions)
 
 
 def _rows(obs: Any) -> int:

@@ -7,7 +7,7 @@ Everything here blocks (hashing, onnxruntime, golden vectors): the event loop ha
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -131,9 +131,10 @@ def load_served(paths: Iterable[str | Path], config: ServedConfig) -> PolicyStor
 class Library:
     """The policies in memory, by name, version and hash."""
 
-    def __init__(self, repository: Repository, *, threads: int = 1) -> None:
+    def __init__(self, repository: Repository, load: Callable[[Path], Policy] = Policy.load) -> None:
+        """`load` loads and proves one bundle; raises BundleError."""
         self.repository = repository
-        self._threads = threads
+        self._load = load
         self._loaded: dict[tuple[str, str, str], Loaded] = {}
 
     def get(self, name: str, version: str, digest: str) -> Loaded | None:
@@ -151,7 +152,7 @@ class Library:
             return loaded
         _, folder = self.repository.find(name, version)
         if digest_of(folder) == digest:
-            policy = Policy.load(folder, threads=self._threads)
+            policy = self._load(folder)
             if digest_of(folder) == digest:  # it was not exchanged meanwhile
                 loaded = self._loaded[name, version, digest] = Loaded(policy, digest, now())
                 return loaded

@@ -8,7 +8,7 @@ conventions (base units, `_total`). It knows nothing of HTTP.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
@@ -63,6 +63,7 @@ class Metrics:
         self._answered: dict[tuple[str, str, str], _Series] = {}
         self._failed: dict[tuple[str, str, str, str], int] = {}
         self._streams: dict[str, int] = {}
+        self.sources: list[Callable[[], Iterable[Metric]]] = []  # further families, asked for when somebody looks
 
     def answered(self, protocol: str, decision: Decision, batch: int, seconds: float) -> None:
         """Count a request that got its action `seconds` after it arrived."""
@@ -87,13 +88,10 @@ class Metrics:
         """Return how many requests a version has answered, over all protocols."""
         return sum(sum(series.latency.counts) for key, series in self._answered.items() if key[:2] == (policy, version))
 
-    def exposition(self, policies: dict[str, tuple[str, ...]], more: Iterable[Metric] = ()) -> bytes:
-        """Return the text Prometheus reads; `policies` are the versions by name, the default last.
-
-        `more` are families of others, written after ours.
-        """
+    def exposition(self, policies: dict[str, tuple[str, ...]]) -> bytes:
+        """Return the text Prometheus reads; `policies` are the versions by name, the default last."""
         registry = CollectorRegistry(auto_describe=False)
-        registry.register(_Snapshot(self, policies, more))
+        registry.register(_Snapshot(self, policies))
         return generate_latest(registry)
 
     def families(self, policies: dict[str, tuple[str, ...]]) -> Iterator[Metric]:
@@ -132,14 +130,14 @@ class Metrics:
             for version in versions:
                 loaded.add_metric([self._replica, policy, version], float(version == versions[-1]))
         yield loaded
+        for source in self.sources:
+            yield from source()
 
 
 class _Snapshot(Collector):
-    def __init__(self, metrics: Metrics, policies: dict[str, tuple[str, ...]], more: Iterable[Metric]) -> None:
+    def __init__(self, metrics: Metrics, policies: dict[str, tuple[str, ...]]) -> None:
         self._metrics = metrics
         self._policies = policies
-        self._more = more
 
     def collect(self) -> Iterator[Metric]:
-        yield from self._metrics.families(self._policies)
-        yield from self._more
+        return self._metrics.families(self._policies)

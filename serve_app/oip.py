@@ -47,7 +47,7 @@ LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensor
 BINARY = b"application/octet-stream"
 PLATFORM = "onnx_onnxv1"
 OUTPUT = "action"
-EXTENSIONS = ("binary_tensor_data", "parameters")
+EXTENSIONS = ("binary_tensor_data", "parameters", "model_repository")
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
 # What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
 PARAMETERS = frozenset({*wire.OPTIONS, "binary_data_output", "sequence_id", "sequence_start", "sequence_end"})

@@ -14,6 +14,7 @@ FOLDERS = ("envs", "export", "serve_app", "deploy")
 ONLY_IN = {
     "ray.rllib": ("export/checkpoint.py", "export/old_stack.py", "export/old_models.py", "examples/"),
     "ray.serve": ("serve_app/app.py",),
+    "ray.experimental": ("serve_app/ledger.py",),
     "fastapi": (
         "serve_app/http.py",
         "serve_app/edge.py",

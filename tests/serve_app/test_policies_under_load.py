@@ -273,6 +273,11 @@ def cluster(repository: Path) -> Iterator[Cluster]:
         remove_folder(folder)
 
 
+def set_alias(cluster: Cluster, alias: str) -> None:
+    with cluster.admin() as admin:
+        admin.alias("ur5", alias, "1")
+
+
 def default_of(replica: dict[str, Any]) -> str:
     return str(next(policy["version"] for policy in replica["policies"] if policy["name"] == "ur5"))
 
@@ -286,9 +291,17 @@ def test_aliases_switch_on_every_replica_under_load_without_a_failed_request(clu
             # The command has returned: no replica gives the other version any more.
             assert {default_of(replica) for replica in cluster.replicas()} == {version}
         admin.rollback("ur5", "production")
+        # Commands at the same time, whichever replicas they reach, all happen.
+        at_once = [threading.Thread(target=set_alias, args=(cluster, f"at-once-{n}")) for n in range(6)]
+        for thread in at_once:
+            thread.start()
+        for thread in at_once:
+            thread.join()
     assert load.first_failures == [] and set(load.versions) == {"1", "2"}
     assert load.answered > 50
-    assert {default_of(replica) for replica in cluster.replicas()} == {"2"}
+    for replica in cluster.replicas():
+        assert default_of(replica) == "2"
+        assert set(replica["policies"][0]["aliases"]) == {"production", *(f"at-once-{n}" for n in range(6))}
 
 
 def test_a_broken_version_is_refused_under_load_and_nothing_changes(cluster: Cluster) -> None:
