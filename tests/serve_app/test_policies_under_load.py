@@ -241,6 +241,8 @@ def cluster(repository: Path) -> Iterator[Cluster]:
         "RAY_SERVE_RUN_ROUTER_IN_SEPARATE_LOOP": "0",
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
         "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
+        "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
+        "RAY_SERVE_HAPROXY_RETRIES": "5",
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "rlservo.serve_app.ingress:middlewares",
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
@@ -363,8 +365,7 @@ def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_bac
         time.sleep(1)
     print("first failures:", Counter(load.first_failures))
     assert load.failures == [], Counter(load.failures)
-    assert len(load.first_failures) <= 4 * CLIENTS
-    assert all(failure.startswith(("RemoteDisconnected", "ConnectionReset", "503")) for failure in load.first_failures)
+    assert len(load.first_failures) <= CLIENTS  # each had one request in it at most
     assert set(load.versions) == {"3"}
     assert {each["generation"] for each in cluster.replicas()} == generation
 
