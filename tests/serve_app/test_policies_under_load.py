@@ -81,7 +81,7 @@ class Cluster:
         if settings is not None:
             self.application["args"]["settings"] = {**self.application["args"]["settings"], **settings}
         if not by_command:  # starting the command costs ten seconds on a busy machine
-            connection = http.client.HTTPConnection("127.0.0.1", self.dashboard, timeout=60)
+            connection = http.client.HTTPConnection("127.0.0.1", self.dashboard, timeout=120)
             headers = {
                 "content-type": "application/json",
                 "authorization": f"Bearer {self.environment['RAY_AUTH_TOKEN']}",
@@ -99,7 +99,7 @@ class Cluster:
             program = [sys.executable, "-m", "ray.serve.scripts", "deploy", str(file)]
         done = subprocess.run(
             [*program, "-a", f"http://127.0.0.1:{self.dashboard}"],
-            env=self.environment, cwd=ROOT, capture_output=True, text=True, timeout=60,
+            env=self.environment, cwd=ROOT, capture_output=True, text=True, timeout=240,
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
 
@@ -262,8 +262,8 @@ def cluster(repository: Path) -> Iterator[Cluster]:
     made = Cluster(port, dashboard, folder, environment, repository, configuration)
     try:
         assert process.stdout.readline() == "READY\n"
-        made.deploy(serving("1"), by_command=True)
-        made.wait_for(lambda seen: len(seen) == 2, timeout_s=120)
+        made.deploy(serving("1"))
+        made.wait_for(lambda seen: len(seen) == 2, timeout_s=180)
         yield made
     finally:
         process.stdin.close()
