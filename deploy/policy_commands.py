@@ -281,13 +281,17 @@ def _show(reply: dict[str, Any], as_json: bool) -> None:
 
 def _table(replica: dict[str, Any]) -> Table:
     table = Table(title=f"replica {replica['replica']}, generation {replica['generation']} ({replica['changed_by']})")
-    for column in ("policy", "version", "state", "aliases", "since", "requests", "reason"):
-        table.add_column(column)
+    for column in ("policy", "version", "state", "aliases", "since (UTC)", "requests", "reason"):
+        table.add_column(column, no_wrap=column != "reason")
     for each in replica["policies"]:
         for version in each["version_states"]:
             marks = [*version["aliases"]]
             if version["version"] == each["version"] and "production" not in marks:
                 marks.append("(default)")
-            state = (version["version"], version["state"], ", ".join(marks), version["loaded_at"] or "")
+            state = (version["version"], version["state"], ", ".join(marks), _when(version["loaded_at"]))
             table.add_row(each["name"], *state, str(version["requests"]), version["reason"])
     return table
+
+
+def _when(time: str | None) -> str:
+    return "" if time is None else time[:19].replace("T", " ")

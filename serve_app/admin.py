@@ -44,6 +44,9 @@ class AliasCommand(_Command):
 
 class RollbackCommand(_Command):
     alias: Alias = PRODUCTION
+    expected: Version | None = Field(
+        None, description="Where the alias leads now; when it does not, nothing changes. Makes a repeated command safe."
+    )
 
 
 class CanaryCommand(_Command):
@@ -117,7 +120,13 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
     @command("rollback", "Let an alias lead where it led before")
     async def rollback(name: str, given: RollbackCommand) -> Response:
         def change(before: Plan) -> dict[str, PolicyPlan]:
-            return plan.roll_back(before, name, given.alias, lambda n, v: digest_of(control.repository.find(n, v)[1]))
+            return plan.roll_back(
+                before,
+                name,
+                given.alias,
+                lambda n, v: digest_of(control.repository.find(n, v)[1]),
+                expected=given.expected,
+            )
 
         return await changed(name, f"rollback {name} {given.alias}", change)
 

@@ -45,8 +45,10 @@ class AdminClient:
         return self._command(name, "alias", {"alias": alias, "version": version})
 
     def rollback(self, name: str, alias: str) -> dict[str, Any]:
-        """Let an alias lead where it led before."""
-        return self._command(name, "rollback", {"alias": alias})
+        """Let an alias lead where it led before; once, even if the proxy should send the command twice."""
+        policies = [policy for replica in self.replicas() for policy in replica["policies"] if policy["name"] == name]
+        expected = policies[0]["aliases"].get(alias) if policies else None
+        return self._command(name, "rollback", {"alias": alias, "expected": expected})
 
     def canary(self, name: str, version: str | None, share: float | None = None) -> dict[str, Any]:
         """Send a share of the sessions to a version, or with None end that."""

@@ -10,6 +10,7 @@ comes here through `cluster.py`. A replica imports neither torch nor ray.rllib.
 import asyncio
 import inspect
 import logging
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -36,6 +37,7 @@ from rlservo.serve_app.oip_grpc import InferenceService
 from rlservo.serve_app.plan import ServedConfig
 from rlservo.serve_app.scaling import BUSY, Load
 from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.store import load_policy
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +45,7 @@ APPLICATION = "rlservo"
 DEPLOYMENT = "PolicyServer"
 SPARE = 64  # health, metrics, documentation
 GRPC_SERVICE = "rlservo.serve_app.grpc_ingress:add_service"
-FOLLOW_TIMEOUT_S = 60.0  # [s] for every replica to load and prove what a change brought
+FOLLOW_TIMEOUT_S = 45.0  # [s] for every replica to load and prove what a change brought; HAProxy waits for 60
 # A rolling update starts the new replica before the old one stops; older Rays stop first.
 SURGE: dict[str, Any] = (
     {"max_surge_percent": 100} if "max_surge_percent" in inspect.signature(serve.deployment).parameters else {}
@@ -122,9 +124,8 @@ class PolicyServer(InferenceService):
             configure(self._settings, replica=self._replica)
             self._host = _listening_host()
             check_exposure(self._host, self._settings)
-            library = Library(
-                Repository(folders), threads=self._settings.threads, options=self._settings.policy_options
-            )
+            load = partial(load_policy, threads=self._settings.threads, options=self._settings.policy_options)
+            library = Library(Repository(folders), load)
         except RlservoError as error:
             raise _plain(error) from None
         self._control = Control(
@@ -204,6 +205,10 @@ class PolicyServer(InferenceService):
     async def _call_all(self, method: str, *arguments: Any) -> list[Any]:
         """Call a method of every running replica. Raises PartlyAppliedError when one of them does not answer."""
         handle: Any = serve.get_deployment_handle(self._id.name, self._id.app_name)
+        if not hasattr(type(handle), "broadcast"):  # Ray before 2.60; the handle itself has every attribute
+            raise PartlyAppliedError(
+                f"Ray {ray.__version__} cannot ask every replica at once: the others follow within a few seconds"
+            )
         try:
             replies = await handle.broadcast(method, *arguments).results_async(
                 timeout_s=FOLLOW_TIMEOUT_S, return_exceptions=True

@@ -8,6 +8,7 @@ Loading happens in a thread of its own, so that requests go on meanwhile. It kno
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -163,9 +164,11 @@ class Control:
             else:
                 raise UnavailableError("others keep changing what is served: try again")
             await self._apply(plan)
-        behind = await self._tell(plan.generation)
         if refused is not None:
+            with contextlib.suppress(PartlyAppliedError):  # who was not told looks for himself
+                await self._tell(plan.generation)
             raise refused
+        behind = await self._tell(plan.generation)
         if behind:
             sentences = "; ".join(f"{each.replica}: {'; '.join(each.behind)}" for each in behind)
             raise PartlyAppliedError(

@@ -55,7 +55,11 @@ class Core:
         self.settings = settings
         self.guard = Guard(Keys.from_settings(settings))
         self.metrics = Metrics(replica)
-        self.metrics.sources += [partial(queue, self, replica), partial(drift, self, replica)]
+        self.metrics.sources += [
+            partial(queue, self, replica),
+            partial(drift, self, replica),
+            partial(self.shadows.families, replica),
+        ]
         self.log = RequestLog(settings)
         self.admission = Admission(
             max_queued=settings.max_ongoing_requests,
@@ -167,7 +171,7 @@ class Core:
             assert store is not None
             default = store.default(name)
             versions[name] = (*(version for version in store.versions(name) if version != default), default)
-        return self.metrics.exposition(versions, self.shadows.families(self.replica))
+        return self.metrics.exposition(versions)
 
 
 NO_EPISODE = Episode()

@@ -337,6 +337,10 @@ def ray_environment(
             # the value is put into haproxy.cfg as it is, and '#' comments out the level that follows there.
             "RAY_SERVE_HAPROXY_NBTHREAD": "1",
             "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
+            # A replica that dies leaves requests unanswered: another one answers them, since acting changes nothing.
+            # Six tries are more than the errors after which HAProxy gives up on a replica (3, Ray's default).
+            "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
+            "RAY_SERVE_HAPROXY_RETRIES": "5",
             "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # Ray's hour would keep a half-sent request for as long
             "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
             "RAY_SERVE_HAPROXY_BINARY_PATH": str(script),

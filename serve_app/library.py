@@ -7,7 +7,7 @@ Everything here blocks (hashing, onnxruntime, golden vectors): the event loop ha
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,6 @@ from rlservo.export.errors import (
     UnknownVersionError,
     UsageError,
 )
-from rlservo.serve_app.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.plan import ServedConfig, now, plan_of
 from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.store import PolicyStore
@@ -132,13 +131,10 @@ def load_served(paths: Iterable[str | Path], config: ServedConfig) -> PolicyStor
 class Library:
     """The policies in memory, by name, version and hash."""
 
-    def __init__(
-        self, repository: Repository, *, threads: int = 1, options: Mapping[str, PolicyOptions] | None = None
-    ) -> None:
-        """Load with so many threads a session; `options` are by policy name, '*' is for those not named."""
+    def __init__(self, repository: Repository, load: Callable[[Path], Policy] = Policy.load) -> None:
+        """`load` loads and proves one bundle; raises BundleError."""
         self.repository = repository
-        self._threads = threads
-        self._options = dict(options or {})
+        self._load = load
         self._loaded: dict[tuple[str, str, str], Loaded] = {}
 
     def get(self, name: str, version: str, digest: str) -> Loaded | None:
@@ -156,8 +152,7 @@ class Library:
             return loaded
         _, folder = self.repository.find(name, version)
         if digest_of(folder) == digest:
-            options = self._options.get(name, self._options.get("*", DEFAULT_OPTIONS))
-            policy = Policy.load(folder, threads=self._threads, options=options)
+            policy = self._load(folder)
             if digest_of(folder) == digest:  # it was not exchanged meanwhile
                 loaded = self._loaded[name, version, digest] = Loaded(policy, digest, now())
                 return loaded

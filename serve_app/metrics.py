@@ -88,13 +88,10 @@ class Metrics:
         """Return how many requests a version has answered, over all protocols."""
         return sum(sum(series.latency.counts) for key, series in self._answered.items() if key[:2] == (policy, version))
 
-    def exposition(self, policies: dict[str, tuple[str, ...]], more: Iterable[Metric] = ()) -> bytes:
-        """Return the text Prometheus reads; `policies` are the versions by name, the default last.
-
-        `more` are families of others, written after ours.
-        """
+    def exposition(self, policies: dict[str, tuple[str, ...]]) -> bytes:
+        """Return the text Prometheus reads; `policies` are the versions by name, the default last."""
         registry = CollectorRegistry(auto_describe=False)
-        registry.register(_Snapshot(self, policies, more))
+        registry.register(_Snapshot(self, policies))
         return generate_latest(registry)
 
     def families(self, policies: dict[str, tuple[str, ...]]) -> Iterator[Metric]:
@@ -138,11 +135,9 @@ class Metrics:
 
 
 class _Snapshot(Collector):
-    def __init__(self, metrics: Metrics, policies: dict[str, tuple[str, ...]], more: Iterable[Metric]) -> None:
+    def __init__(self, metrics: Metrics, policies: dict[str, tuple[str, ...]]) -> None:
         self._metrics = metrics
         self._policies = policies
-        self._more = more
 
     def collect(self) -> Iterator[Metric]:
-        yield from self._metrics.families(self._policies)
-        yield from self._more
+        return self._metrics.families(self._policies)

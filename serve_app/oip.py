@@ -53,7 +53,7 @@ LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensor
 BINARY = b"application/octet-stream"
 PLATFORM = "onnx_onnxv1"
 STATE_IN, STATE_OUT = "state_in.", "state_out."
-EXTENSIONS = ("binary_tensor_data", "parameters", "sequence")
+EXTENSIONS = ("binary_tensor_data", "parameters", "sequence", "model_repository")
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
 MODEL_NAME = "model_name"  # KServe's client says again what the path says
 # What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.

@@ -271,9 +271,19 @@ def set_alias(plan: Plan, name: str, alias: str, version: str | None) -> dict[st
     return _with(plan, name, policy, aliases=aliases, history=_moved(policy, aliases))
 
 
-def roll_back(plan: Plan, name: str, alias: str, digest_of: DigestOf) -> dict[str, PolicyPlan]:
-    """Let an alias lead where it led before, loading that version again if need be."""
+def roll_back(
+    plan: Plan, name: str, alias: str, digest_of: DigestOf, *, expected: str | None = None
+) -> dict[str, PolicyPlan]:
+    """Let an alias lead where it led before, loading that version again if need be.
+
+    `expected` is where it leads as far as the caller knows: the same command twice goes back once.
+    """
     policy = plan.policy(name)
+    if expected is not None and policy.aliases.get(alias) != expected:
+        leads = f"leads to {policy.aliases[alias]}" if alias in policy.aliases else "is gone"
+        raise ConflictError(
+            f"the alias '{alias}' of policy '{name}' {leads} and was expected at {expected}: moved already"
+        )
     earlier = policy.history.get(alias, ())
     if not earlier:
         raise ConflictError(f"the alias '{alias}' of policy '{name}' has led nowhere else: there is no way back")

@@ -125,4 +125,6 @@ class ServerSettings(BaseModel):
             source = PREFIX + name.upper() if name in values and name not in given else f"the setting '{name}'"
             known = ", ".join(cls.model_fields)
             hint = f"; known: {known}" if first["type"] == "extra_forbidden" else ""
-            raise UsageError(f"{source} is not usable: {first['msg']} (given: {first['input']!r:.80}){hint}") from error
+            field = cls.model_fields.get(name)
+            given_text = "" if field is not None and not field.repr else f" (given: {first['input']!r:.80})"
+            raise UsageError(f"{source} is not usable: {first['msg']}{given_text}{hint}") from None  # it may be a key

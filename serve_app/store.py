@@ -125,7 +125,7 @@ class PolicyStore:
         policies: list[Policy] = []
         for folder in folders.values():
             try:
-                policies.append(_load(folder, threads, options or {}))
+                policies.append(load_policy(folder, threads=threads, options=options))
             except BundleError as error:
                 failures.append(error)
         if len(failures) == 1:
@@ -273,7 +273,8 @@ def take_notices(policy: Policy) -> tuple[str, ...]:
     return taken
 
 
-def _load(folder: Path, threads: int, options: Mapping[str, PolicyOptions]) -> Policy:
+def load_policy(folder: Path, *, threads: int = 1, options: Mapping[str, PolicyOptions] | None = None) -> Policy:
+    """Load and prove a bundle; `options` are by policy name, '*' is for those not named. Raises BundleError."""
     if not options:
         return Policy.load(folder, threads=threads)
     name = read_contract(folder).name

@@ -20,6 +20,7 @@ ONLY_IN = {
         "examples/",
     ),
     "ray.serve": ("serve_app/app.py",),
+    "ray.experimental": ("serve_app/ledger.py",),
     "fastapi": (
         "serve_app/http.py",
         "serve_app/edge.py",

@@ -33,7 +33,13 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def url(policies: Path) -> Iterator[str]:
+def runtime(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where `rlservo serve` keeps its operator's key."""
+    return tmp_path_factory.mktemp("runtime")
+
+
+@pytest.fixture(scope="module")
+def url(policies: Path, runtime: Path) -> Iterator[str]:
     """The two policies behind `rlservo serve`, as a user starts it."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -42,7 +48,7 @@ def url(policies: Path) -> Iterator[str]:
         [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(policies), "--port", str(port)],
         stdout=subprocess.DEVNULL,
         start_new_session=True,
-        env={**os.environ},
+        env={**os.environ, "XDG_RUNTIME_DIR": str(runtime)},
     )
     try:
         with PolicyClient(f"http://127.0.0.1:{port}", "ur5") as probe_client:
@@ -51,6 +57,18 @@ def url(policies: Path) -> Iterator[str]:
     finally:
         server.send_signal(signal.SIGINT)
         server.wait(60)
+    assert list((runtime / "rlservo").iterdir()) == []  # the key went with the server
+
+
+def test_the_operator_administers_with_the_key_that_serve_wrote(url: str, runtime: Path) -> None:
+    (key,) = (runtime / "rlservo").iterdir()
+    assert key.stat().st_mode & 0o777 == 0o600
+    done = subprocess.run(
+        [sys.executable, "-m", "rlservo.deploy.cli", "policy", "alias", "ur5", "production=1", "--url", url],
+        capture_output=True, text=True, timeout=120, env={**os.environ, "XDG_RUNTIME_DIR": str(runtime)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "ur5: default 1, loaded 1; aliases production=1" in done.stdout
 
 
 def test_ur5_reaches_95_percent_of_random_targets(url: str) -> None:

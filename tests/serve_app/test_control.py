@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from rlservo.serve_app import plan
 from rlservo.serve_app.control import Change, Control, Following
 from rlservo.serve_app.library import Library, Repository, digest_of
 from rlservo.serve_app.plan import Canary, Plan
+from rlservo.serve_app.policy import Policy
 
 OBS = np.zeros(27, np.float32) + 0.1
 
@@ -279,6 +281,30 @@ def test_canary_and_shadow_have_to_read_and_give_the_same(
             await control.change(lambda p: plan.set_canary(p, "ur5", Canary(version="12", share=0.5)), what="canary")
         with pytest.raises(RefusedError, match=r"version 12 cannot be the shadow of version 1"):
             await control.change(lambda p: plan.set_shadow(p, "ur5", "12"), what="shadow")
+
+    asyncio.run(run())
+
+
+def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folder: Path) -> None:
+    began, go_on = threading.Event(), threading.Event()
+
+    def slowly(bundle: Path) -> Policy:
+        if bundle.name == "2":
+            began.set()
+            assert go_on.wait(20)
+        return Policy.load(bundle)
+
+    async def run() -> None:
+        control = Control(Library(Repository([folder]), slowly), Shelf(), replica="slow")
+        await control.configure(config("1", production="1"))
+        change = asyncio.create_task(control.change(loading(control, "2"), what="load"))
+        while not began.is_set():
+            await asyncio.sleep(0.01)
+        assert control.states()["ur5"]["2"].state == "loading"
+        assert control.store is not None and control.store.act("ur5", None, OBS).version == "1"
+        go_on.set()
+        await change
+        assert control.states()["ur5"]["2"].state == "ready" and control.store.versions("ur5") == ("1", "2")
 
     asyncio.run(run())
 

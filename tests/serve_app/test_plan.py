@@ -92,7 +92,9 @@ def test_rollbacks_go_back_through_what_an_alias_was_and_load_what_is_gone() -> 
 
     now = now.after(plan.roll_back(now, "ur5", "production", digest_of), "rollback")
     assert now.policies["ur5"].default == "2" and now.policies["ur5"].versions["2"] == "b2" and asked == [("ur5", "2")]
-    now = now.after(plan.roll_back(now, "ur5", "production", digest_of), "rollback")
+    with pytest.raises(ConflictError, match="leads to 2 and was expected at 10"):
+        plan.roll_back(now, "ur5", "production", digest_of, expected="10")
+    now = now.after(plan.roll_back(now, "ur5", "production", digest_of, expected="2"), "rollback")
     assert now.policies["ur5"].default == "1"
     with pytest.raises(ConflictError, match="has led nowhere else"):
         plan.roll_back(now, "ur5", "production", digest_of)

@@ -81,7 +81,7 @@ class Cluster:
         if settings is not None:
             self.application["args"]["settings"] = {**self.application["args"]["settings"], **settings}
         if not by_command:  # starting the command costs ten seconds on a busy machine
-            connection = http.client.HTTPConnection("127.0.0.1", self.dashboard, timeout=60)
+            connection = http.client.HTTPConnection("127.0.0.1", self.dashboard, timeout=120)
             headers = {
                 "content-type": "application/json",
                 "authorization": f"Bearer {self.environment['RAY_AUTH_TOKEN']}",
@@ -99,7 +99,7 @@ class Cluster:
             program = [sys.executable, "-m", "ray.serve.scripts", "deploy", str(file)]
         done = subprocess.run(
             [*program, "-a", f"http://127.0.0.1:{self.dashboard}"],
-            env=self.environment, cwd=ROOT, capture_output=True, text=True, timeout=60,
+            env=self.environment, cwd=ROOT, capture_output=True, text=True, timeout=240,
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
 
@@ -241,6 +241,8 @@ def cluster(repository: Path) -> Iterator[Cluster]:
         "RAY_SERVE_RUN_ROUTER_IN_SEPARATE_LOOP": "0",
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
         "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
+        "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
+        "RAY_SERVE_HAPROXY_RETRIES": "5",
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "rlservo.serve_app.ingress:middlewares",
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
@@ -260,8 +262,8 @@ def cluster(repository: Path) -> Iterator[Cluster]:
     made = Cluster(port, dashboard, folder, environment, repository, configuration)
     try:
         assert process.stdout.readline() == "READY\n"
-        made.deploy(serving("1"), by_command=True)
-        made.wait_for(lambda seen: len(seen) == 2, timeout_s=120)
+        made.deploy(serving("1"))
+        made.wait_for(lambda seen: len(seen) == 2, timeout_s=180)
         yield made
     finally:
         process.stdin.close()
@@ -271,6 +273,11 @@ def cluster(repository: Path) -> Iterator[Cluster]:
         process.wait()
         process.stdout.close()
         remove_folder(folder)
+
+
+def set_alias(cluster: Cluster, alias: str) -> None:
+    with cluster.admin() as admin:
+        admin.alias("ur5", alias, "1")
 
 
 def default_of(replica: dict[str, Any]) -> str:
@@ -286,9 +293,17 @@ def test_aliases_switch_on_every_replica_under_load_without_a_failed_request(clu
             # The command has returned: no replica gives the other version any more.
             assert {default_of(replica) for replica in cluster.replicas()} == {version}
         admin.rollback("ur5", "production")
+        # Commands at the same time, whichever replicas they reach, all happen.
+        at_once = [threading.Thread(target=set_alias, args=(cluster, f"at-once-{n}")) for n in range(6)]
+        for thread in at_once:
+            thread.start()
+        for thread in at_once:
+            thread.join()
     assert load.first_failures == [] and set(load.versions) == {"1", "2"}
     assert load.answered > 50
-    assert {default_of(replica) for replica in cluster.replicas()} == {"2"}
+    for replica in cluster.replicas():
+        assert default_of(replica) == "2"
+        assert set(replica["policies"][0]["aliases"]) == {"production", *(f"at-once-{n}" for n in range(6))}
 
 
 def test_a_broken_version_is_refused_under_load_and_nothing_changes(cluster: Cluster) -> None:
@@ -350,8 +365,7 @@ def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_bac
         time.sleep(1)
     print("first failures:", Counter(load.first_failures))
     assert load.failures == [], Counter(load.failures)
-    assert len(load.first_failures) <= 4 * CLIENTS
-    assert all(failure.startswith(("RemoteDisconnected", "ConnectionReset", "503")) for failure in load.first_failures)
+    assert len(load.first_failures) <= CLIENTS  # each had one request in it at most
     assert set(load.versions) == {"3"}
     assert {each["generation"] for each in cluster.replicas()} == generation
 

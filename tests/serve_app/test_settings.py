@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rlservo.export.errors import UsageError
+from rlservo.serve_app.keys import new_key
 from rlservo.serve_app.settings import ServerSettings
 
 
@@ -27,3 +28,10 @@ def test_a_setting_that_cannot_be_used_is_named(
 ) -> None:
     with pytest.raises(UsageError, match=sentence):
         ServerSettings.from_environment(given, environment=environment)
+
+
+def test_a_key_put_where_its_hash_belongs_is_not_shown() -> None:
+    key, _ = new_key("operator", admin=True)
+    with pytest.raises(UsageError, match="RLSERVO_OPERATOR_KEY is not usable") as caught:
+        ServerSettings.from_environment(environment={"RLSERVO_OPERATOR_KEY": key})
+    assert key not in caught.value.message
