@@ -114,11 +114,16 @@ class WithFallback:
             try:
                 action = self._policy.act(obs, explore=explore, seed=seed, **more)
             except (DeadlineError, UnavailableError, SessionLostError) as error:
-                if tries_left and self._fallback_is("hold") and self._last is None and not _is_lost(error):
+                if (
+                    tries_left
+                    and self._fallback_is("hold")
+                    and self._last is None
+                    and not isinstance(error, SessionLostError)
+                ):
                     self._count(error)
                     continue  # the robot has not been commanded yet, and what it sees has not changed
                 return self._fall_back(error)
-            self._last = action
+            self._last = _copy(action)  # a loop may write into what it got
             return action
         raise AssertionError("the last try returns or raises")
 
@@ -167,10 +172,6 @@ class WithFallback:
             self._on_fallback(error)
 
 
-def _is_lost(error: RlservoError) -> bool:
-    return isinstance(error, SessionLostError)
-
-
 def _zero(contract: Contract) -> Any:
     leaves = leaf_specs(contract.action_space, "action")
     choice = next((name for name, leaf in leaves.items() if np.dtype(leaf.dtype).kind != "f"), None)
@@ -203,7 +204,6 @@ def _checked(contract: Contract, action: Any) -> Any:
 
 
 def _copy(action: Any) -> Any:
-    """A loop may write into the action it got."""
     if isinstance(action, dict):
         return {key: _copy(part) for key, part in action.items()}
     return tuple(_copy(part) for part in action) if isinstance(action, tuple) else action.copy()
