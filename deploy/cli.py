@@ -43,6 +43,13 @@ class Rate(str, Enum):
     max = "max"
 
 
+class TransportKind(str, Enum):
+    """How to reach the server."""
+
+    http = "http"
+    ws = "ws"
+
+
 class Pick(str, Enum):
     """Which end of a metric is the better one."""
 
@@ -349,6 +356,22 @@ def rollout(
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
     ] = None,
     video: Annotated[Path | None, typer.Option(help="Write the first episode to this .mp4 file.")] = None,
+    transport: Annotated[
+        TransportKind, typer.Option(help="http: JSON, a request per action; ws: one WebSocket.")
+    ] = TransportKind.http,
+    deadline_ms: Annotated[float | None, typer.Option(help="An action that takes longer is not used.")] = None,
+    fallback: Annotated[
+        str | None,
+        typer.Option(
+            metavar="hold|zero|stop|ACTION", help="What the robot does without an answer in time; by default it fails."
+        ),
+    ] = None,
+    server_state: Annotated[
+        bool, typer.Option("--server-state", help="Leave a recurrent policy's state with the server.")
+    ] = False,
+    api_key: Annotated[
+        str | None, typer.Option(envvar="RLSERVO_API_KEY", help="Rather in the variable: others see arguments.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Drive an environment with a policy and report success, return, latency and deadline misses.
@@ -357,15 +380,17 @@ def rollout(
     """
     if (url is None) == (bundle is None):
         raise UsageError("give either --url (a server) or --bundle (in process)")
+    if bundle is not None and (fallback, deadline_ms, transport) != (None, None, TransportKind.http):
+        raise UsageError("--transport, --deadline-ms and --fallback are for a server (--url)")
     if video is not None:
         choose_gl_backend()
     with _extra("sim"):
         from rlservo.serve_app.rollout import rollout as run_rollout
         from rlservo.serve_app.rollout_report import render_report
 
-    with _acting_policy(url, policy, bundle) as acting:
+    with _acting_policy(url, policy, bundle, transport, deadline_ms, server_state, api_key) as acting:
         report = run_rollout(
-            acting,
+            _with_fallback(acting, fallback),
             env,
             episodes=episodes,
             seed=seed,
@@ -380,6 +405,8 @@ def rollout(
         _out.print(render_report(report))
     if report.interrupted:
         raise typer.Exit(130)
+    if report.stopped is not None:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -405,7 +432,15 @@ robot_commands.add_to(app)
 app.add_typer(policy_commands.policy, name="policy")
 
 
-def _acting_policy(url: str | None, name: str | None, bundle: Path | None) -> ActingPolicy:
+def _acting_policy(
+    url: str | None,
+    name: str | None,
+    bundle: Path | None,
+    transport: TransportKind,
+    deadline_ms: float | None,
+    server_state: bool,
+    api_key: str | None,
+) -> ActingPolicy:
     """Return the policy to drive with; in process it needs no HTTP client."""
     if bundle is not None:
         from rlservo.serve_app.policy import Policy
@@ -413,8 +448,24 @@ def _acting_policy(url: str | None, name: str | None, bundle: Path | None) -> Ac
         return Policy.load(bundle)
     with _extra("client"):
         from rlservo.serve_app.client import PolicyClient
+        from rlservo.serve_app.stream_client import StreamClient
 
-    return PolicyClient(str(url), name)
+    kind = StreamClient if transport is TransportKind.ws else PolicyClient
+    return kind(str(url), name, deadline_ms=deadline_ms, server_state=server_state, api_key=api_key)
+
+
+def _with_fallback(policy: ActingPolicy, fallback: str | None) -> ActingPolicy:
+    if fallback is None:
+        return policy
+    from rlservo.serve_app.fallback import WithFallback
+
+    if fallback in ("hold", "zero", "stop"):
+        return WithFallback(policy, fallback)
+    try:
+        action = json.loads(fallback)
+    except json.JSONDecodeError:
+        raise UsageError(f"--fallback {fallback!r}: expected hold, zero, stop or an action such as [0, 0]") from None
+    return WithFallback(policy, action)
 
 
 def parse_env_arguments(pairs: list[str]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import time
+import uuid
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
@@ -23,6 +24,7 @@ from rlservo.export.errors import (
     ActionError,
     DeadlineError,
     ObservationError,
+    SessionLostError,
     UnavailableError,
     UnknownPolicyError,
     UsageError,
@@ -46,7 +48,9 @@ class PolicyClient:
     the server loads meanwhile does not change a running loop.
 
     Thread-safe for stateless policies: threads share the connections and each gets the answer to its own request.
-    A recurrent policy's state is kept here and sent along, so such a client belongs to one loop.
+    A recurrent policy's state is kept here and sent along, so such a client belongs to one loop; no replica that dies
+    takes it along. With `server_state` it stays with the server instead, in a session of this client, which is worth
+    it for large states (frames of a camera) and raises SessionLostError when the server has lost it.
     """
 
     def __init__(
@@ -58,23 +62,35 @@ class PolicyClient:
         timeout_s: float = 5.0,
         retries: int = 2,
         api_key: str | None = None,
+        deadline_ms: float | None = None,
+        server_state: bool = False,
     ) -> None:
         """Check the arguments; the server is first asked when `contract` or `act` needs it.
 
-        `policy` may be None where the server has exactly one. `timeout_s` bounds one call, its retries included;
-        `retries` counts further attempts after a failed connection or a 503, nothing else is ever sent twice.
+        `policy` may be None where the server has exactly one. `timeout_s` bounds one call, its retries included, and
+        `deadline_ms` instead of it each `act`; `retries` counts further attempts after a failed connection or a 503,
+        nothing else is ever sent twice.
         """
+        if deadline_ms is not None and not deadline_ms > 0:
+            raise UsageError(f"deadline_ms must be above 0, got {deadline_ms}")
         if policy == "":
             raise UsageError("the policy's name is empty: give a name, or None where the server has only one policy")
         if version is not None and policy is None:
             raise UsageError(f"version {version!r} was given without the policy's name")
         self._transport = Transport(url, timeout_s=timeout_s, retries=retries, api_key=api_key)
-        self._deadline_ms = 1e3 * timeout_s
+        self._deadline_ms = 1e3 * timeout_s if deadline_ms is None else deadline_ms
         self._policy = policy
         self._version = version
         self._contract: Contract | None = None
         self._numbers = itertools.count(1)  # next() is atomic: no two requests share a number
-        self._state: dict[str, Any] | None = None
+        self._state: dict[str, Any] = {}  # empty at an episode's start
+        self._session = uuid.uuid4().hex if server_state else None
+        self._steps = 0  # of the session's episode
+
+    @property
+    def reconnects(self) -> int:
+        """How many connections were made after the first."""
+        return self._transport.reconnects
 
     @property
     def contract(self) -> Contract:
@@ -87,8 +103,10 @@ class PolicyClient:
             self._contract = self._fetch()
         return self._contract
 
-    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> Any:
-        """Return the action for `obs`, as `ActingPolicy.act` describes.
+    def act(
+        self, obs: Observation, *, explore: bool = False, seed: int | None = None, reward: ArrayLike | None = None
+    ) -> Any:
+        """Return the action for `obs`, as `ActingPolicy.act` describes; `reward` as `Policy.act` does.
 
         Raises ObservationError (non-finite numbers are refused here, the rest by the server), ActionError when the
         answer is not an action of this policy, DeadlineError after `timeout_s`, UnavailableError when the server
@@ -96,26 +114,32 @@ class PolicyClient:
         """
         contract = self.contract
         number = next(self._numbers)
-        plain, batch = _sendable(obs, contract)
+        plain, batch = sendable(obs, contract)
         # The server drops what it could not answer in time, instead of working through a queue of abandoned questions.
         request: dict[str, Any] = {"obs": plain, "seq": number, "deadline_ms": self._deadline_ms}
         if explore:
             request["explore"] = True
         if seed is not None:
             request["seed"] = seed
-        if self._state is not None:
+        if reward is not None:
+            request["reward"] = np.asarray(reward)
+        if self._session is not None:
+            request.update(session_id=self._session, reset=self._steps == 0)
+        elif contract.state:
             request["state"] = self._state
         path = ("v1", "policies", contract.name, "versions", contract.version, "act")
-        reply = self._transport.post(*path, body=encode(request))
-        self._check_sender(reply, number, contract)
-        action = _restored(reply.get("action"), batch, contract)
-        if contract.state:
-            self._state = reply.get("state")
+        reply = self._transport.post(*path, body=encode(request), timeout_s=self._deadline_ms / 1e3)
+        check_sender(self._transport.url, reply, number, contract)
+        action = restored(reply.get("action"), batch, contract)
+        if self._session is not None:
+            self._steps = check_step(reply, self._steps)
+        elif contract.state:
+            self._state = carried(reply, contract)
         return action
 
     def reset(self) -> None:
-        """Start an episode: the next request carries no recurrent state. Sends nothing."""
-        self._state = None
+        """Start an episode: the next request begins with the state of an episode's start. Sends nothing."""
+        self._state, self._steps = {}, 0
 
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:
         """Return as soon as the server offers the policy.
@@ -163,22 +187,44 @@ class PolicyClient:
                 f"{first['msg']} (is the server another version of rlservo?)"
             ) from error
 
-    def _check_sender(self, reply: Any, number: int, contract: Contract) -> None:
-        """Refuse an answer to another request or from another policy: it must not move this robot."""
-        if not isinstance(reply, dict):
-            raise UnavailableError(f"{self._transport.url} answered with {type(reply).__name__}, expected an object")
-        if reply.get("seq") != number:
-            raise UnavailableError(
-                f"{self._transport.url} answered request {reply.get('seq')!r}, expected {number}: "
-                "the action was dropped",
-                {"expected": number, "actual": reply.get("seq")},
-            )
-        sender = (reply.get("policy"), reply.get("version"))
-        if sender != (contract.name, contract.version):
-            raise UnavailableError(
-                f"{self._transport.url} answered for policy {sender[0]!r} version {sender[1]!r}, expected "
-                f"{contract.name!r} version {contract.version!r}: the action was dropped"
-            )
+
+def check_sender(url: str, reply: Any, number: int, contract: Contract) -> None:
+    """Refuse an answer to another request or from another policy: it must not move this robot."""
+    if not isinstance(reply, dict):
+        raise UnavailableError(f"{url} answered with {type(reply).__name__}, expected an object")
+    if reply.get("seq") != number:
+        raise UnavailableError(
+            f"{url} answered request {reply.get('seq')!r}, expected {number}: the action was dropped",
+            {"expected": number, "actual": reply.get("seq")},
+        )
+    sender = (reply.get("policy"), reply.get("version"))
+    if sender != (contract.name, contract.version):
+        raise UnavailableError(
+            f"{url} answered for policy {sender[0]!r} version {sender[1]!r}, expected "
+            f"{contract.name!r} version {contract.version!r}: the action was dropped"
+        )
+
+
+def check_step(reply: Mapping[str, Any], steps: int) -> int:
+    """Return how many steps the server's memory has come; raise SessionLostError unless it comes from this episode.
+
+    It may be ahead: a step whose answer came too late, or was refused here, has moved it on all the same.
+    """
+    step = reply.get("session_step")
+    if type(step) is not int or step <= steps or (steps == 0 and step != 1):
+        raise SessionLostError(
+            f"the server's memory is at step {step!r} of an episode, expected one after {steps}: it is not this "
+            "episode's; call reset() to begin one"
+        )
+    return step
+
+
+def carried(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
+    """Return the state for the next request; raise UnavailableError where the server gave none."""
+    state = reply.get("state")
+    if not isinstance(state, dict) or set(state) != {spec.name for spec in contract.state}:
+        raise UnavailableError(f"the server's answer for {contract.name!r} lacks the state: the action was dropped")
+    return state
 
 
 def _only_policy(listing: Any) -> str:
@@ -194,7 +240,7 @@ def _only_policy(listing: Any) -> str:
     return names[0]
 
 
-def _sendable(obs: Observation, contract: Contract) -> tuple[Any, tuple[int, ...]]:
+def sendable(obs: Observation, contract: Contract) -> tuple[Any, tuple[int, ...]]:
     """Return (what goes into the JSON, the batch axis as () or (B,)); the server checks shapes and names."""
     space = contract.observation_space
     if isinstance(space, DictSpec | TupleSpec):
@@ -241,7 +287,7 @@ def _finite(value: ArrayLike, where: str) -> NDArray[Any]:
     return array
 
 
-def _restored(action: Any, batch: tuple[int, ...], contract: Contract) -> Any:
+def restored(action: Any, batch: tuple[int, ...], contract: Contract) -> Any:
     """Return the JSON action in the space's form, arrays of its dtype and shape, or raise ActionError."""
     return build_action(
         contract.action_space,
@@ -258,7 +304,7 @@ def _part(action: Any, name: str, contract: Contract) -> Any:
     for step in name.split(".")[1:]:
         if isinstance(part, dict) and step in part:
             part = part[step]
-        elif isinstance(part, list) and step.isdigit() and int(step) < len(part):
+        elif isinstance(part, list | tuple) and step.isdigit() and int(step) < len(part):
             part = part[int(step)]
         else:
             raise ActionError(f"the server's action for {contract.name!r} lacks the part {name!r}")

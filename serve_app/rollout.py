@@ -17,9 +17,10 @@ import numpy as np
 
 from rlservo.export.errors import RlservoError, UsageError
 from rlservo.serve_app.acting import ActingPolicy
+from rlservo.serve_app.fallback import LinkCounts, StoppedError, WithFallback
 from rlservo.serve_app.memory import REWARD
 from rlservo.serve_app.rollout_env import check_fit, control_rate_of, make_env
-from rlservo.serve_app.rollout_report import EpisodeRow, Rate, RolloutReport, summarise
+from rlservo.serve_app.rollout_report import EpisodeRow, Link, Rate, RolloutReport, summarise
 from rlservo.serve_app.video import VideoFile, rgb_frame
 
 if TYPE_CHECKING:
@@ -47,7 +48,8 @@ def rollout(
     from the same number. With rate 'real' the loop keeps the control rate on an absolute schedule, as on a robot: a
     period that is missed is counted and skipped, never caught up in a burst. `video` receives the frames of the first
     `video_episodes` episodes at the control rate; drawing happens inside the loop, so it counts as its time.
-    `on_episode` is called after each episode. Ctrl-C returns what was finished, with `interrupted` set.
+    `on_episode` is called after each episode. Ctrl-C returns what was finished, with `interrupted` set; so does a
+    fallback (`WithFallback`) that is to stop, with `stopped`.
 
     Raises UsageError when the environment cannot be made, does not fit the policy's contract or fails, and whatever
     `policy.act` raises, with the episode and the step in front. The environment is always closed, the policy never.
@@ -77,7 +79,7 @@ def rollout(
         if video is not None and control_rate_hz is not None:
             loop.video = cleanup.enter_context(VideoFile(video, fps=control_rate_hz))
         rows: list[EpisodeRow] = []
-        interrupted = False
+        interrupted, stopped = False, None
         began = time.perf_counter()
         try:
             for index in range(episodes):
@@ -88,6 +90,8 @@ def rollout(
                     on_episode(row)
         except KeyboardInterrupt:
             interrupted = True
+        except StoppedError as error:
+            stopped = error.message
         wall_s = time.perf_counter() - began
     return summarise(
         rows,
@@ -103,6 +107,27 @@ def rollout(
         control_rate_hz=control_rate_hz,
         overruns=loop.pacer.overruns,
         video=str(video) if loop.video is not None and loop.video.frames else None,
+        link=_link_of(policy),
+        stopped=stopped,
+    )
+
+
+def _link_of(policy: ActingPolicy) -> Link | None:
+    """Return what a policy behind a network counted; None for one in process."""
+    counts, fallback, inner = LinkCounts(), None, policy
+    if isinstance(policy, WithFallback):
+        counts, fallback, inner = policy.counts, policy.name, policy.policy
+    reconnects = getattr(inner, "reconnects", None)
+    if reconnects is None and fallback is None:
+        return None
+    return Link(
+        fallback=fallback,
+        late=counts.late,
+        unavailable=counts.unavailable,
+        lost=counts.lost,
+        fallback_steps=counts.fallback,
+        stale=getattr(inner, "stale", 0),
+        reconnects=reconnects or 0,
     )
 
 

@@ -39,6 +39,19 @@ class Latency:
 
 
 @dataclass(frozen=True)
+class Link:
+    """How the connection to the policy did, over every step of the run."""
+
+    fallback: str | None  # what was chosen for when there is no answer
+    late: int  # no answer within the deadline
+    unavailable: int  # no connection, or a server that refused for now
+    lost: int  # the server had lost the episode's memory
+    fallback_steps: int  # steps that got the fallback's action
+    stale: int  # answers that came after their deadline and were dropped
+    reconnects: int
+
+
+@dataclass(frozen=True)
 class RolloutReport:
     """A run of several episodes. Figures of episodes count finished ones; None means there is nothing to count."""
 
@@ -66,6 +79,8 @@ class RolloutReport:
     deadline_misses: int | None  # steps whose `act` alone took longer than that
     overruns: int | None  # rate 'real': steps after which the loop was late for the next one
     video: str | None
+    link: Link | None = None  # None: nothing was between the loop and its policy
+    stopped: str | None = None  # why the loop ended before its episodes did: the fallback is 'stop'
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types."""
@@ -90,6 +105,8 @@ def summarise(
     control_rate_hz: float | None,
     overruns: int,
     video: str | None,
+    link: Link | None = None,
+    stopped: str | None = None,
 ) -> RolloutReport:
     """Return the report of what was recorded."""
     judged = [row.success for row in rows if row.success is not None]
@@ -120,6 +137,8 @@ def summarise(
         deadline_misses=None if deadline_s is None else sum(latency > deadline_s for latency in latencies_s),
         overruns=overruns if rate == "real" else None,
         video=video,
+        link=link,
+        stopped=stopped,
     )
 
 
@@ -181,6 +200,17 @@ def render_report(report: RolloutReport) -> Table:
             "overruns",
             f"{report.overruns} of {report.steps} steps (the whole loop, env.step included, took longer than a period)",
         )
+    if report.link is not None:
+        link = report.link
+        table.add_row(
+            "link",
+            f"late {link.late}  unavailable {link.unavailable}  memory lost {link.lost}  dropped late answers "
+            f"{link.stale}  reconnects {link.reconnects}",
+        )
+        if link.fallback is not None:
+            table.add_row("fallback", f"{link.fallback_steps} of {report.steps} steps ({link.fallback})")
+    if report.stopped is not None:
+        table.add_row("stopped", report.stopped)
     table.add_row("speed", f"{report.steps_per_s:,.0f} steps/s over {report.wall_s:.1f} s, rate '{report.rate}'")
     if report.video is not None:
         table.add_row("video", report.video)

@@ -1,8 +1,8 @@
 """One HTTP conversation with a policy server: JSON out, JSON in, a time budget, bounded retries, our own errors.
 
 Used by `client`. It knows nothing of policies, observations or contracts; httpx is imported here and nowhere else.
-A call takes `timeout_s` at most, retries and waits included (a server that sends its answer byte by byte can stretch
-that to twice as long), and an answer that was not complete by then is never returned.
+A call takes `timeout_s` at most, retries and waits included, however slowly the server's bytes trickle in, and an
+answer that was not complete by then is never returned.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ try:
     import httpx
 except ModuleNotFoundError as missing:
     raise UsageError("the HTTP client needs httpx: pip install 'rlservo[client]'") from missing
+
+from rlservo.serve_app.deadlines import DeadlineBackend  # needs httpx's httpcore
 
 try:  # three times faster than the standard library on an image; not a requirement of the client
     import orjson
@@ -67,15 +69,23 @@ class Transport:
             proxy=_proxy_of(self.url),
             limits=httpx.Limits(max_connections=100),
         )
+        self._backend = DeadlineBackend()
+        # httpx has no argument for it; httpcore, below it, has. Its own time-outs are for each read, not for all.
+        self._http._pool._network_backend = self._backend
         self._closed = False
+
+    @property
+    def reconnects(self) -> int:
+        """How many connections were made after the first."""
+        return max(0, self._backend.connections - 1)
 
     def get(self, *path: str, timeout_s: float | None = None, retries: int | None = None) -> Any:
         """Return the JSON at `/path[0]/path[1]/...`."""
         return self._call("GET", path, None, timeout_s, retries)
 
-    def post(self, *path: str, body: bytes) -> Any:
+    def post(self, *path: str, body: bytes, timeout_s: float | None = None) -> Any:
         """Send a JSON document and return the JSON answer."""
-        return self._call("POST", path, body, None, None)
+        return self._call("POST", path, body, timeout_s, None)
 
     def close(self) -> None:
         """Close the connections. A call after that raises UsageError."""
@@ -131,6 +141,7 @@ class Transport:
         headers = self._headers if body is None else {**self._headers, "content-type": "application/json"}
         timeout = dict.fromkeys(("connect", "read", "write", "pool"), remaining)
         request = httpx.Request(method, url, headers=headers, content=body, extensions={"timeout": timeout})
+        self._backend.deadline = deadline
         try:
             response = self._http.handle_request(request)
             try:
@@ -145,11 +156,15 @@ class Transport:
                 response.close()  # an unread rest closes the connection: a late answer cannot meet the next request
         except (httpx.ReadTimeout, httpx.WriteTimeout) as error:
             raise late from error
+        except httpx.ConnectTimeout as error:
+            raise UnavailableError(f"{self.url} cannot be reached within {budget:g} s", {"url": self.url}) from error
         except httpx.TransportError as error:
             dropped = isinstance(error, httpx.RemoteProtocolError | httpx.ReadError | httpx.WriteError)
             what = "dropped the connection" if dropped else "cannot be reached"
             why = str(error) or type(error).__name__
             raise UnavailableError(f"{self.url} {what}: {why}", {"url": self.url, "dropped": dropped}) from error
+        finally:
+            self._backend.deadline = None
         if time.monotonic() > deadline:
             raise late
         return response.status_code, response.headers, content
@@ -163,18 +178,26 @@ class Transport:
             ) from error
 
     def _error(self, content: bytes, url: str, status: int) -> RlservoError:
-        """Turn `{"error", "code", "details"?}` back into the class that the server raised."""
+        """Turn an error's body back into the class that the server raised."""
         try:
             document = json.loads(content)
         except ValueError:
             document = None
-        if not isinstance(document, dict) or not isinstance(document.get("error"), str):
-            if status == 404:  # Ray Serve's own answer while the application is being deployed
-                return UnavailableError(f"{url} answered 404 with {_shown(content)}: no rlservo server is there (yet)")
-            return _class_of_status(status)(f"{url} answered {status} with {_shown(content)}: is it an rlservo server?")
-        details = document.get("details")
-        kind = error_classes().get(str(document.get("code")), _class_of_status(status))
-        return kind(document["error"], details if isinstance(details, dict) else None)
+        told = error_from(document, status) if isinstance(document, dict) else None
+        if told is not None:
+            return told
+        if status == 404:  # Ray Serve's own answer while the application is being deployed
+            return UnavailableError(f"{url} answered 404 with {_shown(content)}: no rlservo server is there (yet)")
+        return error_of_status(status)(f"{url} answered {status} with {_shown(content)}: is it an rlservo server?")
+
+
+def error_from(document: Mapping[str, Any], status: int) -> RlservoError | None:
+    """Turn `{"error", "code", "details"?}` back into the class that the server raised; None if it is not that."""
+    if not isinstance(document.get("error"), str):
+        return None
+    details = document.get("details")
+    kind = error_classes().get(str(document.get("code")), error_of_status(status))
+    return kind(document["error"], details if isinstance(details, dict) else None)
 
 
 def encode(document: Mapping[str, Any]) -> bytes:
@@ -217,7 +240,7 @@ def _retry_after_s(headers: Mapping[str, str]) -> float | None:
     return seconds if seconds >= 0 else None  # also refuses NaN
 
 
-def _class_of_status(status: int) -> type[RlservoError]:
+def error_of_status(status: int) -> type[RlservoError]:
     """Return the error for an answer that carries no code of ours, a proxy's for example."""
     if status in (401, 403):
         return UsageError

@@ -1,0 +1,84 @@
+"""Connections that keep a deadline over all their reads and writes, for httpcore.
+
+httpcore's time-outs are for each read: a server that sends a byte now and then is waited for without end. A control
+loop's deadline is for the whole answer. It knows sockets as httpcore wraps them, and nothing of HTTP.
+"""
+
+from __future__ import annotations
+
+import ssl
+import threading
+import time
+from collections.abc import Iterable
+from typing import Any
+
+import httpcore
+
+
+class DeadlineBackend(httpcore.NetworkBackend):
+    """Makes connections that give up at `deadline`, which each thread sets for itself."""
+
+    def __init__(self) -> None:
+        self._backend = httpcore.SyncBackend()
+        self._local = threading.local()
+        self.connections = 0
+
+    @property
+    def deadline(self) -> float | None:
+        """When this thread's exchange must be over (`time.monotonic`); None leaves httpcore's own time-outs."""
+        return getattr(self._local, "deadline", None)
+
+    @deadline.setter
+    def deadline(self, value: float | None) -> None:
+        self._local.deadline = value
+
+    def remaining(self, timeout: float | None, kind: type[Exception]) -> float | None:
+        """Return what is left of `timeout` and the deadline; raise `kind` where that is nothing."""
+        if self.deadline is None:
+            return timeout
+        left = self.deadline - time.monotonic()
+        if left <= 0:
+            raise kind("the deadline has passed")
+        return left if timeout is None else min(left, timeout)
+
+    def connect_tcp(
+        self,
+        host: str,
+        port: int,
+        timeout: float | None = None,
+        local_address: str | None = None,
+        socket_options: Iterable[Any] | None = None,
+    ) -> httpcore.NetworkStream:
+        """Connect."""
+        left = self.remaining(timeout, httpcore.ConnectTimeout)
+        stream = self._backend.connect_tcp(host, port, left, local_address, socket_options)
+        self.connections += 1
+        return _DeadlineStream(stream, self)
+
+    def sleep(self, seconds: float) -> None:
+        """Sleep, as httpcore's own retries do."""
+        time.sleep(seconds)
+
+
+class _DeadlineStream(httpcore.NetworkStream):
+    def __init__(self, stream: httpcore.NetworkStream, backend: DeadlineBackend) -> None:
+        self._stream = stream
+        self._backend = backend
+
+    def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
+        return self._stream.read(max_bytes, self._backend.remaining(timeout, httpcore.ReadTimeout))
+
+    def write(self, buffer: bytes, timeout: float | None = None) -> None:
+        self._stream.write(buffer, self._backend.remaining(timeout, httpcore.WriteTimeout))
+
+    def close(self) -> None:
+        self._stream.close()
+
+    def start_tls(
+        self, ssl_context: ssl.SSLContext, server_hostname: str | None = None, timeout: float | None = None
+    ) -> httpcore.NetworkStream:
+        left = self._backend.remaining(timeout, httpcore.ConnectTimeout)
+        return _DeadlineStream(self._stream.start_tls(ssl_context, server_hostname, left), self._backend)
+
+    def get_extra_info(self, info: str) -> Any:
+        return self._stream.get_extra_info(info)
