@@ -1,6 +1,7 @@
 """Compare what serving one policy costs: rlservo against a bare server and what people would pick instead.
 
-    python benchmarks/serving.py [--quick] [--publish] [--rounds N] [--only NAME ...] [--bundle DIR --checkpoint RL_MODULE_DIR]
+    python benchmarks/serving.py [--quick] [--publish] [--rounds N] [--starts N] [--only NAME ...]
+                                 [--bundle DIR --checkpoint RL_MODULE_DIR]
 
 One machine, one run, one policy (the shipped UR5's), one load generator (`wrk`, and for what it does not speak a line
 client in Python). The peers come from PyPI, each in an environment of its own, with one worker each. All servers run at

@@ -34,7 +34,7 @@ from speed.catalogue import Case, binary, case_of, plain, rlservo
 from speed.loads import ClosedError, GrpcLine, HttpLine, LoadError, WebSocketLine
 from speed.machine import PROXY, REPLICA, rss_mb
 from speed.rounds import session_of
-from speed.servers import START_S, Exchange, Server, running
+from speed.servers import START_S, Exchange, Server, StartError, running
 
 WARM_UP = 0.5  # of the time: allocators and caches fill up first
 SETTLE_S = 10.0  # after the last replica is there: Serve replaces HAProxy's process for each
@@ -71,7 +71,10 @@ def main() -> None:
         folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="rlsb-", ignore_cleanup_errors=True)))
         case = case_of(*policy(arguments, folder, console))
         server = rlservo(case, folder, replicas=arguments.replicas)
-        cleanup.enter_context(running(server, folder, secrets.token_hex(8)))
+        try:
+            cleanup.enter_context(running(server, folder, secrets.token_hex(8)))
+        except StartError as error:
+            raise SystemExit(str(error)) from None
         console.print(
             f"{arguments.minutes:g} minutes at {arguments.rate:g} requests/s, {arguments.replicas} replicas ..."
         )

@@ -1,30 +1,23 @@
-"""What stands before Ray Serve's own request handling in a replica: one header and one write, both worth microseconds.
+"""What stands before Ray Serve's own request handling in a replica: one header, worth two asyncio tasks a request.
 
 Serve watches every HTTP request for the client hanging up, so that long work can be cancelled. A policy answers before
-anything could be cancelled. The header `x-request-disconnect-disabled` is Serve's switch for that (ray 2.60).
-
-uvicorn writes a reply's head and its body one after the other, so the proxy, and then the client, may wake up and read
-twice for a reply of 300 bytes. `JoinedWrites` makes it one write.
-
-`RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH=rlservo.serve_app.ingress:middlewares` puts both in place. It is imported by
-Serve's proxies as well, so it needs nothing but starlette.
+anything could be cancelled. The header `x-request-disconnect-disabled` is Serve's switch for that (ray 2.60), and
+`RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH=rlservo.serve_app.ingress:middlewares` sets it on the server's side. It is
+imported by Serve's proxies as well, so it needs nothing but starlette. Replies leave in one write (`joined.py`).
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
+
+from rlservo.serve_app.joined import join_writes
 
 HEADER = (b"x-request-disconnect-disabled", b"?1")
 
 
-INFORMATIONAL = b"HTTP/1.1 1"  # 100 Continue: the client waits for it before it sends the body
-
-
-class Ingress:
-    """Adds the header to every HTTP request, and joins the writes of replies to POST; WebSockets pass untouched."""
+class WithoutDisconnectWatch:
+    """Adds the header to every HTTP request; a WebSocket needs its disconnects."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -32,47 +25,11 @@ class Ingress:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
             scope["headers"] = [*scope["headers"], HEADER]
-            if scope["method"] == "POST":  # HEAD, for one, has no body to wait for
-                # uvicorn's own object for this request (0.54); where `send` is something else, nothing is joined.
-                cycle = getattr(send, "__self__", None)
-                transport = getattr(cycle, "transport", None)
-                if transport is not None:
-                    cycle.transport = JoinedWrites(transport)  # type: ignore[union-attr]  # it has the attribute
+            if scope["method"] == "POST":
+                join_writes(send)
         await self._app(scope, receive, send)
-
-
-class JoinedWrites:
-    """One reply's transport: holds the head back until the first piece of the body, and writes both at once."""
-
-    __slots__ = ("_head", "_transport")
-
-    def __init__(self, transport: Any) -> None:
-        self._transport = transport
-        self._head: bytes | None = None  # None before the head, empty after it
-
-    def write(self, data: bytes) -> None:
-        """Write, or hold the head."""
-        head = self._head
-        if head:
-            self._head = b""
-            self._transport.write(head + data)
-        elif head is None and not data.startswith(INFORMATIONAL):
-            self._head = data
-        else:
-            self._transport.write(data)
-
-    def close(self) -> None:
-        """Write what is held and close: the application failed between head and body."""
-        if self._head:
-            self._transport.write(self._head)
-            self._head = b""
-        self._transport.close()
-
-    def __getattr__(self, name: str) -> Any:
-        """Leave everything else to the transport."""
-        return getattr(self._transport, name)
 
 
 def middlewares() -> list[Middleware]:
     """Return what Serve puts around each HTTP server it starts."""
-    return [Middleware(Ingress)]
+    return [Middleware(WithoutDisconnectWatch)]

@@ -258,6 +258,8 @@ def ray_environment(folder: Path, *, haproxy: str | None, mark: str) -> dict[str
             "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "rlservo.serve_app.ingress:middlewares",
             "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback_http),
             "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
+            # A busy or small computer needs longer than Serve's 5 s to start a proxy, and Serve kills one that does.
+            "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
             # Requests take microseconds: replicas need not wait half a minute for stragglers when the server stops.
             "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "0",
         }
