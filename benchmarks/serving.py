@@ -8,7 +8,7 @@ client in Python). The peers come from PyPI, each in an environment of its own, 
 the same time and take turns in short rounds, so that a slow moment of the machine falls on all of them. What is
 compared are ratios within rounds; absolute times belong to the machine. CPU time per request, of all of a server's
 processes, hardly depends on what else runs. Results go to bench/serving.md, .json and .svg; with
---publish the table and the chart also to benchmarks/, where README and DESIGN show them.
+--publish the table and the chart also to benchmarks/, to be committed.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import gzip
 import json
+import re
 import secrets
 import signal
 import sys
@@ -34,10 +35,11 @@ from speed.catalogue import Case, binary, case_of, plain, rlservo
 from speed.loads import ClosedError, GrpcLine, HttpLine, LoadError, WebSocketLine
 from speed.machine import PROXY, REPLICA, rss_mb
 from speed.rounds import session_of
-from speed.servers import START_S, Exchange, Server, StartError, running
+from speed.servers import START_S, Exchange, Server, StartError, ask, running
 
 WARM_UP = 0.5  # of the time: allocators and caches fill up first
 SETTLE_S = 10.0  # after the last replica is there: Serve replaces HAProxy's process for each
+REPLICA_LABEL = re.compile(rb'rlservo_policy_loaded\{[^}]*replica="([^"]*)"')
 FLAT_MB = 3.0  # growth over the fitted time that counts as none: allocators move in steps of this size
 ROWS = 64
 
@@ -205,12 +207,15 @@ def _holds(answer: bytes, part: bytes) -> None:
 
 
 def settle(server: Server, replicas: int) -> None:
-    """Wait for every replica: the server answers as soon as the first does."""
+    """Wait for every replica, as each says in its metrics: the server answers as soon as the first does."""
     deadline = time.monotonic() + START_S
-    while sum(process.role == REPLICA for process in server.members().values()) < replicas:
+    metrics = replace(server, act=Exchange("GET", "/metrics", b""))
+    seen: set[bytes] = set()
+    while len(seen) < replicas:
         if time.monotonic() > deadline:
             raise SystemExit(f"{server.name} did not start {replicas} replicas within {START_S:g} s")
-        time.sleep(0.5)
+        seen |= set(REPLICA_LABEL.findall(ask(metrics)[1]))
+        time.sleep(0.1)
     time.sleep(SETTLE_S)
 
 
