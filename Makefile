@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test check bench wheel setup clean
+.PHONY: demo test check bench soak wheel setup clean
 
 demo: setup  ## Export the two shipped checkpoints, serve them, drive both simulators; a table and a picture in demo/
 	$(BIN)/rlservo demo --out demo
@@ -24,6 +24,9 @@ bench: setup  ## Simulator, export and serving speed, printed and written to ben
 	$(BIN)/python benchmarks/robot_server.py
 	$(BIN)/python benchmarks/export_policy.py
 	$(BIN)/python benchmarks/serving.py
+
+soak: setup  ## Ten minutes of mixed load over every protocol: wrong answers, and whether memory stays flat
+	$(BIN)/python benchmarks/soak.py
 
 wheel: setup  ## Build the wheel into dist/
 	$(BIN)/python -m build --wheel --outdir dist .

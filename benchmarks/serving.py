@@ -1,12 +1,14 @@
 """Compare what serving one policy costs: rlservo against a bare server and what people would pick instead.
 
-    python benchmarks/serving.py [--quick] [--rounds N] [--only NAME ...] [--bundle DIR --checkpoint RL_MODULE_DIR]
+    python benchmarks/serving.py [--quick] [--publish] [--rounds N] [--starts N] [--only NAME ...]
+                                 [--bundle DIR --checkpoint RL_MODULE_DIR]
 
 One machine, one run, one policy (the shipped UR5's), one load generator (`wrk`, and for what it does not speak a line
 client in Python). The peers come from PyPI, each in an environment of its own, with one worker each. All servers run at
 the same time and take turns in short rounds, so that a slow moment of the machine falls on all of them. What is
 compared are ratios within rounds; absolute times belong to the machine. CPU time per request, of all of a server's
-processes, hardly depends on what else runs. Results go to bench/serving.md, .json and .svg.
+processes, hardly depends on what else runs. Results go to bench/serving.md, .json and .svg; with
+--publish the table and the chart also to benchmarks/, to be committed.
 """
 
 from __future__ import annotations
@@ -69,12 +71,16 @@ def main() -> None:
     }
     show(result, console)
     write(result, facts)
+    if arguments.publish:
+        for name in ("serving.md", "serving.svg"):
+            shutil.copy(OUT / name, ROOT / "benchmarks" / name)
     console.print(f"written: {OUT.relative_to(ROOT)}/serving.md, serving.json, serving.svg")
 
 
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer and shorter rounds: noisy, but the same path")
+    parser.add_argument("--publish", action="store_true", help="renew benchmarks/serving.md and serving.svg, too")
     parser.add_argument("--rounds", type=int, help="turns of every server (default 7, quick: 3)")
     parser.add_argument("--starts", type=int, help="cold starts of rlservo and RLlib's example (default 3, quick: 1)")
     parser.add_argument("--only", nargs="*", metavar="NAME", help="these servers, by the table's names, and rlservo")

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import gzip
 import json
+import re
 import secrets
 import signal
 import sys
@@ -34,9 +35,11 @@ from speed.catalogue import Case, binary, case_of, plain, rlservo
 from speed.loads import ClosedError, GrpcLine, HttpLine, LoadError, WebSocketLine
 from speed.machine import PROXY, REPLICA, rss_mb
 from speed.rounds import session_of
-from speed.servers import Exchange, Server, running
+from speed.servers import START_S, Exchange, Server, StartError, ask, running
 
-WARM_UP = 0.3  # of the time: allocators and caches fill up first
+WARM_UP = 0.5  # of the time: allocators and caches fill up first
+SETTLE_S = 10.0  # after the last replica is there: Serve replaces HAProxy's process for each
+REPLICA_LABEL = re.compile(rb'rlservo_policy_loaded\{[^}]*replica="([^"]*)"')
 FLAT_MB = 3.0  # growth over the fitted time that counts as none: allocators move in steps of this size
 ROWS = 64
 
@@ -70,7 +73,10 @@ def main() -> None:
         folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="rlsb-", ignore_cleanup_errors=True)))
         case = case_of(*policy(arguments, folder, console))
         server = rlservo(case, folder, replicas=arguments.replicas)
-        cleanup.enter_context(running(server, folder, secrets.token_hex(8)))
+        try:
+            cleanup.enter_context(running(server, folder, secrets.token_hex(8)))
+        except StartError as error:
+            raise SystemExit(str(error)) from None
         console.print(
             f"{arguments.minutes:g} minutes at {arguments.rate:g} requests/s, {arguments.replicas} replicas ..."
         )
@@ -200,6 +206,19 @@ def _holds(answer: bytes, part: bytes) -> None:
 # The run
 
 
+def settle(server: Server, replicas: int) -> None:
+    """Wait for every replica, as each says in its metrics: the server answers as soon as the first does."""
+    deadline = time.monotonic() + START_S
+    metrics = replace(server, act=Exchange("GET", "/metrics", b""))
+    seen: set[bytes] = set()
+    while len(seen) < replicas:
+        if time.monotonic() > deadline:
+            raise SystemExit(f"{server.name} did not start {replicas} replicas within {START_S:g} s")
+        seen |= set(REPLICA_LABEL.findall(ask(metrics)[1]))
+        time.sleep(0.1)
+    time.sleep(SETTLE_S)
+
+
 def soak(
     asks: dict[str, Ask], server: Server, seconds: float, rate: float, console: Console
 ) -> tuple[Counter[str], Counter[str], dict[int, Track]]:
@@ -257,7 +276,7 @@ def report(
         if track.role not in (REPLICA, PROXY):
             continue
         growth, slope = track.growth(WARM_UP * whole)
-        lived = track.times_s[0] < WARM_UP * whole and track.times_s[-1] >= whole - 1e-6
+        lived = track.times_s[0] < 0.1 * whole and track.times_s[-1] >= whole - 1e-6
         flat = growth <= FLAT_MB and lived
         judged = judged or not flat
         rows.append(

@@ -311,6 +311,8 @@ def ray_environment(
             "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
             # gRPC reads a whole message before anybody can refuse it; Serve's default is 2 GiB.
             "RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(max_message),
+            # A busy or small computer needs longer than Serve's 5 s to start a proxy, and Serve kills one that does.
+            "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
             # Requests take microseconds: replicas need not wait half a minute for stragglers when the server stops.
             "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "0",
         }

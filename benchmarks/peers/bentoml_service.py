@@ -16,7 +16,7 @@ import numpy as np
 import onnxruntime
 
 
-@bentoml.service(workers=1, logging={"access": {"enabled": False}}, metrics={"enabled": False})  # type: ignore[untyped-decorator]  # not in the type checker's environment
+@bentoml.service(workers=1, logging={"access": {"enabled": False}}, metrics={"enabled": False})
 class PolicyService:
     def __init__(self) -> None:
         options = onnxruntime.SessionOptions()

@@ -20,6 +20,7 @@ import uvicorn
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from rich.console import Console
 
+import soak as soak_module
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.http import create_app
 from rlservo.serve_app.settings import ServerSettings
@@ -231,3 +232,11 @@ def test_growth_is_a_line_after_the_warm_up() -> None:
     assert abs(settled.growth(180.0)[0]) < 0.01
     growth, slope = leaking.growth(180.0)
     assert slope == pytest.approx(60.0) and growth == pytest.approx(415 / 60)
+
+
+def test_soak_begins_when_every_replica_has_answered(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(soak_module, "SETTLE_S", 0.0)
+    soak_module.settle(server, 1)
+    monkeypatch.setattr(soak_module, "START_S", 0.3)
+    with pytest.raises(SystemExit, match="did not start 2 replicas"):
+        soak_module.settle(server, 2)  # there is one
