@@ -157,15 +157,30 @@ def _export(
             files = waiting.pop(0)
             extended = files.is_one_of_several and (name_all or not order.name)
             name = bundle_name(base, files.module_id, files.agent_id) if extended else base
+            target = choose_target(order.out, name, order.version)
+            if any(result.path == target for _, result in written):
+                raise UsageError(f"two modules would both be written to {target}: export them one by one, with --name")
             try:
-                written.append(_build(files, facts, choose_target(order.out, name, order.version), order, folders))
+                written.append(_build(files, facts, target, order, folders))
             except CheckpointError as error:
                 if not name_all or "agents" not in error.details:
                     raise
                 waiting[:0] = [dataclasses.replace(files, agent_id=agent) for agent in error.details["agents"]]
+        _publish(written)
+    return [result for _, result in written]
+
+
+def _publish(written: Sequence[tuple[Path, ExportResult]]) -> None:
+    """Give every finished folder its name, or none."""
+    named: list[Path] = []
+    try:
         for folder, result in written:
             folder.rename(result.path)
-    return [result for _, result in written]
+            named.append(result.path)
+    except BaseException:
+        for path in named:
+            shutil.rmtree(path, ignore_errors=True)
+        raise
 
 
 def _build(

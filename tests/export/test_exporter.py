@@ -215,7 +215,7 @@ def test_the_users_own_code_is_found_in_the_app_dir_and_only_there(
         f"r = export_checkpoint({str(zoo / 'user_module')!r}, {str(tmp_path)!r}, app_dir={str(app)!r}, **args)\n"
         "print('module:', r.contract.provenance.module_class, sys.path == before)\n"
     )
-    done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     refused, exported = done.stdout.splitlines()
     assert "the Python module 'zoo_parts'" in refused and str(tmp_path) in refused and "--app-dir" in refused
@@ -237,7 +237,7 @@ def test_an_export_starts_no_ray_no_environment_and_no_process(zoo: Path, tmp_pa
     home.mkdir()
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", script],
-        capture_output=True, text=True, timeout=120, env={**os.environ, "HOME": str(home)},
+        capture_output=True, text=True, timeout=300, env={**os.environ, "HOME": str(home)},
     )  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (0, "False []\n", "")
     assert not (home / ".ray").exists()

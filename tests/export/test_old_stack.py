@@ -541,7 +541,7 @@ def test_the_users_own_old_models_are_found_in_the_app_dir_and_only_there(
         "            print('module:', r.contract.provenance.module_class)\n"
         "        except CheckpointError as error: print('refused:', error)\n"
     )
-    done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     by_class, with_class, by_name, with_name = done.stdout.splitlines()
     assert "the Python module 'old_zoo_parts'" in by_class and str(tmp_path) in by_class and "--app-dir" in by_class
@@ -593,7 +593,7 @@ def test_an_old_stack_export_starts_no_ray_no_environment_and_no_process(old_zoo
     home.mkdir()
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", script],
-        capture_output=True, text=True, timeout=120, env={**os.environ, "HOME": str(home)},
+        capture_output=True, text=True, timeout=300, env={**os.environ, "HOME": str(home)},
     )  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (0, "False []\n", "")
     assert not (home / ".ray").exists()
