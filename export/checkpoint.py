@@ -432,7 +432,7 @@ def _action_rule(
         )
     kind = module.get_inference_action_dist_cls()
     mode = find_mode(_deterministic(module), kind.__name__, action_space, given[Columns.ACTION_DIST_INPUTS])
-    distribution = _distribution_kind(kind)
+    distribution = None if mode == "given" else _distribution_kind(kind)
     if distribution is None:
         notify(f"the action distribution {kind.__name__} is not one of RLlib's: the export cannot explore with it")
     return distribution, mode, ("action_dist_inputs",)
