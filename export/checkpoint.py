@@ -373,7 +373,7 @@ def _action_rule(
     kind = module.get_inference_action_dist_cls()
     mode = find_mode(_deterministic(module), kind.__name__, action_space, given[Columns.ACTION_DIST_INPUTS])
     exploring = module.get_exploration_action_dist_cls()
-    distribution = _distribution_kind(exploring)
+    distribution = None if mode == "given" else _distribution_kind(exploring)
     if distribution is None:
         notify(f"the action distribution {exploring.__name__} is not one of RLlib's: the export cannot explore with it")
     return distribution, mode, ("action_dist_inputs",)

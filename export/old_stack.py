@@ -343,8 +343,10 @@ def _action_rule(
     children = getattr(kind, "keywords", {}).get("child_distributions", ())
     if any(getattr(child, "func", child) not in DISTRIBUTIONS for child in children):
         distribution = None
+    if mode == "given":  # counted integers, or the user's own
+        distribution = None
     if distribution is None:
-        notify(f"the action distribution {plain.__name__} is not one of RLlib's: the export cannot explore with it")
+        notify(f"the action distribution {plain.__name__} on {action_space} is not one the export can explore with")
     return distribution, mode, ("action_dist_inputs",)
 
 

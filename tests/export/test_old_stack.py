@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.actor import PolicyGraph
 from rlservo.export.bundle import Parity, load_bundle
-from rlservo.export.errors import CheckpointError, ParityError, RlservoError, UnsupportedError
+from rlservo.export.errors import CheckpointError, ParityError, RequestError, RlservoError, UnsupportedError
 from rlservo.export.exporter import ExportResult, export_checkpoint
 from rlservo.export.location import locate_checkpoint
 from rlservo.export.old_location import OldStackFiles
@@ -34,6 +34,7 @@ from rlservo.export.samples import draw_batches
 from rlservo.export.torchscript import run_torchscript
 from rlservo.export.unpickle import user_code
 from rlservo.export.verify import verify_bundle
+from rlservo.serve_app.policy import Policy
 
 STATE = "policies/default_policy/policy_state.pkl"
 EXPORTED = [
@@ -458,6 +459,13 @@ def test_a_state_that_cannot_be_trusted_is_refused(
     rewrite(damaged / STATE, change)
     with pytest.raises(error, match=words):
         load("pendulum", damaged.parent)
+
+
+def test_integer_actions_run_and_cannot_explore(old_zoo: Path, export: Callable[..., ExportResult]) -> None:
+    policy, seen = Policy.load(export("counts").path), np.load(old_zoo / "counts.npz")
+    np.testing.assert_array_equal(policy.act(seen["obs"]), seen["action"])
+    with pytest.raises(RequestError, match="explor"):
+        policy.act(seen["obs"], explore=True)
 
 
 def test_a_policys_own_folder_tells_its_facts_without_the_algorithm(

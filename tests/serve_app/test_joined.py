@@ -14,7 +14,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.server import ServerState
 
-from rlservo.serve_app.ingress import HEADER, WithoutDisconnectWatch
+from rlservo.serve_app.ingress import HEADER, Ingress
 
 PROTOCOLS = [HttpToolsProtocol, H11Protocol]
 
@@ -71,7 +71,7 @@ def exchange(protocol: Any, app: Any, *pieces: bytes) -> Recorder:
     """Feed a request, piece by piece, to a connection; return what it wrote."""
 
     async def run() -> Recorder:
-        config = uvicorn.Config(WithoutDisconnectWatch(app), lifespan="off", log_level="critical", access_log=False)
+        config = uvicorn.Config(Ingress(app), lifespan="off", log_level="critical", access_log=False)
         config.load()
         state = ServerState()
         connection = protocol(config=config, server_state=state, app_state={})
@@ -141,7 +141,7 @@ def test_serve_is_told_not_to_watch_for_disconnects_and_websockets_pass_untouche
 
     async def nothing(*_: object) -> Any: ...
 
-    call: Callable[..., Any] = WithoutDisconnectWatch(app)
+    call: Callable[..., Any] = Ingress(app)
     asyncio.run(call({"type": "http", "method": "POST", "headers": []}, nothing, nothing))
     asyncio.run(call({"type": "websocket", "headers": []}, nothing, nothing))
     assert HEADER in seen[0]["headers"] and seen[1]["headers"] == []
