@@ -149,6 +149,7 @@ def ray_session(
     told = log_level in ("DEBUG", "INFO")
     quiet: dict[str, Any] = {"log_to_driver": told, "logging_level": logging.INFO if told else logging.ERROR}
     logging.getLogger("ray.tune").setLevel(logging.INFO if told else logging.CRITICAL)  # the cause is told at the end
+    logging.getLogger("tensorboardX").setLevel(logging.ERROR)  # it warns of a return that is -inf (`fill_return`)
     folder: str | None = None
     own = str((app_dir or Path()).resolve())
     if app_dir is not None and own not in sys.path:

@@ -49,34 +49,37 @@ trap finish EXIT
 
 address="$(srun --nodes=1 --ntasks=1 --overlap --nodelist="$head" hostname -I | awk '{print $1}')"
 [ -n "$address" ] || { echo "several_nodes.sh: node $head has no address" >&2; exit 1; }
-on_node "$head" "${ray[@]}" start --head --block --node-ip-address="$address" --port="$port" --temp-dir="$folder" \
-  --num-cpus="$cores" --num-gpus="$gpus" --include-dashboard=false
-for node in "${nodes[@]:1}"; do
-  on_node "$node" "${ray[@]}" start --block --address="$address:$port" --num-cpus="$cores" --num-gpus="$gpus"
-done
-
-# Wait until all nodes are there: a trial that does not fit yet would wait without saying so.
-"$python" - "$address:$port" "${#nodes[@]}" <<'PYTHON'
+wait_for_nodes() { # wait_for_nodes COUNT: a trial that does not fit yet would wait without saying so
+  "$python" - "$address:$port" "$1" <<'PYTHON'
+import subprocess
 import sys
 import time
 
-import ray
-
 address, wanted = sys.argv[1], int(sys.argv[2])
-deadline = time.monotonic() + 180
-while True:
-    try:
-        if not ray.is_initialized():
-            ray.init(address, logging_level="ERROR", log_to_driver=False)
-        if sum(node["Alive"] for node in ray.nodes()) >= wanted:
-            break
-    except Exception as error:
-        if time.monotonic() > deadline:
-            sys.exit(f"several_nodes.sh: Ray's head at {address} does not answer: {error}")
-    if time.monotonic() > deadline:
-        sys.exit(f"several_nodes.sh: {wanted} nodes expected, {sum(node['Alive'] for node in ray.nodes())} are there")
+# In a process of its own each time: Ray ends one that finds no cluster.
+count = (
+    "import ray, sys; ray.init(sys.argv[1], logging_level='ERROR', log_to_driver=False); "
+    "print(sum(node['Alive'] for node in ray.nodes()))"
+)
+deadline, there = time.monotonic() + 300, "none"
+while time.monotonic() < deadline:
+    asked = subprocess.run([sys.executable, "-c", count, address], capture_output=True, text=True)
+    there = asked.stdout.strip() or there
+    if there.isdigit() and int(there) >= wanted:
+        sys.exit()
     time.sleep(1)
+sys.exit(f"several_nodes.sh: of {wanted} Ray nodes at {address}, {there} answered within five minutes")
 PYTHON
+}
+
+# The dashboard is off, but Ray still looks whether its port is free.
+on_node "$head" "${ray[@]}" start --head --block --node-ip-address="$address" --port="$port" --temp-dir="$folder" \
+  --num-cpus="$cores" --num-gpus="$gpus" --include-dashboard=false --dashboard-port="$((port + 1))"
+wait_for_nodes 1
+for node in "${nodes[@]:1}"; do
+  on_node "$node" "${ray[@]}" start --block --address="$address:$port" --num-cpus="$cores" --num-gpus="$gpus"
+done
+wait_for_nodes "${#nodes[@]}"
 
 if [ "${RLSERVO_RESUME:-}" = last ]; then
   # run.json is in every run's folder; the newest run is the one to go on with.

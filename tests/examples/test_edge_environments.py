@@ -43,7 +43,7 @@ def test_episodes_longer_than_the_training_have_no_return_and_do_not_stop_it(edg
     assert (Path(found["bundle"]) / "policy.onnx").is_file()
 
 
-@pytest.mark.parametrize(("name", "log"), [("Crashing", "crashes.txt"), ("Crashing runner", "runner_crashes.txt")])
+@pytest.mark.parametrize(("name", "log"), [("Crashing", "Crashing.txt"), ("Crashing runner", "Crashing_runner.txt")])
 def test_crashes_are_survived_by_remaking_the_environment_or_the_runner(name: str, log: str, edges: Any) -> None:
     folder, found = edges
     assert (folder / log).read_text().count("crash") > 0

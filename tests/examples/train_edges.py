@@ -20,22 +20,9 @@ RUNS = {
     "Promises32": ["--run", "DQN", "--stop-timesteps", "1000"],
     "Camera": [],
     "Endless": [],
-    "Crashing": [
-        "--restart-failed-sub-environments",
-        "--set",
-        "rollout_fragment_length=25",
-        "--env-arg",
-        "log=crashes.txt",
-    ],
-    "Crashing runner": [
-        "--num-cpus",
-        "1",
-        "--set",
-        "rollout_fragment_length=25",
-        "--env-arg",
-        "log=runner_crashes.txt",
-    ],
-    "Crashing for good": ["--env-arg", "log=fatal_crashes.txt", "--stop-iters", "50"],
+    "Crashing": ["--restart-failed-sub-environments", "--set", "rollout_fragment_length=25"],
+    "Crashing runner": ["--num-cpus", "1", "--set", "rollout_fragment_length=25", "--env-arg", "crashes=1"],
+    "Crashing for good": ["--stop-iters", "50"],
 }
 
 
@@ -46,6 +33,8 @@ def main(folder: Path) -> None:
         for name, more in RUNS.items():
             env = f"edge_environments:edge/{name.split()[0]}-v0"
             common = ["--num-cpus", "0", "--name-env", env, "--stop-iters", "2", "--hidden", "16"]
+            if name.startswith("Crashing"):  # an absolute path: Tune's workers run in the trial's folder
+                common += ["--env-arg", f"log={folder / name.replace(' ', '_')}.txt"]
             own = more if "DQN" in more else [*more, "--set", "train_batch_size_per_learner=300"]
             parser = simple_trainer.argument_parser()
             args = parser.parse_args([*common, *own])

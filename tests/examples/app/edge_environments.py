@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -68,17 +68,18 @@ class Endless(Float64):
 
 
 class Crashing(Promises32):
-    """Fails now and then, as a simulator does; every crash is written down."""
+    """Fails after 60 steps of its life, as a simulator does now and then, until `log` has seen it `crashes` times."""
 
-    def __init__(self, log: str = "") -> None:
-        self._log = log
-        self._chance = np.random.default_rng(os.getpid() * 1000 + int.from_bytes(os.urandom(2), "little"))
+    def __init__(self, log: str, crashes: int = 1_000) -> None:
+        self._log = Path(log)
+        self._crashes = crashes
+        self._life = 0
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        if self._chance.random() < 0.01:
-            if self._log:
-                with open(self._log, "a") as log:  # noqa: PTH123
-                    log.write("crash\n")
+        self._life += 1
+        so_far = self._log.read_text() if self._log.exists() else ""
+        if self._life > 60 and so_far.count("crash") < self._crashes:
+            self._log.write_text(so_far + "crash\n")
             raise RuntimeError("the simulator's connection was lost")
         return super().step(action)
 
