@@ -112,8 +112,8 @@ def render(measured: list[Measured]) -> str:
         endings = ", ".join(f"{count} {status}" for status, count in sorted(one.endings.items())) or "-"
         lines.append(
             f"| {one.start} | {one.episodes} | {success} | {interval} "
-            f"| {one.mean_return:.4g} ({low:.4g} to {high:.4g}) | {one.worst_return:.4g} | {one.mean_steps:.1f} "
-            f"| {endings} |"
+            f"| {one.mean_return:.4g} ({low:.4g} to {high:.4g}) | {one.worst_return:.4g} "
+            f"| {one.mean_steps:.1f} | {endings} |"
         )
     return "\n".join(lines)
 

@@ -141,9 +141,10 @@ class PolicyServer(InferenceService):
         app = create_app(
             lambda: self._control.store, self._settings, replica=self._replica, control=self._control, alone=_alone
         )
-        self._core = app.state.core
-        gate.is_open = self._core.admission.is_open
-        self.serve_grpc(self._core, local_only=is_loopback(self._host))
+        core: Core = app.state.core
+        self._core = core
+        gate.is_open = core.admission.is_open
+        self.serve_grpc(core, local_only=is_loopback(self._host))
         return app
 
     async def reconfigure(self, user_config: Any) -> None:
