@@ -121,7 +121,7 @@ def _batch(space: SpaceSpec, obs: Any) -> int:
             return len(obs)  # of single observations
         inside = space.spaces.items() if isinstance(space, DictSpec) else enumerate(space.spaces)
         parts = obs if type(obs) in (dict, list, tuple) else {}
-        found = dict(parts) if type(parts) is dict else dict(enumerate(parts))
+        found: dict[Any, Any] = dict(parts) if type(parts) is dict else dict(enumerate(parts))
         return max((_batch(child, found[key]) for key, child in inside if key in found), default=0)
     rows = _rows(obs)
     return rows if type(obs) is dict or rows != (space.shape or (0,))[0] else 1
