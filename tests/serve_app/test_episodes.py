@@ -6,6 +6,7 @@ import contextlib
 import functools
 import http.client
 import json
+import random
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -306,6 +307,30 @@ def test_a_session_stays_with_its_version_until_that_is_gone(
         status, reply = step()
         assert (status, reply["code"]) == (410, "session-lost") and "no longer loaded" in reply["error"]
         assert step(reset=True)[1]["version"] == "2"
+
+
+def test_no_odd_request_gets_a_5xx(ask: Ask) -> None:
+    rng = random.Random(0)
+
+    def odd(depth: int = 0) -> Any:
+        if depth < 3 and rng.random() < 0.4:
+            if rng.random() < 0.5:
+                return [odd(depth + 1) for _ in range(rng.choice([0, 1, 3, 8]))]
+            return {rng.choice(["h", "c", "a", "b", "zeta", "arm"]): odd(depth + 1) for _ in range(rng.randrange(4))}
+        return rng.choice([0, -1, 10**30, 0.5, 1e308, 1e39, "", "nan", True, None, [0.1, 0.2, 0.3]])
+
+    fields = ("state", "session_id", "reset", "end", "reward", "last_action", "seq", "timestamp", "explore", "seed")
+    usual = {"state": {}, "session_id": "odd", "reset": True, "reward": 0.5, "last_action": [0.1, 0.1], "seq": 1}
+    seen: dict[int, int] = {}
+    for _ in range(500):
+        name = rng.choice(["lstm_box", "lstm_previous", "act_nested"])
+        obs = plain(observations(name, 1)[0]) if rng.random() < 0.8 else odd()
+        chosen = [field for field in fields if rng.random() < 0.3]
+        more = {field: usual[field] if field in usual and rng.random() < 0.7 else odd() for field in chosen}
+        status, reply = ask(f"/v1/policies/{name}/act", {"obs": obs, **more})
+        seen[status] = seen.get(status, 0) + 1
+        assert status < 500, (more, reply)
+    assert seen[200] > 20 and seen[400] > 100, seen
 
 
 # Open Inference Protocol.
