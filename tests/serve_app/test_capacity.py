@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import socket
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack
@@ -21,6 +22,7 @@ from websockets.exceptions import ConnectionClosed
 from rlservo.export.errors import OverloadedError
 from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.http import create_app
+from rlservo.serve_app.launcher import ray_environment
 from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
@@ -168,3 +170,32 @@ def test_a_wait_in_the_queue_counts_from_the_beginning_of_the_burst() -> None:
         assert admission.enter() > first and admission.longest == 3
 
     asyncio.run(burst())
+
+
+def test_the_proxys_configuration_is_mended_before_it_starts(tmp_path: Path) -> None:
+    """Lines as Ray 2.60 writes them; /bin/true stands where HAProxy would."""
+    environment = ray_environment(tmp_path, haproxy="/bin/true", mark="test")
+    file = tmp_path / "haproxy.cfg"
+    stats, metrics = (environment[f"RAY_SERVE_HAPROXY_{name}_PORT"] for name in ("STATS", "METRICS"))
+    file.write_text(
+        "global\n    maxconn 4096\ndefaults\n    mode http\n    errorfile 502 /ray/500.http\n"
+        f"    errorfile 503 /ray/500.http\nfrontend prometheus\n    bind :{metrics}\nlisten stats\n  bind *:{stats}\n"
+    )
+    subprocess.run([environment["RAY_SERVE_HAPROXY_BINARY_PATH"], "-f", str(file)], check=True)
+    answer_file = tmp_path / "503.http"
+    assert file.read_text().splitlines() == [
+        "global",
+        "    maxconn 4096",
+        "defaults",
+        "    timeout http-request 5s",
+        "    mode http",
+        f"    errorfile 502 {answer_file}",
+        f"    errorfile 503 {answer_file}",
+        "frontend prometheus",
+        f"    bind 127.0.0.1:{metrics}",
+        "listen stats",
+        f"  bind 127.0.0.1:{stats}",
+    ]
+    head, _, body = answer_file.read_bytes().partition(b"\r\n\r\n")
+    assert b" 503 " in head and b"retry-after: 1" in head
+    assert json.loads(body)["code"] == "unavailable"
