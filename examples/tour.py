@@ -282,8 +282,8 @@ def frozen_lake(settings: Settings) -> None:
     # A field is a number; the network sees it one-hot. (RLlib's annotation is narrower than what it takes.)
     config.env_runners(
         env_to_module_connector=cast(Any, lambda env, spaces, device: FlattenObservations()),
-        num_envs_per_env_runner=8,
-        rollout_fragment_length=1,  # 8 steps, then one update
+        num_envs_per_env_runner=4,
+        rollout_fragment_length=3,  # 12 steps, as n_step needs three in a row, then one update
     )
     config.training(
         lr=1e-3,

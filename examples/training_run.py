@@ -16,6 +16,7 @@ import json
 import logging
 import math
 import os
+import re
 import secrets
 import shutil
 import signal
@@ -475,7 +476,10 @@ def _first_line(error: BaseException) -> str:
 def _cause(error: BaseException | None) -> str:
     """Return the line that names the exception at the bottom of a Ray error, which is a traceback in itself."""
     lines = [line for line in str(error).splitlines() if line and not line.startswith((" ", "\t", "Traceback"))]
-    return lines[-1] if lines else type(error).__name__
+    told = [
+        line for line in lines if re.match(r"[\w.]+(Error|Exception|Exit): \S", line)
+    ]  # RLlib raises some without words
+    return (told or lines or [type(error).__name__])[-1]
 
 
 def best_checkpoint_of(outcome: Outcome) -> Path:

@@ -63,8 +63,11 @@ count = (
 )
 deadline, there = time.monotonic() + 300, "none"
 while time.monotonic() < deadline:
-    asked = subprocess.run([sys.executable, "-c", count, address], capture_output=True, text=True)
-    there = asked.stdout.strip() or there
+    try:
+        asked = subprocess.run([sys.executable, "-c", count, address], capture_output=True, text=True, timeout=60)
+        there = asked.stdout.strip() or there
+    except subprocess.TimeoutExpired:
+        continue
     if there.isdigit() and int(there) >= wanted:
         sys.exit()
     time.sleep(1)

@@ -48,7 +48,7 @@ def test_crashes_are_survived_by_remaking_the_environment_or_the_runner(name: st
     folder, found = edges
     assert (folder / log).read_text().count("crash") > 0
     assert "error" not in found[name], found[name]
-    assert found[name]["steps"] >= 600
+    assert found[name]["steps"] >= 300  # the runner that died brought none meanwhile
 
 
 def test_crash_in_the_driver_without_the_flag_ends_the_training_with_its_cause(edges: Any) -> None:

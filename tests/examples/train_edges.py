@@ -21,7 +21,18 @@ RUNS = {
     "Camera": [],
     "Endless": [],
     "Crashing": ["--restart-failed-sub-environments", "--set", "rollout_fragment_length=25"],
-    "Crashing runner": ["--num-cpus", "1", "--set", "rollout_fragment_length=25", "--env-arg", "crashes=1"],
+    "Crashing runner": [
+        "--num-cpus",
+        "1",
+        "--set",
+        "rollout_fragment_length=25",
+        "--env-arg",
+        "crashes=1",
+        "--stop-iters",
+        "100000",
+        "--stop-timesteps",
+        "300",
+    ],
     "Crashing for good": ["--stop-iters", "50"],
 }
 
