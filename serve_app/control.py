@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from rlservo.export.bundle import Contract
+from rlservo.export.bundle import Contract, version_key
 from rlservo.export.errors import (
     BundleError,
     PartlyAppliedError,
@@ -228,7 +228,7 @@ class Control:
                     states[name, version] = VersionState("ready", reason, loaded.loaded_at)
         states.update({key: VersionState("loading") for key in self._loading if key not in states})
         by_name: dict[str, dict[str, VersionState]] = {}
-        for (name, version), state in sorted(states.items()):
+        for (name, version), state in sorted(states.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
             by_name.setdefault(name, {})[version] = state
         return by_name
 

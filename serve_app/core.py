@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rlservo.export.bundle import Contract, DictSpec, SpaceSpec, TupleSpec
-from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError
+from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError, UnknownPolicyError
 from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.control import Control
 from rlservo.serve_app.episodes import Episode, Episodes
@@ -82,9 +82,12 @@ class Core:
         return self._store_provider() is not None
 
     def has(self, name: str, version: str | None = None) -> bool:
-        """Whether a policy, in this version, is loaded."""
+        """Whether a policy, in this version or under this alias, is loaded."""
         store = self._store_provider()
-        return store is not None and name in store.names and (version is None or version in store.versions(name))
+        try:
+            return store is not None and bool(store.get(name, version))
+        except UnknownPolicyError:
+            return False
 
     def contract(self, name: str, version: str | None, session_id: str | None = None) -> Contract:
         """Return the contract that a request's tensors follow: a session's own, whatever the default is meanwhile."""

@@ -10,6 +10,7 @@ import asyncio
 import ipaddress
 import logging
 import math
+import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any
@@ -39,7 +40,7 @@ from rlservo.serve_app.tensors import DTYPES, MAX_AXES, datatype_of, from_bytes
 logger = logging.getLogger(__name__)
 
 PROTOCOL = "grpc"
-REQUEST_ID = "x-request-id"
+REQUEST_ID, SESSION = "x-request-id", "x-session-id"
 CODES = {
     400: grpc.StatusCode.INVALID_ARGUMENT,
     401: grpc.StatusCode.UNAUTHENTICATED,
@@ -130,11 +131,11 @@ class Grpc:
     def answer(self, method: str, request: Incoming, context: Any) -> Any:
         """Return the reply to one call. An error sets the status, and the empty reply is not looked at."""
         try:
-            request_id = self._check(method, context)
+            request_id, session = self._check(method, context)
             if request_id is not None:
                 context.set_trailing_metadata([(REQUEST_ID, request_id)])  # in addition to Serve's own
             if method == "ModelInfer":
-                return self._infer(request, request_id)
+                return self._infer(request, request_id, session)
             return self._methods[method](request)
         except Exception as error:
             _fail(context, error)
@@ -147,7 +148,8 @@ class Grpc:
         """
         idle_s = self._core.settings.stream_idle_s
         try:
-            request_id = self._check("ModelStreamInfer", context)
+            request_id, session = self._check("ModelStreamInfer", context)
+            session = session or secrets.token_hex(8)  # all of a stream is one version's where a canary runs
             counted = self._core.admission.streaming()
             counted.__enter__()
         except Exception as error:
@@ -164,7 +166,9 @@ class Grpc:
                     _fail(context, DeadlineError(f"the stream was silent for {idle_s:g} s: open another one"))
                     return
                 try:
-                    yield messages.ModelStreamInferResponse(infer_response=self._infer((content, None), request_id))
+                    yield messages.ModelStreamInferResponse(
+                        infer_response=self._infer((content, None), request_id, session)
+                    )
                 except Exception as error:
                     sentence = _explain(error)[1]
                     yield messages.ModelStreamInferResponse(
@@ -174,8 +178,8 @@ class Grpc:
             counted.__exit__(None, None, None)
             self._core.metrics.stream("", -1)
 
-    def _check(self, method: str, context: Any) -> str | None:
-        """Return the caller's request id, if it gave one. Raises ForbiddenError or UnauthenticatedError."""
+    def _check(self, method: str, context: Any) -> tuple[str | None, str | None]:
+        """Return the caller's (request id, session), where given. Raises ForbiddenError or UnauthenticatedError."""
         if self._local_only and not is_local(context.peer()):
             raise ForbiddenError(
                 "this server listens on this machine only: serve it with --host to reach it from others"
@@ -183,7 +187,8 @@ class Grpc:
         metadata = context.invocation_metadata()
         headers = [(name.encode(), _bytes(value)) for name, value in metadata]
         self._core.guard.check({"headers": headers}, PATHS[method])
-        return next((value for name, value in metadata if name == REQUEST_ID), None)
+        given = {name: value for name, value in metadata if type(value) is str}
+        return given.get(REQUEST_ID), given.get(SESSION)
 
     def _model_ready(self, request: Incoming) -> Any:
         asked = _parse(messages.ModelReadyRequest, request[0])
@@ -197,7 +202,7 @@ class Grpc:
         asked = _parse(messages.RepositoryIndexRequest, request[0])
         return messages.RepositoryIndexResponse(models=oip.repository_index(self._core, ready=asked.ready))
 
-    def _infer(self, request: Incoming, request_id: str | None = None) -> Any:
+    def _infer(self, request: Incoming, request_id: str | None, session: str | None) -> Any:
         content, remaining_s = request
         name, version = "", None
         try:
@@ -222,6 +227,7 @@ class Grpc:
                 _inputs(asked),
                 received=received,
                 deadline_ms=None if remaining_s is None else remaining_s * 1e3,
+                session=session,
             )
         except RlservoError as error:
             self._core.failed(PROTOCOL, name, version, error.code)

@@ -180,7 +180,7 @@ def test_the_callers_deadline_reaches_the_policy(live_server: Any, ur5: Path) ->
     asyncio.run(run())
     (one, within), (two, ever) = seen
     assert (one, two, ever) == (b"one", b"two", None)
-    assert 3.0 < within <= 5.0
+    assert 3.0 < within < 5.1  # gRPC rounds a deadline to its wheel of timers
 
 
 def test_a_deadline_that_has_passed_is_not_worked_for(ur5: Path) -> None:
