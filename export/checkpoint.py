@@ -8,6 +8,7 @@ every export is compared with: RLlib's own pipelines around RLlib's own forward 
 from __future__ import annotations
 
 import copy
+import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import ray
 import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
@@ -307,9 +309,23 @@ def _restore(kind: Any, folder: Path) -> Any:
     try:
         return kind.from_checkpoint(str(folder))
     except Exception as error:  # whatever RLlib, torch or the user's own constructor raises
-        raise CheckpointError(f"{folder} cannot be restored: {explain(error)}") from error
+        raise CheckpointError(f"{folder} cannot be restored: {explain(error)}{_other_ray(folder)}") from error
     finally:
         deprecation.removeFilter(_not_rllibs_own)
+
+
+def _other_ray(folder: Path) -> str:
+    """Return what to do where another Ray wrote a part that this one cannot read; empty where it was this one."""
+    try:
+        written_by = str(json.loads((folder / "metadata.json").read_text(encoding="utf-8"))["ray_version"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+    if written_by == ray.__version__:
+        return ""
+    return (
+        f"; Ray {written_by} wrote it and this is Ray {ray.__version__}: export with Ray {written_by}, or train on and "
+        "save with a later one"
+    )
 
 
 def _not_rllibs_own(record: logging.LogRecord) -> bool:

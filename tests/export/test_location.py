@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import shutil
 from collections.abc import Callable
@@ -198,3 +199,13 @@ def test_weights_that_are_not_finite_are_refused(copy_of: Callable[[str], Path],
     rewrite_weights(damaged, lambda state: np.copyto(state["pi.net.mlp.0.bias"], np.nan))
     with pytest.raises(CheckpointError, match="training diverged"):
         load_checkpoint(locate_checkpoint(damaged), notices.append)
+
+
+def test_a_part_that_another_ray_wrote_and_this_one_cannot_read_says_so(copy_of: Callable[[str], Path]) -> None:
+    damaged = copy_of("clipped")
+    pipeline = damaged / "env_runner" / "env_to_module_connector"
+    written = json.loads((pipeline / "metadata.json").read_text())
+    (pipeline / "metadata.json").write_text(json.dumps({**written, "ray_version": "2.44.1"}))
+    (pipeline / "class_and_ctor_args.pkl").write_bytes(pickle.dumps({"class": dict, "ctor_args_and_kwargs": ((), {})}))
+    with pytest.raises(CheckpointError, match=r"Ray 2\.44\.1 wrote it and this is Ray .*: export with Ray 2"):
+        load_checkpoint(locate_checkpoint(damaged), lambda _: None)
