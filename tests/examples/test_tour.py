@@ -20,7 +20,7 @@ def test_every_stop_ends_in_a_bundle(tmp_path: Path, run_script: Any) -> None:
     assert len(re.findall(r"random actions: mean return -?[\d.]+", ended.out)) == 3
     assert "the exported graph gives the same: largest difference" in ended.out
     assert len(re.findall(r"^[SFHG] [←↓→↑] +-?[\d.]+(   [SFHG] [←↓→↑] +-?[\d.]+){3}$", ended.out, re.MULTILINE)) == 4
-    assert re.search(r"step +0: value -?[\d.]+, action mean", ended.out)
+    assert re.search(r"step +0: value +-?[\d.]+, action mean", ended.out)
     bundles = {path.parent.parent.name for path in (tmp_path / "tour" / "bundles").glob("*/*/contract.json")}
     assert len(bundles) == 3
     if not picture:
