@@ -358,7 +358,9 @@ def _check_contract(bundle: Bundle) -> None:
     for side, listed_tensors in (("inputs", contract.inputs), ("outputs", contract.outputs)):
         for tensor in listed_tensors:
             space = tensors_of[side].get(tensor.name)
-            if space is not None and (tensor.dtype, tensor.shape) != (space.dtype, (-1, *space.shape)):
+            # RLlib sends the action of a Box of shape () as an array of one, and so do its exports.
+            shapes = [(-1, *space.shape)] + [(-1, 1)] * (side == "outputs" and not space.shape) if space else []
+            if space is not None and (tensor.dtype != space.dtype or tensor.shape not in shapes):
                 raise BundleError(
                     f"{bundle.path}: the space of '{tensor.name}' is {space.dtype} of shape {space.shape}, the tensor "
                     f"{tensor.dtype} of shape {tensor.shape}"

@@ -33,8 +33,8 @@ RECURRENT = ["lstm_box", "lstm_discrete", "lstm_previous", "previous", "user_gru
 STATELESS = [
     "obs_discrete", "obs_below_zero", "obs_multi_discrete", "obs_multi_binary", "obs_integers",
     "obs_integers_filtered_first", "obs_bytes", "obs_dict", "obs_tuple", "obs_nested", "dict_module", "greedy_module",
-    "image", "byte_image", "act_multi_discrete", "act_dict", "act_tuple", "masked", "autoregressive", "scaled",
-    "halved", "impala", "sac_discrete", "tqc", "dqn_plain", "dqn_distributional", "dqn_distributional_plain",
+    "image", "byte_image", "act_multi_discrete", "act_dict", "act_tuple", "act_scalar", "masked", "autoregressive",
+    "scaled", "halved", "impala", "sac_discrete", "tqc", "dqn_plain", "dqn_distributional", "dqn_distributional_plain",
     "bc", "marwil", "cql", "iql", "byte_masked", "user_distribution", "old_model_inside",
 ]  # fmt: skip
 # RLlib's own classes and zoo environments, on the way from a checkpoint to the contract.

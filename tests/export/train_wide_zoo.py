@@ -244,6 +244,7 @@ def configurations(out: Path) -> dict[str, Any]:
         "act_multi_discrete": ppo("vector", "multi_discrete"),
         "act_dict": ppo("vector", "dict"),
         "act_tuple": ppo("vector", "tuple"),
+        "act_scalar": ppo("vector", "scalar"),
         "act_nested": ppo("nested", "nested", flat, model=LSTM),
         "masked": ppo("masked", "discrete", spec=masking),
         "byte_masked": ppo("byte_masked", "discrete", spec=masking),

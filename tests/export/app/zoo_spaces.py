@@ -48,6 +48,7 @@ ACTIONS: dict[str, Any] = {
         "free": Box(-np.inf, np.inf, (1,), np.float32),
     }),
     "tuple": Tuple((Discrete(2), Box(-0.5, 0.25, (2,), np.float32), MultiDiscrete([2, 3]))),
+    "scalar": Box(-1.0, 3.0, (), np.float32),
     "autoregressive": Tuple((Discrete(3), Box(-1.0, 1.0, (1,), np.float32))),
     "nested": Dict({"a": Tuple((Box(0.0, 9.0, (1,), np.float32), Discrete(2))), "b": MultiDiscrete([3, 2])}),
 }  # fmt: skip
