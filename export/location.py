@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
@@ -43,13 +44,14 @@ class CheckpointFiles:
     root: Path
     module_id: str
     alone: bool = False
+    part: bool = False  # of a MultiRLModule that was saved by itself
     agent_id: str | None = None
     """The agent that was asked for, where the module serves several."""
 
     @property
     def is_one_of_several(self) -> bool:
         """Whether the policy goes by an id of its own, and may have others beside it."""
-        return not self.alone and self.module_id != DEFAULT_MODULE
+        return self.module_id != DEFAULT_MODULE and (self.part or not self.alone)
 
     @property
     def module(self) -> Path:
@@ -117,7 +119,11 @@ def locate_checkpoint(path: str | Path, module_id: str | None = None, agent_id: 
         raise CheckpointError(f"{given} is a file: expected the folder of an RLlib checkpoint")
     root = _find_root(given)
     if _is_module(root):
-        alone = CheckpointFiles(root, module_id or DEFAULT_MODULE, alone=True)
+        parts = _parts(root)
+        if parts:
+            module_id = _choose(root, parts, module_id)
+            root /= module_id
+        alone = CheckpointFiles(root, module_id or DEFAULT_MODULE, alone=True, part=bool(parts))
         _check_complete(alone)
         return alone
     if not (root / MODULES).is_dir():
@@ -139,7 +145,7 @@ def locate_modules(path: str | Path) -> list[Files]:
     """
     given = Path(path).expanduser().absolute()
     root = _find_root(given) if given.is_dir() else given
-    ids = _present_modules(root) or policy_ids(root)
+    ids = _present_modules(root) or policy_ids(root) or (_parts(root) if root.is_dir() else [])
     return [locate_checkpoint(root, module_id) for module_id in ids] or [locate_checkpoint(given)]
 
 
@@ -177,6 +183,11 @@ def _is_module(folder: Path) -> bool:
     return any((folder / f"{STATE_STEMS['module']}{suffix}").is_file() for suffix in STATE_SUFFIXES)
 
 
+def _parts(folder: Path) -> list[str]:
+    """Return the modules in the folder of a MultiRLModule that was saved by itself."""
+    return sorted(child.name for child in folder.iterdir() if child.is_dir() and _is_module(child))
+
+
 def _newest_checkpoint(folder: Path) -> Path | None:
     numbered = [
         (int(match[1]), child)
@@ -193,10 +204,15 @@ def _present_modules(root: Path) -> list[str]:
 
 def _choose_module(root: Path, module_id: str | None) -> str:
     present = _present_modules(root)
+    if not present and module_id is None:
+        raise CheckpointError(f"{root / MODULES} holds no module: looked for <module id>/{CTOR_FILE}")
+    return _choose(root, present, module_id)
+
+
+def _choose(root: Path, present: Sequence[str], module_id: str | None) -> str:
+    """Return the module that is asked for, or the only one. Raises CheckpointError."""
     if module_id is not None and module_id not in present:
         raise CheckpointError(f"{root} has no module '{module_id}': it holds {', '.join(present) or 'none'}")
-    if not present:
-        raise CheckpointError(f"{root / MODULES} holds no module: looked for <module id>/{CTOR_FILE}")
     if module_id is None and len(present) > 1:
         raise CheckpointError(
             f"{root} holds {len(present)} modules ({', '.join(present)}): name the one to export with --module-id, or "

@@ -209,3 +209,14 @@ def test_a_part_that_another_ray_wrote_and_this_one_cannot_read_says_so(copy_of:
     (pipeline / "class_and_ctor_args.pkl").write_bytes(pickle.dumps({"class": dict, "ctor_args_and_kwargs": ((), {})}))
     with pytest.raises(CheckpointError, match=r"Ray 2\.44\.1 wrote it and this is Ray .*: export with Ray 2"):
         load_checkpoint(locate_checkpoint(damaged), lambda _: None)
+
+
+def test_modules_saved_together_are_taken_one_by_one(wide_zoo: Path, tmp_path: Path, app: Path) -> None:
+    together = tmp_path / "together"
+    shutil.copytree(wide_zoo / "team" / "learner_group" / "learner" / "rl_module", together)
+    with pytest.raises(CheckpointError, match=r"holds 2 modules \(arms, wheels\): name the one to export"):
+        locate_checkpoint(together)
+    with pytest.raises(CheckpointError, match="has no module 'legs': it holds arms, wheels"):
+        locate_checkpoint(together, "legs")
+    assert locate_checkpoint(together, "wheels").module == together / "wheels"  # type: ignore[union-attr]
+    assert [files.module_id for files in locate_modules(together)] == ["arms", "wheels"]
