@@ -33,6 +33,7 @@ from ray.rllib.policy.torch_mixins import ValueNetworkMixin
 from ray.rllib.policy.torch_policy import TorchPolicy
 from ray.rllib.policy.torch_policy_v2 import TorchPolicyV2
 from ray.rllib.utils.annotations import is_overridden
+from ray.rllib.utils.exploration.parameter_noise import ParameterNoise
 from ray.rllib.utils.numpy import convert_to_numpy
 from ray.rllib.utils.spaces.space_utils import unbatch
 from ray.rllib.utils.typing import ActionConnectorDataType, AgentConnectorDataType
@@ -288,6 +289,11 @@ def _check_policy(files: OldStackFiles, policy: Any) -> None:
         raise UnsupportedError(
             f"model {model} has noisy layers (noisy=True), which RLlib's old stack draws anew for every action, "
             "exploring or not: there is no one action to prove an export with"
+        )
+    if isinstance(policy.exploration, ParameterNoise):
+        raise UnsupportedError(
+            f"policy {name} explores with ParameterNoise, and RLlib saves its weights with the noise of that moment in "
+            "them (ray 2.60): they are not those it acts with when it does not explore"
         )
     _prepare(policy)
     for key, weights in policy.model.state_dict().items():

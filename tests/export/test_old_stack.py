@@ -315,6 +315,7 @@ def test_the_old_stack_reference_does_not_drift(load: Callable[..., OldStackChec
         ("attention", UnsupportedError, r"AttentionWrapper of policy PPOTorchPolicy .*\('state_in_0', shift -50:-1\)"),
         ("previous_lstm", UnsupportedError, r"LSTMWrapper of policy PPOTorchPolicy .*\('prev_actions', shift -1\)"),
         ("noisy_dqn", UnsupportedError, r"noisy layers \(noisy=True\)"),
+        ("noisy_weights", UnsupportedError, "explores with ParameterNoise, and RLlib saves its weights with the noise"),
         (
             "previous_action",
             UnsupportedError,

@@ -37,8 +37,8 @@ from train_zoo import leaves  # pyright: ignore[reportMissingImports]
 
 STEPS = 100  # recorded
 REFUSED = {
-    "noisy_dqn", "batch_reader", "previous_action", "clock_reader", "attention", "previous_lstm", "clipped_limbs",
-    "own_policy",
+    "noisy_dqn", "noisy_weights", "batch_reader", "previous_action", "clock_reader", "attention", "previous_lstm",
+    "clipped_limbs", "own_policy",
 }  # fmt: skip
 REPLAY = {"type": "MultiAgentPrioritizedReplayBuffer", "capacity": 100}
 
@@ -152,6 +152,13 @@ def configurations(out: Path) -> dict[str, Any]:
         "plain_dqn": dqn(dueling=False, double_q=False, hiddens=[], categorical_distribution_temperature=0.5),
         "distributional_dqn": dqn(num_atoms=5, v_min=-2.0, v_max=30.0),
         "noisy_dqn": dqn(noisy=True),
+        # Evaluation by steps cuts episodes, which this exploration does not take.
+        "noisy_weights": dqn()
+        .evaluation(evaluation_duration_unit="episodes", evaluation_duration=1)
+        .env_runners(
+            batch_mode="complete_episodes",
+            exploration_config={"type": "ParameterNoise", "sub_exploration": {"type": "EpsilonGreedy"}},
+        ),
         "sac": sac("Pendulum-v1", filtered="MeanStdFilter"),
         "unnormalized_sac": sac("Pendulum-v1", **clip),
         "discrete_sac": sac("CartPole-v1"),
