@@ -290,6 +290,11 @@ class Control:
                     f"policy '{name}' version {version} cannot be the {role} of version {policy.default}: its "
                     "observations or actions are of other names, types or shapes"
                 )
+            if role == "canary" and theirs.state != ours.state:
+                raise RefusedError(
+                    f"policy '{name}' version {version} cannot be the canary of version {policy.default}: what it "
+                    "remembers of an episode is something else"
+                )
             if role == "shadow" and theirs.state:
                 raise RefusedError(
                     f"policy '{name}' version {version} remembers its episode: a shadow computes on single observations"
@@ -330,7 +335,9 @@ class Control:
                 wanted = was
                 keys = [(name, version, digest) for version, digest in was.versions.items()]
                 loaded = {key: each for key in keys if (each := self._library.get(*key)) is not None}
-            elif errors and self.store is None and wanted.default in errors:
+            elif errors and wanted.default in errors:
+                if self.store is not None:
+                    continue  # not served here rather than as another version; `behind` says so
                 raise BundleError(
                     f"policy '{name}' cannot be served as version {wanted.default}, its default: "
                     f"{errors[wanted.default].message}"

@@ -189,14 +189,27 @@ def _batch(space: SpaceSpec, obs: Any) -> int:
         parts = obs if type(obs) in (dict, list, tuple) else {}
         found: dict[Any, Any] = dict(parts) if type(parts) is dict else dict(enumerate(parts))
         return max((_batch(child, found[key]) for key, child in inside if key in found), default=0)
-    rows = _rows(obs)
-    return rows if type(obs) is dict or rows != (space.shape or (0,))[0] else 1
+    if type(obs) is dict:  # element names and values
+        return max((_length(value) for value in obs.values()), default=0)
+    rows = _length(obs)
+    return rows if rows != (space.shape or (0,))[0] else 1
+
+
+def _length(value: Any) -> int:
+    if type(value) is np.ndarray:
+        return len(value) if value.ndim else 0
+    return len(value) if type(value) in (list, tuple) else 0
 
 
 def _rows(obs: Any) -> int:
-    """Return how many observations a batch would hold: lists, arrays, or names to either."""
-    if type(obs) is dict:
-        return max((_rows(value) for value in obs.values()), default=0)
-    if type(obs) is np.ndarray:
-        return len(obs) if obs.ndim else 0
-    return len(obs) if type(obs) is list else 0
+    """Return how many observations there are at most, whatever the space is: `_batch` looks closer at large ones."""
+    most, parts = 0, [obs]
+    while parts:
+        part = parts.pop()
+        if type(part) is dict:
+            parts += part.values()
+        else:
+            most = max(most, _length(part))
+            if type(part) in (list, tuple) and part and type(part[0]) in (dict, list, tuple, np.ndarray):
+                parts.append(part[0])  # the parts of a Tuple are of one batch
+    return most

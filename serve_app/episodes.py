@@ -69,8 +69,16 @@ class Episodes:
         if episode.end or (episode.reset and stream is None):
             word = "end" if episode.end else "reset"
             raise RequestError(f"'{word}' is for a session: send its 'session_id', too")
+        if stream is not None:
+            begins = episode.reset or (episode.state is not None and not episode.state)
+            try:
+                self._check_version(store, name, version, stream)
+            except SessionError:
+                if not begins:
+                    raise
+                stream.policy = store.choose(name, version, session)  # an episode begins: with what is there now
+                stream.begin()
         if stream is not None and episode.state is None:
-            self._check_version(store, name, version, stream)
             if episode.reset:
                 stream.begin()
             step, taken_ms, notices = _timed(

@@ -368,7 +368,8 @@ def _fail(context: Any, error: Exception) -> None:
     status, sentence, code = _explain(error)
     context.set_code(status)
     context.set_details(sentence)
-    trailing = [("rlservo-code", code)]
+    given = [(name, value) for name, value in context.invocation_metadata() or () if name == REQUEST_ID]
+    trailing = [("rlservo-code", code), *given]
     if status is grpc.StatusCode.UNAVAILABLE:
         trailing.append(("retry-after", str(RETRY_AFTER_S)))
     context.set_trailing_metadata(trailing)  # in addition to Serve's

@@ -105,6 +105,7 @@ class Policy:
         contract = bundle.contract
         self._bundle = bundle
         self._contract = contract
+        self._session: onnxruntime.InferenceSession | None = session
         self._run: _Run = session.run
         self._rng = np.random.default_rng()
         self.options = options
@@ -126,7 +127,8 @@ class Policy:
         """Whether an action depends on what came before: on a state, or by a limit on the last action."""
         # Most policies read one array and give one: those few microseconds are what a control loop asks for.
         observations = leaf_specs(contract.observation_space, "obs")
-        self._simple = len(observations) == len(actions) == len(contract.inputs) == 1 and not self.episodic
+        flat = "obs" in observations and "action" in actions  # not a Dict or Tuple, which may have a single leaf
+        self._simple = flat and len(contract.inputs) == 1 and not self.episodic
         self._leaf_reader = ObservationReader(
             contract.name, next(iter(observations.values())), options=options, notice=self._take_notice
         )
@@ -262,13 +264,19 @@ class Policy:
         own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
         return Step(build_action(space, own), action, after, rows if batch else None)
 
+    def twin(self) -> Policy:
+        """Return another policy over the same graph, for another thread: its memory, notices and drift are its own."""
+        if self._session is None:
+            _refuse_closed([], {})
+        return Policy(self._bundle, self._session, self.options)
+
     def reset(self) -> None:
         """Start an episode: a recurrent policy forgets. Nothing to do for a stateless one."""
         self._state = self._last = None
 
     def close(self) -> None:
         """Drop the session; `act` raises UsageError from now on."""
-        self._run = _refuse_closed
+        self._run, self._session = _refuse_closed, None
 
     def __enter__(self) -> Self:
         return self

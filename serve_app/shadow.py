@@ -7,6 +7,7 @@ action's own units; for discrete actions it is 0 or the distance of their number
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 from collections.abc import Iterator, Mapping
@@ -19,6 +20,8 @@ from prometheus_client.metrics_core import Metric
 
 from rlservo.export.errors import RlservoError
 from rlservo.serve_app.store import Decision, Shadow
+
+logger = logging.getLogger(__name__)
 
 WAITING = 64  # requests at most, so that a slow candidate costs neither memory nor the default version's time
 BOUNDS = (1e-6, 1e-5, 1e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
@@ -97,11 +100,14 @@ class Shadows:
             shadow, obs, decision = self._waiting.get()
             series = self._of(shadow, decision)
             try:
-                action = shadow.policy.act(obs)
+                differences = _differences(shadow.policy.act(obs), decision.action, batch=decision.batch)
             except RlservoError:  # its action left the space, say: that is what a shadow is run for
                 series.failed += 1
                 continue
-            differences = _differences(action, decision.action, batch=decision.batch)
+            except Exception:  # this thread serves every shadow, and has to outlive one that is broken
+                logger.exception("shadow %s of policy '%s' failed", shadow.version, decision.name)
+                series.failed += 1
+                continue
             np.add.at(series.counts, np.searchsorted(BOUNDS, differences), 1)
             series.total += float(differences.sum())
             series.largest = max(series.largest, float(differences.max(initial=0.0)))

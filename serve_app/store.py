@@ -232,7 +232,7 @@ class PolicyStore:
             self._canary[name] = _Canary(canary, plan.canary.share, canary.episodic)
         shadow = versions.get((plan.shadow and plan.version_of(plan.shadow)) or "")
         if shadow is not None and shadow is not default:
-            self._shadow[name] = Shadow(default.contract.version, shadow.contract.version, shadow)
+            self._shadow[name] = Shadow(default.contract.version, shadow.contract.version, shadow.twin())
 
     def _versions(self, name: str) -> Mapping[str, Policy]:
         versions = self._policies.get(name)

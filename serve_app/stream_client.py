@@ -150,6 +150,10 @@ class StreamClient:
                     f"{self.url} did not answer within {1e3 * self._deadline_s:g} ms",
                     {"deadline_ms": 1e3 * self._deadline_s},
                 ) from None
+            if not held and (reply.get("policy"), reply.get("version")) != (contract.name, contract.version):
+                self._drop()  # the default has moved: the next connection names its version
+                if self._connections == 1 and time.monotonic() + WAIT_S < deadline:
+                    continue
             check_sender(self.url, reply, number, contract)
             action = restored(_first(reply.get("actions"), contract, batch), batch, contract)
             if held:

@@ -24,6 +24,7 @@ from rlservo.serve_app.http import create_app
 from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
+from rlservo.serve_app.stream_client import StreamClient
 from rlservo.serve_app.structure import action_leaves
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -307,6 +308,41 @@ def test_a_session_stays_with_its_version_until_that_is_gone(
         status, reply = step()
         assert (status, reply["code"]) == (410, "session-lost") and "no longer loaded" in reply["error"]
         assert step(reset=True)[1]["version"] == "2"
+
+
+def test_an_open_stream_goes_on_with_its_version_when_another_becomes_the_default(
+    served: Serve, box_policy: Callable[..., Path], tmp_path: Path
+) -> None:
+    one, two = (Policy.load(box_policy(tmp_path, version=version, seed=seed)) for seed, version in enumerate("12"))
+    stores = [PolicyStore([one]), PolicyStore([one, two])]
+    now = 0
+    obs = np.linspace(-1, 1, 27)
+    with (
+        served(create_app(lambda: stores[now], ServerSettings())) as port,
+        StreamClient(f"http://127.0.0.1:{port}", "ur5", deadline_ms=5000) as client,
+    ):
+        assert client.act(obs) == pytest.approx(one.act(obs))
+        now = 1
+        for _ in range(3):
+            assert client.act(obs) == pytest.approx(one.act(obs))
+
+
+def test_a_stream_begins_its_next_episode_with_the_bundle_that_is_there_now(
+    store: PolicyStore, recurrent: Path, served: Serve
+) -> None:
+    again = Policy.load(recurrent / "lstm_box")
+    stores = [store, PolicyStore([again])]
+    now = 0
+    obs = observations("lstm_box", 1)[0]
+    with (
+        served(create_app(lambda: stores[now], ServerSettings())) as port,
+        Socket(port, "/v1/policies/lstm_box/stream?errors=keep") as stream,
+    ):
+        assert stream.ask(obs=obs)["session_step"] == 1
+        now = 1  # the same version, loaded anew
+        assert stream.ask(obs=obs)["code"] == "session-lost"
+        assert stream.ask(obs=obs, reset=True)["session_step"] == 1
+        assert stream.ask(obs=obs)["session_step"] == 2
 
 
 def test_no_odd_request_gets_a_5xx(ask: Ask) -> None:
