@@ -67,20 +67,24 @@ def connections(port: int, number: int) -> Iterator[list[socket.socket]]:
 
 def test_what_exceeds_the_queue_is_refused_at_once_and_the_rest_gets_its_own_action(serve: Serve, ur5: Path) -> None:
     with Policy.load(ur5) as policy, serve(max_ongoing_requests=16) as port, connections(port, 61) as clients:
-        clients[0].sendall(ask(OBS))  # 4,096 observations keep the loop busy while the others arrive
-        time.sleep(0.02)
-        for index, client in enumerate(clients[1:], start=1):
-            client.sendall(ask(OBS[index]))
-        refused = 0
-        assert answer(clients[0])[0] == 200
-        for index, client in enumerate(clients[1:], start=1):
-            status, headers, document = answer(client)
-            if status == 200:
-                np.testing.assert_allclose(document["action"], policy.act(OBS[index]), rtol=1e-5, atol=1e-6)
-            else:
-                assert (status, document["code"], headers["retry-after"]) == (503, "over-capacity", "1")
-                refused += 1
-        assert 0 < refused <= 60 - 16
+        for _ in range(20):  # on a busy computer the loop may be done before the others have arrived
+            clients[0].sendall(ask(OBS))  # 4,096 observations keep the loop busy meanwhile
+            time.sleep(0.02)
+            for index, client in enumerate(clients[1:], start=1):
+                client.sendall(ask(OBS[index]))
+            refused = 0
+            assert answer(clients[0])[0] == 200
+            for index, client in enumerate(clients[1:], start=1):
+                status, headers, document = answer(client)
+                if status == 200:
+                    np.testing.assert_allclose(document["action"], policy.act(OBS[index]), rtol=1e-5, atol=1e-6)
+                else:
+                    assert (status, document["code"], headers["retry-after"]) == (503, "over-capacity", "1")
+                    refused += 1
+            assert refused <= 60 - 16
+            if refused:
+                break
+        assert refused
         for index, client in enumerate(clients[1:], start=1):  # once it is over, everybody is served again
             client.sendall(ask(OBS[index]))
             assert answer(client)[0] == 200
