@@ -7,7 +7,7 @@ One machine, one run, one policy (the shipped UR5's), one load generator (`wrk`,
 client in Python). The peers come from PyPI, each in an environment of its own, with one worker each. All servers run at
 the same time and take turns in short rounds, so that a slow moment of the machine falls on all of them. What is
 compared are ratios within rounds; absolute times belong to the machine. CPU time per request, of all of a server's
-processes, hardly depends on what else runs. Results go to bench/serving.md, .json and .svg; with
+processes, depends on it less. Results go to bench/serving.md, .json and .svg; with
 --publish the table and the chart also to benchmarks/, to be committed.
 """
 
@@ -57,6 +57,9 @@ def main() -> None:
         case = case_of(*policy(arguments, folder, console))
         console.print("preparing the peers' environments (the first time, a few minutes) ...")
         compared, missing = servers(case, folder)
+        known = {one.name for one in compared} | set(missing)
+        if strange := [name for name in arguments.only or () if name not in known]:
+            raise SystemExit(f"--only: no server is called '{strange[0]}': there are {', '.join(sorted(known))}")
         compared = [one for one in compared if not arguments.only or one.name in (RLSERVO, *arguments.only)]
         result = measure(case, compared, folder, arguments, console)
         result.missing.update(missing)

@@ -84,8 +84,8 @@ def verdicts(result: Result) -> list[Verdict]:
     """Compare with the targets."""
     ratio, median = result.ratio, result.median
     ours1, ours16 = (JSON1, RLSERVO), (JSON16, RLSERVO)
-    quickest = min((name for name in PEERS if median(JSON1, name, p50)), key=lambda name: median(JSON1, name, p50) or 0)
-    best = max((name for name in PEERS if median(JSON16, name, rate)), key=lambda name: median(JSON16, name, rate) or 0)
+    quickest = min(PEERS, key=lambda name: median(JSON1, name, p50) or float("inf"))
+    best = max(PEERS, key=lambda name: median(JSON16, name, rate) or 0)
     in_process = (LARGE, IN_PROCESS)
     memory = _quotient(result.replica_mb, RLSERVO, RLLIB)
     start = _quotient(result.cold_start_s, RLSERVO, RLLIB)
