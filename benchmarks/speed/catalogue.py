@@ -99,11 +99,11 @@ def binary(case: Case, rows: int) -> Exchange:
 
 
 def rlservo(case: Case, _folder: Path, name: str = RLSERVO, replicas: int = 1) -> Server:
-    (port,) = free_ports(1)
+    port, grpc_port = free_ports(2)
     command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(case.bundle.path), "--port", str(port)]
     return Server(
         name,
-        [*command, "--replicas", str(replicas)],
+        [*command, "--grpc-port", str(grpc_port), "--replicas", str(replicas)],
         port,
         plain(case, f"/v1/policies/{case.name}/act"),
         batch=binary(case, BATCH),
@@ -111,6 +111,7 @@ def rlservo(case: Case, _folder: Path, name: str = RLSERVO, replicas: int = 1) -
         stream=f"/v1/policies/{case.name}/stream",
         message=pack({"obs": case.obs}),
         greets=True,
+        grpc_port=grpc_port,
     )
 
 

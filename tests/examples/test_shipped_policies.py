@@ -65,7 +65,7 @@ def card_figures(name: str) -> list[dict[str, Any]]:
 
 
 def test_these_policies_ship() -> None:
-    assert NAMES == ["cartpole_dqn", "mir100_navigation", "mir100_sparse_fixes", "ur5_positioning"]
+    assert NAMES == ["cartpole_dqn", "mir100_navigation", "mir100_sparse_fixes", "pendulum_sac", "ur5_positioning"]
 
 
 @pytest.mark.parametrize(
