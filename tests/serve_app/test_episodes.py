@@ -156,7 +156,7 @@ def test_a_state_that_travels_in_json_gives_the_policys_own_episode(
         assert status == 200, reply
         same(store, name, reply["action"], action)
         state = reply["state"]
-        assert set(state) == {spec.name for spec in store.get(name).contract.state}
+        assert set(state) == {"@policy", *(spec.name for spec in store.get(name).contract.state)}
 
 
 @NAMES
