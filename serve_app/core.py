@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rlservo.export.bundle import DictSpec, SpaceSpec, TupleSpec
-from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError, UnknownPolicyError
+from rlservo.export.errors import DeadlineError, RlservoError, TooLargeError, UnavailableError, UnknownPolicyError
 from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.control import Control
 from rlservo.serve_app.episodes import Episode, Episodes
@@ -162,6 +162,11 @@ class Core:
         elif version is not None:  # an alias is counted as the version it leads to
             version = store.version_of(name, version)
         self.metrics.failed(protocol, name, version or "", code)
+
+    def kept_out(self, protocol: str, error: RlservoError, request_id: str | None) -> None:
+        """Count and log a request that the guard let nobody look at."""
+        self.metrics.failed(protocol, "", "", error.code)
+        self.log.failed(protocol, "", None, error.code, error.message, request_id=request_id)
 
     def policies(self) -> Iterator[tuple[str, str, Policy]]:
         """Yield (name, version, policy) of all that are loaded."""

@@ -199,7 +199,7 @@ class Episodes:
         else:
             session = self.sessions.find(name, session_id)
             self._check_version(store, name, version, session, session_id)
-            repeated = session.repeated(seq)
+            repeated = session.repeated(seq, obs)
             if repeated is not None:
                 return repeated
         taken = _timed(session.policy, obs, episode, NOTHING, session=session, explore=explore, seed=seed)
@@ -210,6 +210,7 @@ class Episodes:
         session.keep(taken.step)
         decision = taken.decision(session.policy, EpisodeNote(session_id=session_id, step=session.steps))
         session.seq, session.answer = seq, decision
+        session.asked = b"" if seq is None else session.policy.fingerprint(obs)
         return decision
 
     def _check_version(

@@ -131,6 +131,9 @@ class Policy:
         self._reader = StructureReader(
             contract.name, contract.observation_space, options=options, notice=self._take_notice
         )
+        self._silent_reader = StructureReader(
+            contract.name, contract.observation_space, options=PolicyOptions(out_of_bounds="accept")
+        )
         actions = leaf_specs(contract.action_space, "action")
         self._guards = {name: ActionGuard(contract.name, name, leaf) for name, leaf in actions.items()}
         self._memory = Memory(contract)
@@ -278,6 +281,13 @@ class Policy:
         space = self._contract.action_space
         own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
         return Step(build_action(space, own), action, after, rows if batch else None)
+
+    def fingerprint(self, obs: Observation) -> bytes:
+        """Return what tells an observation from others, in whatever form it comes. Raises ObservationError."""
+        digest = hashlib.blake2b(digest_size=16)
+        for array in self._silent_reader.read(obs)[0].values():
+            digest.update(np.ascontiguousarray(array))
+        return digest.digest()
 
     def twin(self) -> Policy:
         """Return another policy over the same graph, for another thread: its memory, notices and drift are its own."""

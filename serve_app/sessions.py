@@ -12,7 +12,7 @@ import asyncio
 import time
 from collections import Counter, OrderedDict
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ class Session:
     rows: int = 0  # episodes that it takes the place of
     used: float = field(default_factory=time.monotonic)
     seq: int | None = None  # of the last request that was answered
+    asked: bytes = b""  # what its observation was, as a hash
     answer: Decision | None = None  # to the last request, for the same request sent again
 
     def keep(self, step: Step) -> None:
@@ -53,15 +54,22 @@ class Session:
         self.state = self.last = self.seq = self.answer = None
         self.steps = 0
 
-    def repeated(self, seq: int | None) -> Decision | None:
+    def repeated(self, seq: int | None, obs: Any) -> Decision | None:
         """Return the answer there was, when this is the last request again (its reply got lost).
 
-        To compute it twice would move the memory on twice. Raises SessionError for a request that comes out of order.
+        To compute it twice would move the memory on twice. Raises SessionError for a request that comes out of order,
+        and for another one under the last one's number: the old answer would be an action for what is long past.
         """
         if seq is None or self.seq is None or seq > self.seq:
             return None
         if seq == self.seq:
-            return self.answer
+            if self.policy.fingerprint(obs) == self.asked:
+                return self.answer
+            raise SessionError(
+                f"request {seq} of its session was answered already, for another observation: give every request a "
+                "larger 'seq' than the one before, or none",
+                {"seq": seq, "last_seq": self.seq},
+            )
         raise SessionError(
             f"request {seq} came after request {self.seq} of its session was answered: send them in order",
             {"seq": seq, "last_seq": self.seq},

@@ -114,6 +114,8 @@ class Stream:
         except RlservoError as error:
             self._failed(name, version, error, conversation.request_id, conversation)
             await _fail(send, error_answer(error)[1])
+        except OSError:  # the client went while its reply was being sent: nobody is left to tell
+            logger.debug("a stream's client went before its reply could be sent")
         except Exception:
             logger.exception(
                 "the stream of policy '%s' failed", name, extra={FIELDS: {"request_id": conversation.request_id}}

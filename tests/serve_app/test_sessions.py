@@ -154,6 +154,14 @@ def test_idle_sessions_are_forgotten_without_anybody_asking(store: PolicyStore, 
     assert now["rlservo_episodes_remembered",] == 0
 
 
+def test_a_number_that_is_used_again_for_another_observation_is_refused(server: Server) -> None:
+    first = server.act("s", reset=True, seq=1)[1]
+    assert server.act("s", seq=1) == (200, first)
+    status, reply = server.act("s", seq=1, obs=[0.5, -0.25, 1.5])
+    assert (status, reply["code"]) == (409, "session-conflict") and "for another observation" in reply["error"]
+    assert server.act("s", seq=2, obs=[0.5, -0.25, 1.5])[1]["session_step"] == 2
+
+
 def test_a_number_and_a_string_that_looks_like_it_are_two_sessions(server: Server) -> None:
     assert server.infer(7, sequence_start=True)[1]["parameters"] | {"infer_ms": 0} == {
         "infer_ms": 0,
