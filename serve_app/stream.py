@@ -38,7 +38,6 @@ from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import encode_bug, error_answer, request_id, session_of
 from rlservo.serve_app.keys import check_origin
 from rlservo.serve_app.logs import FIELDS
-from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.sessions import Session
 from rlservo.serve_app.store import Decision
 
@@ -91,7 +90,10 @@ class Stream:
             await refuse(scope, receive, send, error)
             return
         await receive()  # websocket.connect
-        await send({"type": "websocket.accept"})
+        try:
+            await send({"type": "websocket.accept"})
+        except OSError:  # the client has gone already
+            return
         self._core.metrics.stream(name, 1)
         idle = IdleTimer(self._core.settings.stream_idle_s)
         session = Session(policy) if policy.episodic else None
@@ -161,7 +163,7 @@ class Stream:
             if message["type"] == "websocket.disconnect":
                 return
             try:
-                obs, options = self._read(message, asked.session)
+                obs, options = self._read(message, asked)
                 asked.seq = options.get("seq")
                 reply, decision = self._decide(asked, obs, options, received)
             except RlservoError as error:
@@ -244,7 +246,7 @@ class Stream:
             )
         return default, None
 
-    def _read(self, message: Message, session: Session | None) -> tuple[Any, Mapping[str, Any]]:
+    def _read(self, message: Message, asked: _Conversation) -> tuple[Any, Mapping[str, Any]]:
         """Return (observation, options) of one frame."""
         content = message.get("bytes")
         if content is None:
@@ -255,7 +257,7 @@ class Stream:
         if type(document) is not dict:
             raise RequestError(f"the message must be a map such as {{'obs': ...}}, got {type(document).__name__}")
         if "obs" not in document:  # element names and values
-            if session is not None and type(document.get("reset")) is bool and not _has(session.policy, "reset"):
+            if type(document.get("reset")) is bool and not self._names(asked, "reset"):
                 named = {name: value for name, value in document.items() if name != "reset"}
                 return named, {"reset": document["reset"]}
             return document, NO_OPTIONS
@@ -265,6 +267,13 @@ class Stream:
         if unknown:
             raise RequestError(f"unknown field '{unknown[0]}': known are {', '.join(sorted(KNOWN))}")
         return document["obs"], document
+
+    def _names(self, asked: _Conversation, name: str) -> bool:
+        """Whether an observation of this stream's policy has a part or an element of that name."""
+        session = asked.session
+        policy = self._core.store().get(asked.name, asked.version) if session is None else session.policy
+        space = policy.contract.observation_space
+        return name in (space.spaces if isinstance(space, DictSpec) else {element.name for element in space.elements})
 
 
 def _metadata(contract: Contract) -> dict[str, Any]:
@@ -276,12 +285,6 @@ def _metadata(contract: Contract) -> dict[str, Any]:
         "control_rate_hz": contract.control_rate_hz,
         "contract": contract.model_dump(mode="json"),
     }
-
-
-def _has(policy: Policy, name: str) -> bool:
-    """Whether an observation of the policy has a part or an element of that name."""
-    space = policy.contract.observation_space
-    return name in (space.spaces if isinstance(space, DictSpec) else {element.name for element in space.elements})
 
 
 def _chunks(action: Any, *, batch: bool) -> Any:

@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 import websockets.sync.client
 
-from rlservo.export.errors import SessionLostError, UnknownVersionError
+from rlservo.export.bundle import TensorSpec
+from rlservo.export.errors import RequestError, SessionLostError, UnknownVersionError
 from rlservo.serve_app import oip_messages as messages
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.client import PolicyClient
 from rlservo.serve_app.http import create_app
+from rlservo.serve_app.memory import Memory
 from rlservo.serve_app.oip_grpc import Grpc
 from rlservo.serve_app.options import PolicyOptions
 from rlservo.serve_app.plan import PolicyPlan
@@ -311,3 +313,14 @@ def test_an_action_that_came_too_late_is_not_what_the_next_one_is_measured_from(
             client._last, client._unsure = used.tolist(), True
             assert np.abs(unseen - used).max() > 0
             np.testing.assert_allclose(client.act(down), unseen, rtol=1e-5, atol=1e-6)
+
+
+def test_a_reward_is_seen_where_nothing_else_is_remembered(versions: dict[str, Policy]) -> None:
+    contract = versions["1"].contract
+    reward = TensorSpec(name="reward", dtype="float32", shape=(-1,))
+    with_state = Memory(contract.model_copy(update={"inputs": (*contract.inputs, reward)}))
+    assert with_state.feed(None, 1, 2.5)["reward"] == 0  # an episode begins: nothing has been earned
+    alone = Memory(contract.model_copy(update={"inputs": (contract.inputs[0], reward), "state": ()}))
+    assert alone.feed(None, 1, 2.5)["reward"] == 2.5
+    with pytest.raises(RequestError, match="0 at an episode's start"):
+        alone.feed(None, 1, None)

@@ -147,6 +147,13 @@ def test_observations_come_as_named_elements_lists_batches_and_other_dtypes(port
         np.testing.assert_array_equal(actions[:, 0], expected(store, batch))
 
 
+def test_a_reset_is_taken_where_nothing_is_remembered(port: int, store: PolicyStore) -> None:
+    named = {f"element_{i}": value for i, value in enumerate(OBS)}
+    with OpenpiClient(port) as client:
+        for request in ({"obs": OBS, "reset": True}, {**named, "reset": True}):
+            np.testing.assert_array_equal(client.infer(request)["actions"][0], expected(store))
+
+
 def test_exploring_is_repeatable_by_seed(port: int) -> None:
     with OpenpiClient(port) as client:
         first, again, other = (
