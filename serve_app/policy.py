@@ -286,7 +286,7 @@ class Policy:
         """Return what tells an observation from others, in whatever form it comes. Raises ObservationError."""
         digest = hashlib.blake2b(digest_size=16)
         for array in self._silent_reader.read(obs)[0].values():
-            digest.update(np.ascontiguousarray(array))
+            digest.update(array.tobytes())
         return digest.digest()
 
     def twin(self) -> Policy:
