@@ -305,7 +305,6 @@ def serve(
             _note(f"administration: rlservo policy --help; its key is in {served.admin_key_file}")
         _out.print(f"ready; documentation at {served.url}/docs; Ctrl-C stops", highlight=False, soft_wrap=True)
 
-    _err.print("starting Ray Serve ...", style="dim")
     serve_policies(
         directories,
         host=host,
@@ -314,6 +313,7 @@ def serve(
         replicas=replicas,
         served=policy_commands.served_config(config, versions, alias, canary, shadow),
         admin_key_file=key_file(port),
+        on_start=lambda: _err.print("starting Ray Serve ...", style="dim"),
         on_ready=ready,
     )
 

@@ -24,6 +24,7 @@ from rlservo.export.errors import (
     ActionError,
     DeadlineError,
     ObservationError,
+    RequestError,
     SessionLostError,
     UnavailableError,
     UnknownPolicyError,
@@ -34,6 +35,7 @@ from rlservo.serve_app.structure import build_action
 from rlservo.serve_app.transport import Transport, encode
 
 POLL_S = 0.1  # between two looks at a server that is starting
+MARK = "@"  # begins the names in a state that are none of the contract's: they are sent back as they came
 
 
 class PolicyClient:
@@ -48,9 +50,10 @@ class PolicyClient:
     the server loads meanwhile does not change a running loop.
 
     Thread-safe for stateless policies: threads share the connections and each gets the answer to its own request.
-    A recurrent policy's state is kept here and sent along, so such a client belongs to one loop; no replica that dies
-    takes it along. With `server_state` it stays with the server instead, in a session of this client, which is worth
-    it for large states (frames of a camera) and raises SessionLostError when the server has lost it.
+    A recurrent policy's state is kept here and sent along, and so is the last action where the server limits the step
+    from it: such a client belongs to one loop, and no replica that dies takes its memory along. With `server_state` the
+    memory stays with the server instead, in a session of this client, which is worth it for large states (frames of a
+    camera) and raises SessionLostError when the server has lost it.
     """
 
     def __init__(
@@ -84,6 +87,9 @@ class PolicyClient:
         self._contract: Contract | None = None
         self._numbers = itertools.count(1)  # next() is atomic: no two requests share a number
         self._state: dict[str, Any] = {}  # empty at an episode's start
+        self._carries = False  # whether a policy without a state of its own needs one: a limit is set on its steps
+        self._last: Any = None  # the last action of the episode, as the server sent it
+        self._unsure = False  # whether the session may have gone on to an action that never came here
         self._session = uuid.uuid4().hex if server_state else None
         self._steps = 0  # of the session's episode
 
@@ -113,10 +119,10 @@ class PolicyClient:
         cannot be reached, is not ready, or answers another request than this one.
         """
         contract = self.contract
-        number = next(self._numbers)
+        deadline = time.monotonic() + self._deadline_ms / 1e3
         plain, batch = sendable(obs, contract)
         # The server drops what it could not answer in time, instead of working through a queue of abandoned questions.
-        request: dict[str, Any] = {"obs": plain, "seq": number, "deadline_ms": self._deadline_ms}
+        request: dict[str, Any] = {"obs": plain, "deadline_ms": self._deadline_ms}
         if explore:
             request["explore"] = True
         if seed is not None:
@@ -125,21 +131,42 @@ class PolicyClient:
             request["reward"] = np.asarray(reward)
         if self._session is not None:
             request.update(session_id=self._session, reset=self._steps == 0)
-        elif contract.state:
+            if self._unsure and self._last is not None:
+                request["last_action"] = self._last  # what the robot was last commanded
+        elif contract.state or self._carries:
             request["state"] = self._state
-        path = ("v1", "policies", contract.name, "versions", contract.version, "act")
-        reply = self._transport.post(*path, body=encode(request), timeout_s=self._deadline_ms / 1e3)
-        check_sender(self._transport.url, reply, number, contract)
+        try:
+            reply = self._ask(request, contract)
+        except RequestError as error:
+            if "state" in request or self._session is not None or error.details.get("send") != "state":
+                raise
+            # Nothing in the contract says that the server limits the step from one action to the next.
+            self._carries = True
+            request["state"] = self._state
+            if self._last is not None:  # the limit was set in the middle of an episode
+                request["last_action"] = self._last
+            request["deadline_ms"] = 1e3 * (deadline - time.monotonic())
+            reply = self._ask(request, contract)
         action = restored(reply.get("action"), batch, contract)
         if self._session is not None:
             self._steps = check_step(reply, self._steps)
-        elif contract.state:
+        elif "state" in request:
             self._state = carried(reply, contract)
+        self._last, self._unsure = reply["action"], False
         return action
 
     def reset(self) -> None:
         """Start an episode: the next request begins with the state of an episode's start. Sends nothing."""
-        self._state, self._steps = {}, 0
+        self._state, self._steps, self._last = {}, 0, None
+
+    def _ask(self, request: dict[str, Any], contract: Contract) -> Any:
+        """Send a request under a number of its own and return the reply to it. Raises DeadlineError."""
+        number = request["seq"] = next(self._numbers)
+        self._unsure = True
+        path = ("v1", "policies", contract.name, "versions", contract.version, "act")
+        reply = self._transport.post(*path, body=encode(request), timeout_s=request["deadline_ms"] / 1e3)
+        check_sender(self._transport.url, reply, number, contract)
+        return reply
 
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:
         """Return as soon as the server offers the policy.
@@ -222,7 +249,10 @@ def check_step(reply: Mapping[str, Any], steps: int) -> int:
 def carried(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
     """Return the state for the next request; raise UnavailableError where the server gave none."""
     state = reply.get("state")
-    if not isinstance(state, dict) or set(state) != {spec.name for spec in contract.state}:
+    if state is None and not contract.state:
+        return {}  # what had to be carried has not to be any more
+    names = {name for name in state if not name.startswith(MARK)} if isinstance(state, dict) else None
+    if not isinstance(state, dict) or names != {spec.name for spec in contract.state}:
         raise UnavailableError(f"the server's answer for {contract.name!r} lacks the state: the action was dropped")
     return state
 

@@ -113,6 +113,7 @@ class Control:
         self._broadcast = broadcast
         self._is_current = is_current
         self._serving: dict[str, PolicyPlan] = {}
+        self._served: dict[str, set[str]] = {}  # every identity that was ever served here, by name
         self._loading: set[Key] = set()
         self._failed: dict[Key, str] = {}
         self._behind: tuple[str, ...] = ()
@@ -346,7 +347,11 @@ class Control:
             kept.update(loaded)
         self._library.keep(kept)
         # From here on nothing waits: whoever asks sees all of the old or all of the new.
-        self.store = PolicyStore([loaded.policy for loaded in kept.values()], serving)
+        policies = [loaded.policy for loaded in kept.values()]
+        for policy in policies:
+            self._served.setdefault(policy.contract.name, set()).add(policy.identity)
+        changed = [name for name, identities in self._served.items() if len(identities) > 1]
+        self.store = PolicyStore(policies, serving, changed=changed)
         self.plan, self._serving, self._failed, self._behind = plan, serving, failed, tuple(behind)
         if behind:
             logger.error("generation %d cannot be served as it should: %s", plan.generation, "; ".join(behind))

@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from rlservo.export.bundle import Contract, DictSpec, SpaceSpec, TupleSpec
-from rlservo.export.errors import DeadlineError, TooLargeError, UnavailableError, UnknownPolicyError
+from rlservo.export.bundle import DictSpec, SpaceSpec, TupleSpec
+from rlservo.export.errors import DeadlineError, RlservoError, TooLargeError, UnavailableError, UnknownPolicyError
 from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.control import Control
 from rlservo.serve_app.episodes import Episode, Episodes
-from rlservo.serve_app.gauges import drift, queue
+from rlservo.serve_app.gauges import drift, queue, sessions
 from rlservo.serve_app.keys import Guard, Keys
 from rlservo.serve_app.logs import RequestLog
 from rlservo.serve_app.metrics import Metrics
 from rlservo.serve_app.policy import Policy
-from rlservo.serve_app.sessions import Session
+from rlservo.serve_app.sessions import Session, SessionId
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.shadow import Shadows
 from rlservo.serve_app.store import Decision, PolicyStore
@@ -58,6 +58,7 @@ class Core:
         self.metrics.sources += [
             partial(queue, self, replica),
             partial(drift, self, replica),
+            partial(sessions, self, replica),
             partial(self.shadows.families, replica),
         ]
         self.log = RequestLog(settings)
@@ -89,10 +90,14 @@ class Core:
         except UnknownPolicyError:
             return False
 
-    def contract(self, name: str, version: str | None, session_id: str | None = None) -> Contract:
-        """Return the contract that a request's tensors follow: a session's own, whatever the default is meanwhile."""
-        session = None if session_id is None else self.episodes.sessions.peek(name, session_id)
-        return (self.store().get(name, version) if session is None else session.policy).contract
+    def policy(
+        self, name: str, version: str | None, session_id: SessionId | None = None, identity: Any = None
+    ) -> Policy:
+        """Return the policy that a request's tensors are for: of the session, or of the state of that identity.
+
+        Whatever the default is meanwhile. Raises UnavailableError, UnknownPolicyError.
+        """
+        return self.episodes.policy_of(self.store(), name, version, session_id, identity)
 
     def act(
         self,
@@ -157,6 +162,11 @@ class Core:
         elif version is not None:  # an alias is counted as the version it leads to
             version = store.version_of(name, version)
         self.metrics.failed(protocol, name, version or "", code)
+
+    def kept_out(self, protocol: str, error: RlservoError, request_id: str | None) -> None:
+        """Count and log a request that the guard let nobody look at."""
+        self.metrics.failed(protocol, "", "", error.code)
+        self.log.failed(protocol, "", None, error.code, error.message, request_id=request_id)
 
     def policies(self) -> Iterator[tuple[str, str, Policy]]:
         """Yield (name, version, policy) of all that are loaded."""

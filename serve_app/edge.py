@@ -55,6 +55,7 @@ STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; w
     (ActionError, 500),
 )
 RETRY_AFTER_S = 1
+TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been read
 BUG = "the server failed on this request; its log says how"
 JSON = b"application/json"
 
@@ -97,7 +98,7 @@ class Endpoint:
                 )
         except RlservoError as error:
             status, content, headers = error_answer(error)
-            self._failed(scope, error)
+            self._failed(scope, error, time.perf_counter() - started)
         except Exception:
             logger.exception("a request failed", extra={FIELDS: {"request_id": request_id(scope)}})
             status, content, headers = 500, encode_bug(), JSON_HEADERS
@@ -111,11 +112,13 @@ class Endpoint:
         )
         await send({"type": "http.response.body", "body": content})
 
-    def _failed(self, scope: Scope, error: RlservoError) -> None:
+    def _failed(self, scope: Scope, error: RlservoError, seconds: float) -> None:
         params = scope["path_params"]
         name, version = params["name"], params.get("version")
         self._core.failed(self._protocol, name, version, error.code)
-        self._core.log.failed(self._protocol, name, version, error.code, error.message, request_id=request_id(scope))
+        self._core.log.failed(
+            self._protocol, name, version, error.code, error.message, request_id=request_id(scope), seconds=seconds
+        )
 
 
 JSON_HEADERS: Headers = ((b"content-type", JSON),)
@@ -167,38 +170,66 @@ async def read_body(receive: Receive, *, max_bytes: int, timeout_s: float) -> Bo
 
     Raises TooLargeError and DeadlineError.
     """
-    task, late = asyncio.current_task(), False
-
-    def expire() -> None:
-        nonlocal late
-        late = True
-        if task is not None:
-            task.cancel()
-
-    timer = asyncio.get_running_loop().call_later(timeout_s, expire)
+    timer = _BodyTimer(timeout_s)
     try:
         message = await receive()
         body = message.get("body", b"")
         if message.get("more_body", False):
             body = bytearray(body)
             while message.get("more_body", False):
+                timer.pieces += 1
                 message = await receive()
                 body += message.get("body", b"")
                 if len(body) > max_bytes:
                     break
     except asyncio.CancelledError:
-        if not late:
+        if not timer.late:
             raise
-        if sys.version_info >= (3, 11) and task is not None:  # it counts cancellations
+        if sys.version_info >= (3, 11) and (task := asyncio.current_task()) is not None:  # it counts cancellations
             task.uncancel()
         raise DeadlineError(f"the request body did not arrive within {timeout_s:g} s") from None
     finally:
-        timer.cancel()
+        timer.stop()
     if message["type"] == "http.disconnect":
         return None
     if len(body) > max_bytes:
         raise too_large(max_bytes)
     return body  # type: ignore[no-any-return]  # ASGI messages are untyped
+
+
+class _BodyTimer:
+    """Cancels the current task when a body's time is over and nothing more of it comes.
+
+    On a starved process the clock can pass the time before the loop has read what has long arrived (uvloop even looks
+    at its timers first). So when the time is over, the loop gets a few turns, in each of which it reads, and as many
+    again for every piece that they bring; for as long again as the time was, at most.
+    """
+
+    __slots__ = ("_handle", "_last", "_loop", "_quiet", "_seen", "_task", "late", "pieces")
+
+    def __init__(self, seconds: float) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._task = asyncio.current_task()
+        self._handle = self._loop.call_later(seconds, self._look)
+        self._last = self._loop.time() + 2 * seconds
+        self._quiet = self._seen = 0
+        self.pieces = 0
+        self.late = False
+
+    def stop(self) -> None:
+        """Forget about it."""
+        self._handle.cancel()
+
+    def _look(self) -> None:
+        now = self._loop.time()
+        if self.pieces != self._seen and now < self._last:
+            self._seen, self._quiet = self.pieces, 0
+        if self._quiet < TURNS:
+            self._quiet += 1
+            self._handle = self._loop.call_later(TURN_S, self._look)
+        elif self._task is not None:
+            self.late = True
+            self._task.cancel()
 
 
 def request_id(scope: Scope) -> str | None:

@@ -2,7 +2,8 @@
 
 It comes with the request and returns with the reply (`state`), or stays here: under a session's id, or with a stream.
 One of them must be said: a recurrent policy that silently began anew with every request would act wrongly and look
-right. It knows nothing of protocols.
+right. A memory goes to the version that it is of, and to no other. Whatever is refused leaves it where it was. It knows
+nothing of protocols.
 """
 
 from __future__ import annotations
@@ -13,9 +14,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rlservo.export.errors import RequestError, SessionError, SessionLostError
+from rlservo.serve_app.carried import BELONGS_TO, NOTHING, Carried, carry
 from rlservo.serve_app.policy import Policy, Step
-from rlservo.serve_app.sessions import Session, Sessions
-from rlservo.serve_app.store import NEEDS_LAST, NEEDS_STATE, Decision, EpisodeNote, PolicyStore, take_notices
+from rlservo.serve_app.sessions import Session, SessionId, Sessions, shown
+from rlservo.serve_app.store import (
+    NEEDS,
+    NEEDS_LAST,
+    NEEDS_STATE,
+    Decision,
+    EpisodeNote,
+    PolicyStore,
+    take_notices,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,9 +33,9 @@ class Episode:
     """What a request says of the episode it belongs to."""
 
     state: Mapping[str, Any] | None = None
-    """The memory that the client carries; empty at an episode's start. None: it carries none."""
+    """The memory that the client carries (see `carried.py`); empty at an episode's start. None: it carries none."""
 
-    session_id: str | None = None
+    session_id: SessionId | None = None
     reset: bool = False  # begin the session, or the stream's episode
     end: bool = False  # forget the session after this request
     reward: Any = None
@@ -56,12 +66,12 @@ class Episodes:
     ) -> Decision:
         """Decide. `stream` is the session of the stream that the request came on; `session` is whose request it is.
 
-        Raises SessionError, SessionLostError, RequestError and what `Policy.step` raises; the memory has then not
-        moved on.
+        Raises SessionError, SessionLostError, RequestError, UnavailableError where nothing more can be remembered, and
+        what `Policy.step` raises; the memory has then not moved on.
         """
         if episode.session_id is not None:
-            session = episode.session_id
-            begun = self.sessions.peek(name, session) is not None or (episode.reset and self._alone())
+            session = str(episode.session_id)
+            begun = self.sessions.peek(name, episode.session_id) is not None or (episode.reset and self._alone())
             if begun or store.choose(name, version, session).episodic:
                 return self._in_session(store, name, version, obs, episode, explore=explore, seed=seed, seq=seq)
             # There is nothing to remember: the id says only which requests belong together.
@@ -69,29 +79,96 @@ class Episodes:
         if episode.end or (episode.reset and stream is None):
             word = "end" if episode.end else "reset"
             raise RequestError(f"'{word}' is for a session: send its 'session_id', too")
-        if stream is not None:
-            begins = episode.reset or (episode.state is not None and not episode.state)
-            try:
-                self._check_version(store, name, version, stream)
-            except SessionError:
-                if not begins:
-                    raise
-                stream.policy = store.choose(name, version, session)  # an episode begins: with what is there now
-                stream.begin()
-        if stream is not None and episode.state is None:
-            if episode.reset:
-                stream.begin()
-            step, taken_ms, notices = _timed(
-                stream.policy, obs, episode, before=stream.state, last=stream.last, explore=explore, seed=seed
+        if episode.state is not None:
+            return self._carried(
+                store, name, version, obs, episode, stream=stream, explore=explore, seed=seed, session=session
             )
-            _keep(stream, step)
-            return _decision(stream.policy, step, taken_ms, notices, EpisodeNote(step=stream.steps))
-        policy = store.choose(name, version, session) if stream is None else stream.policy
-        _check_carried(policy, episode)
-        step, taken_ms, notices = _timed(policy, obs, episode, explore=explore, seed=seed)
-        state = step.state if step.batch is not None else {key: leaf[0, ...] for key, leaf in step.state.items()}
-        note = EpisodeNote(state=state) if policy.contract.state else None
-        return _decision(policy, step, taken_ms, notices, note)
+        if stream is not None:
+            return self._on_stream(
+                store, name, version, obs, episode, stream, explore=explore, seed=seed, session=session
+            )
+        policy = store.choose(name, version, session)
+        if policy.contract.state:
+            raise RequestError(f"policy '{name}' {NEEDS_STATE}", NEEDS)
+        if policy.limited and episode.last_action is None:
+            raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
+        return _timed(policy, obs, episode, NOTHING, explore=explore, seed=seed).decision(policy, None)
+
+    def policy_of(
+        self, store: PolicyStore, name: str, version: str | None, session_id: SessionId | None, identity: Any
+    ) -> Policy:
+        """Return the policy whose tensors a request's are: its session's, or that of the state it carries."""
+        session = None if session_id is None else self.sessions.peek(name, session_id)
+        if session is not None:
+            return session.policy
+        own = store.find(name, identity) if type(identity) is str and version is None else None
+        return own or store.get(name, version)
+
+    def _carried(
+        self,
+        store: PolicyStore,
+        name: str,
+        version: str | None,
+        obs: Any,
+        episode: Episode,
+        *,
+        stream: Session | None,
+        explore: bool,
+        seed: int | None,
+        session: str | None,
+    ) -> Decision:
+        """Act from a memory that came with the request, for the version that it is of."""
+        assert episode.state is not None
+        carried = Carried.read(episode.state)
+        if carried.belongs_to is not None:
+            policy = _owner(store, name, version, carried.belongs_to)
+        else:
+            policy = store.choose(name, version, session)
+            if stream is not None and _is_loaded(store, stream.policy) and version is None:
+                policy = stream.policy
+            if carried.arrays and policy.contract.state and not store.is_certain(name, version):
+                raise RequestError(
+                    f"the state does not say of which version of policy '{name}' it is, and that can be another than "
+                    f"{policy.contract.version} (loaded are {', '.join(store.versions(name))}): send back all that the "
+                    f"last reply gave ('{BELONGS_TO}' in 'state', or the parameter 'state_policy'), or name the "
+                    "version in the address"
+                )
+        if policy.limited and not carried.begins and carried.last_action is None and episode.last_action is None:
+            raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
+        taken = _timed(policy, obs, episode, carried, explore=explore, seed=seed)
+        carries = bool(policy.contract.state) or policy.limited
+        return taken.decision(policy, EpisodeNote(state=carry(policy, taken.step)) if carries else None)
+
+    def _on_stream(
+        self,
+        store: PolicyStore,
+        name: str,
+        version: str | None,
+        obs: Any,
+        episode: Episode,
+        stream: Session,
+        *,
+        explore: bool,
+        seed: int | None,
+        session: str | None,
+    ) -> Decision:
+        """Act from the memory that the connection keeps."""
+        policy, begins = stream.policy, episode.reset
+        try:
+            self._check_version(store, name, version, stream)
+        except SessionError:
+            if not begins:
+                raise
+            policy = store.choose(name, version, session)  # an episode begins: with what is there now
+        before = Session(policy) if begins else stream
+        taken = _timed(policy, obs, episode, NOTHING, session=before, explore=explore, seed=seed)
+        rows = taken.step.rows if policy.episodic else 0
+        if rows != stream.rows:
+            self.sessions.hold(stream, rows)
+        if begins:
+            stream.begin(policy)
+        stream.keep(taken.step)
+        return taken.decision(policy, EpisodeNote(step=stream.steps))
 
     def _in_session(
         self,
@@ -110,39 +187,46 @@ class Episodes:
         if episode.state is not None:
             raise RequestError("the request has a 'state' and a 'session_id': either you carry the state, or we do")
         if episode.reset:
-            policy = store.choose(name, version, session_id)
+            policy = store.choose(name, version, str(session_id))
             if not self._alone():
                 raise SessionError(
                     "this server has several replicas, and requests of a session would reach any of them: send the "
                     "'state' along, use a WebSocket, or run one replica"
                 )
-            session = self.sessions.begin(name, session_id, policy)
+            if policy.episodic and not episode.end:
+                self.sessions.check_room(name, session_id)
+            session = Session(policy)
         else:
             session = self.sessions.find(name, session_id)
             self._check_version(store, name, version, session, session_id)
-            repeated = session.repeated(seq)
+            repeated = session.repeated(seq, obs)
             if repeated is not None:
                 return repeated
-        step, taken_ms, notices = _timed(
-            session.policy, obs, episode, before=session.state, last=session.last, explore=explore, seed=seed
-        )
-        _keep(session, step)
-        note = EpisodeNote(session_id=session_id, step=session.steps)
-        decision = _decision(session.policy, step, taken_ms, notices, note)
-        session.seq, session.answer = seq, decision
+        taken = _timed(session.policy, obs, episode, NOTHING, session=session, explore=explore, seed=seed)
         if episode.end:
             self.sessions.end(name, session_id)
+        elif episode.reset:
+            self.sessions.put(name, session_id, session, taken.step.rows if session.policy.episodic else 0)
+        session.keep(taken.step)
+        decision = taken.decision(session.policy, EpisodeNote(session_id=session_id, step=session.steps))
+        session.seq, session.answer = seq, decision
+        session.asked = b"" if seq is None else session.policy.fingerprint(obs)
         return decision
 
     def _check_version(
-        self, store: PolicyStore, name: str, version: str | None, session: Session, session_id: str | None = None
+        self,
+        store: PolicyStore,
+        name: str,
+        version: str | None,
+        session: Session,
+        session_id: SessionId | None = None,
     ) -> None:
         """A session stays with the version it began with, for as long as that is loaded."""
         own = session.policy.contract.version
-        which = "this stream's episode" if session_id is None else f"session '{session_id[:64]}'"
-        if name not in store.names or own not in store.versions(name) or store.get(name, own) is not session.policy:
+        which = "this stream's episode" if session_id is None else f"session '{shown(session_id)}'"
+        if not _is_loaded(store, session.policy):
             if session_id is not None:
-                self.sessions.end(name, session_id)
+                self.sessions.end(name, session_id, lost=True)
             raise SessionLostError(
                 f"{which} was with version {own} of policy '{name}', which is no longer loaded: begin an episode"
             )
@@ -153,31 +237,66 @@ class Episodes:
             )
 
 
-def _check_carried(policy: Policy, episode: Episode) -> None:
-    """Raise RequestError unless everything the policy remembers came with the request."""
-    if policy.contract.state and episode.state is None:
-        raise RequestError(f"policy '{policy.contract.name}' {NEEDS_STATE}")
-    if policy.limited and episode.last_action is None:
-        raise RequestError(f"policy '{policy.contract.name}' {NEEDS_LAST}")
+def _is_loaded(store: PolicyStore, policy: Policy) -> bool:
+    name, version = policy.contract.name, policy.contract.version
+    return name in store.names and version in store.versions(name) and store.get(name, version) is policy
 
 
-def _timed(policy: Policy, obs: Any, episode: Episode, **more: Any) -> tuple[Step, float, tuple[str, ...]]:
-    """Return (the step, milliseconds it took, what was out of bounds)."""
+def _owner(store: PolicyStore, name: str, version: str | None, identity: str) -> Policy:
+    """Return the policy that a carried state is of. Raises SessionError, or SessionLostError where it is gone."""
+    own = store.find(name, identity)
+    if own is None:
+        store.get(name, version)  # a policy or version that does not exist comes first
+        raise SessionLostError(
+            f"the state is of '{identity[:128]}', which is not loaded here (any more) as policy '{name}': begin an "
+            "episode (state {})",
+            {"state": identity[:128]},
+        )
+    if version is not None and store.get(name, version) is not own:
+        raise SessionError(
+            f"the state is of version {own.contract.version} of policy '{name}', and the request names version "
+            f"{version[:32]}: begin an episode with that one (state {{}}), or name the state's"
+        )
+    return own
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """A step, and what there is to say of it."""
+
+    step: Step
+    milliseconds: float
+    notices: tuple[str, ...]
+
+    def decision(self, policy: Policy, note: EpisodeNote | None) -> Decision:
+        contract = policy.contract
+        return Decision(
+            self.step.action, contract.name, contract.version, self.milliseconds, self.step.batch, self.notices, note
+        )
+
+
+def _timed(
+    policy: Policy,
+    obs: Any,
+    episode: Episode,
+    carried: Carried,
+    *,
+    session: Session | None = None,
+    explore: bool,
+    seed: int | None,
+) -> _Taken:
+    """Take a step from what the client carries, or from a session's memory."""
     policy.notices.clear()
     started = time.perf_counter()
-    step = policy.step(obs, state=episode.state or None, last_action=episode.last_action, reward=episode.reward, **more)
+    step = policy.step(
+        obs,
+        before=None if session is None else session.state,
+        last=None if session is None else session.last,
+        state=carried.arrays if carried.arrays or (policy.contract.state and not carried.begins) else None,
+        last_action=carried.last_action if episode.last_action is None else episode.last_action,
+        reward=episode.reward,
+        explore=explore,
+        seed=seed,
+    )
     taken_ms = (time.perf_counter() - started) * 1e3
-    return step, taken_ms, take_notices(policy)
-
-
-def _keep(session: Session, step: Step) -> None:
-    session.state = step.state or None
-    session.last = step.leaves
-    session.steps += 1
-
-
-def _decision(
-    policy: Policy, step: Step, taken_ms: float, notices: tuple[str, ...], note: EpisodeNote | None
-) -> Decision:
-    contract = policy.contract
-    return Decision(step.action, contract.name, contract.version, taken_ms, step.batch, notices, note)
+    return _Taken(step, taken_ms, take_notices(policy))

@@ -1,6 +1,6 @@
-"""Metrics of what is there at the moment somebody asks: the queue, and the drift of observations.
+"""Metrics of what is there at the moment somebody asks: the queue, the sessions, and the drift of observations.
 
-`Metrics.sources` takes functions such as these; sessions or shadows add their own. It knows the core and Prometheus'
+`Metrics.sources` takes functions such as these; shadows add their own. It knows the core and Prometheus'
 families.
 """
 
@@ -37,6 +37,31 @@ def queue(core: Core, replica: str) -> Iterator[Metric]:
     )
     turned_away.add_metric([replica], admission.turned_away)
     yield turned_away
+
+
+def sessions(core: Core, replica: str) -> Iterator[Metric]:
+    """Yield what is known of the memories that are kept here."""
+    kept = core.episodes.sessions
+    labels = ["replica", "policy"]
+    open_now = GaugeMetricFamily("rlservo_sessions", "Sessions kept under an id", labels=labels)
+    counted = (
+        ("rlservo_sessions_begun", "Sessions begun under an id", kept.begun),
+        ("rlservo_sessions_evicted", "Sessions forgotten because nobody asked them anything", kept.evicted),
+        ("rlservo_sessions_lost", "Requests whose session is not here (any more)", kept.lost),
+    )
+    families = [CounterMetricFamily(name, help_text, labels=labels) for name, help_text, _ in counted]
+    now = kept.count()
+    for name in sorted({*now, *kept.begun, *kept.lost}):
+        open_now.add_metric([replica, name], now[name])
+        for family, (_, _, count) in zip(families, counted, strict=True):
+            family.add_metric([replica, name], count[name])
+    remembered = GaugeMetricFamily(
+        "rlservo_episodes_remembered",
+        "Episodes in memory, in sessions and on streams; a batch is so many",
+        labels=["replica"],
+    )
+    remembered.add_metric([replica], kept.rows)
+    yield from (open_now, *families, remembered)
 
 
 def drift(core: Core, replica: str) -> Iterator[Metric]:

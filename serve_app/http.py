@@ -25,7 +25,6 @@ from rlservo.serve_app.control import Control
 from rlservo.serve_app.core import Core, StoreProvider
 from rlservo.serve_app.docs import add_docs
 from rlservo.serve_app.edge import JSON, JSON_HEADERS, BareRoute, Body, Endpoint, Headers
-from rlservo.serve_app.keys import Guard
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import Decision
 from rlservo.serve_app.stream import Stream, refuse
@@ -55,7 +54,7 @@ def create_app(
     app = PolicyApp(
         ((ACT_PATTERN, act), (oip.INFER_PATTERN, infer)),
         Stream(core),
-        core.guard,
+        core,
         title="rlservo",
         description=DESCRIPTION,
         docs_url=None,
@@ -88,12 +87,12 @@ class PolicyApp(FastAPI):
     """
 
     def __init__(
-        self, direct: tuple[tuple[re.Pattern[str], ASGIApp], ...], stream: ASGIApp, guard: Guard, **options: Any
+        self, direct: tuple[tuple[re.Pattern[str], ASGIApp], ...], stream: ASGIApp, core: Core, **options: Any
     ) -> None:
         super().__init__(**options)
         self._direct = direct
         self._stream = stream
-        self._guard = guard
+        self._core = core
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Dispatch one ASGI connection."""
@@ -102,8 +101,9 @@ class PolicyApp(FastAPI):
             return
         path = scope["path"].removeprefix(scope.get("root_path", ""))
         try:
-            self._guard.check(scope, path)
+            self._core.guard.check(scope, path)
         except RlservoError as error:
+            self._core.kept_out(scope["type"], error, edge.request_id(scope))
             await refuse(scope, receive, send, error)
             return
         if scope["type"] == "http" and scope["method"] == "POST":

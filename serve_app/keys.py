@@ -140,7 +140,13 @@ def check_origin(scope: Scope) -> None:
             origin = value
         elif name == b"host":
             host = value
-    if origin is not None and urlsplit(origin.decode("latin-1")).netloc.encode("latin-1") != host:
+    if origin is None:
+        return
+    try:
+        own = urlsplit(origin.decode("latin-1")).netloc.encode("latin-1") == host
+    except ValueError:  # no address at all
+        own = False
+    if not own:
         raise ForbiddenError(f"a page of {origin[:100].decode('latin-1')} may not open a stream here")
 
 

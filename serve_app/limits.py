@@ -47,6 +47,8 @@ class StepLimit:
                     array = np.asarray(last[name], space.dtype)
             except (ValueError, TypeError, OverflowError) as error:
                 raise RequestError(f"last_action of policy '{self._policy}' cannot be read: {error}") from error
+            if not space.shape and array.shape == (*expected, 1):  # as RLlib, and so the graph, gives such an action
+                array = array.reshape(expected)
             low, high = space.bounds()
             slack = 1e-5 * np.maximum(1.0, np.minimum(np.abs(low), np.abs(high)))
             if array.shape != expected:
@@ -68,7 +70,8 @@ class StepLimit:
         notices: list[str] = []
         limited = dict(action)
         for name, steps in self._steps.items():
-            step = action[name].astype(np.float64) - last[name]
+            before = last[name].reshape(action[name].shape)
+            step = action[name].astype(np.float64) - before
             beyond = np.abs(step) > steps * (1 + ROUNDING)
             if not beyond.any():
                 continue
@@ -84,7 +87,7 @@ class StepLimit:
             if self._refuses:
                 raise ActionError(f"policy '{self._policy}': {sentence}", {"policy": self._policy})
             notices.append(f"{sentence}: limited")
-            limited[name] = (last[name] + np.clip(step, -steps, steps)).astype(action[name].dtype)
+            limited[name] = (before + np.clip(step, -steps, steps)).astype(action[name].dtype)
         return limited, notices
 
     def _read(self, name: str, steps: Any) -> NDArray[np.float64]:

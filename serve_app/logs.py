@@ -67,10 +67,18 @@ class RequestLog:
         self._values = settings.log_values
 
     def answered(
-        self, protocol: str, policy: str, version: str, seconds: float, *, batch: int, request_id: str | None
+        self,
+        protocol: str,
+        policy: str,
+        version: str,
+        seconds: float,
+        *,
+        batch: int,
+        request_id: str | None,
+        seq: int | None = None,
     ) -> None:
-        """Write a request that got its action; ask `every` before."""
-        fields = {
+        """Write a request that got its action; ask `every` before. `seq` is its number on a stream."""
+        fields: dict[str, Any] = {
             "request_id": _short(request_id),
             "protocol": protocol,
             "policy": policy,
@@ -79,21 +87,36 @@ class RequestLog:
             "ms": round(seconds * 1e3, 3),
             "batch": batch,
         }
+        if seq is not None:
+            fields["seq"] = seq
         _requests.info("answered", extra={FIELDS: fields})
 
     def failed(
-        self, protocol: str, policy: str, version: str | None, code: str, sentence: str, *, request_id: str | None
+        self,
+        protocol: str,
+        policy: str,
+        version: str | None,
+        code: str,
+        sentence: str,
+        *,
+        request_id: str | None,
+        seconds: float | None = None,
+        seq: Any = None,
     ) -> None:
-        """Write a request that got none."""
+        """Write a request that got none; `seq` is what its client gave as its number on a stream."""
         if not _requests.isEnabledFor(logging.INFO):
             return
-        fields = {
+        fields: dict[str, Any] = {
             "request_id": _short(request_id),
             "protocol": protocol,
             "policy": policy[:64],
             "version": version and version[:32],
             "code": code,
         }
+        if seconds is not None:
+            fields["ms"] = round(seconds * 1e3, 3)
+        if type(seq) is int:
+            fields["seq"] = seq
         if self._values:
             fields["error"] = sentence
         _requests.info("refused", extra={FIELDS: fields})

@@ -83,11 +83,13 @@ class Memory:
         return found
 
     def _reward(self, starting: bool, rows: int, reward: ArrayLike | None) -> NDArray[np.float32]:
-        if starting:
+        if starting and self._specs:  # where nothing else is remembered, an episode's start looks like any step
             return np.zeros(rows, np.float32)  # nothing has been earned yet, whatever the caller says
         if reward is None:
+            start = "" if self._specs else ", 0 at an episode's start"
             raise RequestError(
-                f"policy '{self._policy}' was trained to see the reward of its last action: give act(obs, reward=...)"
+                f"policy '{self._policy}' was trained to see the reward of its last action: give "
+                f"act(obs, reward=...), over a network 'reward'{start}"
             )
         try:
             with np.errstate(over="ignore"):

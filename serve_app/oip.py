@@ -1,9 +1,11 @@
 """The Open Inference Protocol v2 over HTTP, with binary tensors: what Triton's and KServe's clients speak.
 
 A policy is a model with the contract's inputs (`obs`, or `obs.<path>` for each leaf of a nested space,
-`state_in.<name>` and `reward`) and outputs (`action` or `action.<path>`, `state_out.<name>`); every call is for a
-batch, as the protocol's shapes say. The request parameters `explore`, `seed`, `seq`, `deadline_ms` and `timestamp` mean
-what they mean in the JSON protocol; `sequence_id`, `sequence_start` and `sequence_end` are its sessions.
+`state_in.<name>` and `reward`; `last_action` or `last_action.<path>`, where its step is limited) and outputs (`action`
+or `action.<path>`, `state_out.<name>`); every call is for a batch, as the protocol's shapes say. The request parameters
+`explore`, `seed`, `seq`, `deadline_ms` and `timestamp` mean what they mean in the JSON protocol; `sequence_id`,
+`sequence_start` and `sequence_end` are its sessions, and `state_policy`, which the reply gives beside the states, is
+its `@policy`.
 It knows HTTP's headers and the protocol's documents; tensors are `tensors.py`'s, decisions the core's.
 
 Specification: github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
@@ -13,7 +15,7 @@ from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -29,6 +31,7 @@ from starlette.types import Scope
 from rlservo.export.bundle import Contract, TensorSpec
 from rlservo.export.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.serve_app import wire
+from rlservo.serve_app.carried import BELONGS_TO
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import (
     JSON_HEADERS,
@@ -44,6 +47,7 @@ from rlservo.serve_app.edge import (
 from rlservo.serve_app.episodes import Episode
 from rlservo.serve_app.listing import states_of
 from rlservo.serve_app.memory import REWARD
+from rlservo.serve_app.sessions import SessionId
 from rlservo.serve_app.store import Decision
 from rlservo.serve_app.structure import action_leaves, build_action
 from rlservo.serve_app.tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor
@@ -53,11 +57,15 @@ LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensor
 BINARY = b"application/octet-stream"
 PLATFORM = "onnx_onnxv1"
 STATE_IN, STATE_OUT = "state_in.", "state_out."
+LAST_ACTION = "last_action"  # inputs like the outputs `action` and `action.<path>`
+STATE_POLICY = "state_policy"  # whose the states are
 EXTENSIONS = ("binary_tensor_data", "parameters", "sequence", "model_repository")
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
 MODEL_NAME = "model_name"  # KServe's client says again what the path says
 # What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
-PARAMETERS = frozenset({*wire.OPTIONS, "binary_data_output", "sequence_id", "sequence_start", "sequence_end"})
+PARAMETERS = frozenset(
+    {*wire.OPTIONS, "binary_data_output", "sequence_id", "sequence_start", "sequence_end", STATE_POLICY}
+)
 TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
 IGNORED = frozenset({"priority", TIMEOUT, "headers", "content_type"})
 SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits one packet either way
@@ -85,7 +93,7 @@ class InferRequest(BaseModel):
     parameters: dict[str, Any] | None = Field(
         None,
         description="`explore`, `seed`, `seq`, `deadline_ms`, `timestamp`, `sequence_id`, `sequence_start`, "
-        "`sequence_end`, `binary_data_output`.",
+        "`sequence_end`, `state_policy` (which the reply gave beside the states), `binary_data_output`.",
     )
     model_name: str | None = Field(None, description="The path's, if given at all.")
     inputs: list[Tensor]
@@ -209,7 +217,10 @@ def decide(
         deadline_ms = wanted_ms if deadline_ms is None else min(wanted_ms, deadline_ms)
     timestamp = wire.read_timestamp(parameters) if parameters else None
     sequence = parameters.get("sequence_id")
-    contract = core.contract(name, version, _session_id(sequence) if sequence else None)
+    identity = parameters.get(STATE_POLICY)
+    if identity is not None and not any(name.startswith(STATE_IN) for name in inputs):
+        identity = None  # there is no state that it could be of
+    contract = core.policy(name, version, _session_id(sequence) if sequence else None, identity).contract
     binary = _wanted_outputs(contract, document, parameters)
     obs = _observation(contract, inputs)
     episode = _episode(contract, inputs, parameters) if parameters or len(inputs) > 1 else None
@@ -236,6 +247,8 @@ def decide(
             told["sequence_id"] = parameters["sequence_id"]
             del told["session_id"]
         said.update(told)
+        if decision.episode.state is not None:
+            said[STATE_POLICY] = decision.episode.state[BELONGS_TO]
     if timestamp is not None:
         said.update(wire.clock(timestamp, received))
     outputs = _outputs(contract, decision)
@@ -266,7 +279,8 @@ def _outputs(contract: Contract, decision: Decision) -> dict[str, NDArray[Any]]:
     """Return everything the model can answer with, by tensor name."""
     outputs: dict[str, NDArray[Any]] = action_leaves(contract.action_space, decision.action)
     if decision.episode is not None and decision.episode.state is not None:
-        outputs.update({STATE_OUT + name: leaf for name, leaf in decision.episode.state.items()})
+        carried = decision.episode.state
+        outputs.update({STATE_OUT + state.name: carried[state.name] for state in contract.state})
     return outputs
 
 
@@ -321,17 +335,21 @@ def _raw_input(contract: Contract, view: memoryview) -> NDArray[Any]:
 
 def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
     """Return the policy's observation batch out of the named inputs, whose names and shapes are checked."""
-    known = [tensor.name for tensor in contract.inputs]
+    listed: Sequence[TensorSpec] = contract.inputs
+    known = [tensor.name for tensor in listed]
     unknown = next((name for name in inputs if name not in known), None)
+    if unknown is not None:  # a last action, which is an input without standing in the contract, or a mistake
+        listed = [*listed, *last_action_inputs(contract)]
+        unknown = next((name for name in inputs if all(name != tensor.name for tensor in listed)), None)
     if unknown is not None:
         raise ObservationError(
             f"policy '{contract.name}' has the input {quoted(known)} and has no input '{unknown[:64]}'"
         )
     rows: dict[str, int] = {}
-    for expected in contract.inputs:
+    for expected in listed:
         array = inputs.get(expected.name)
         if array is None:
-            if expected.name == REWARD or expected.name.startswith(STATE_IN):
+            if expected.name == REWARD or expected.name.startswith((STATE_IN, LAST_ACTION)):
                 continue
             raise ObservationError(f"policy '{contract.name}' has the input '{expected.name}' and did not get it")
         if array.shape[1:] != expected.shape[1:] or array.ndim != len(expected.shape):
@@ -349,22 +367,59 @@ def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
 
 def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Episode | None:
     """Return what the inputs and parameters say of the episode. Raises RequestError."""
-    states = {name.removeprefix(STATE_IN): array for name, array in inputs.items() if name.startswith(STATE_IN)}
+    states: dict[str, Any] = {
+        name.removeprefix(STATE_IN): array for name, array in inputs.items() if name.startswith(STATE_IN)
+    }
+    belongs_to = parameters.get(STATE_POLICY)
+    if states and belongs_to is not None:
+        if type(belongs_to) is not str:
+            raise RequestError(f"'{STATE_POLICY}' must be the string that the last reply gave")
+        states[BELONGS_TO] = belongs_to
     reward = inputs.get(REWARD)
+    last = _last_action(contract, inputs)
     start, end = bool(flag(parameters, "sequence_start")), bool(flag(parameters, "sequence_end"))
     sequence_id = parameters.get("sequence_id")
     if sequence_id in (None, 0, ""):
-        if start and not states and contract.state:  # a single step, for whoever carries the state from there
-            return Episode(state={}, reward=reward)
-        return Episode(state=states or None, reward=reward) if states or reward is not None else None
-    return Episode(state=states or None, session_id=_session_id(sequence_id), reset=start, end=end, reward=reward)
+        if start and not states:  # a single step, for whoever carries from there what there is to carry
+            return Episode(state={}, reward=reward, last_action=last)
+        if not states and reward is None and last is None:
+            return None
+        return Episode(state=states or None, reward=reward, last_action=last)
+    return Episode(
+        state=states or None,
+        session_id=_session_id(sequence_id),
+        reset=start,
+        end=end,
+        reward=reward,
+        last_action=last,
+    )
 
 
-def _session_id(sequence_id: Any) -> str:
+def _session_id(sequence_id: Any) -> SessionId:
     """Return a sequence's id as a session's; an integer and a string of its digits are two. Raises RequestError."""
-    if type(sequence_id) not in (int, str) or len(str(sequence_id)) >= wire.LONGEST_SESSION_ID:
-        raise RequestError("'sequence_id' must be an integer, or a string of fewer than 128 characters")
-    return f"#{sequence_id}" if type(sequence_id) is int else str(sequence_id)
+    if type(sequence_id) in (int, str) and len(str(sequence_id)) < wire.LONGEST_SESSION_ID:
+        return sequence_id  # type: ignore[no-any-return]  # mypy does not narrow by the type's own identity
+    raise RequestError("'sequence_id' must be an integer, or a string of fewer than 128 characters")
+
+
+def _last_action(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
+    """Return the last action that the inputs hold, in the action space's form, or None. Raises ObservationError."""
+    given = {name: array for name, array in inputs.items() if name.startswith(LAST_ACTION)}
+    if not given:
+        return None
+    missing = next((tensor.name for tensor in last_action_inputs(contract) if tensor.name not in given), None)
+    if missing is not None:
+        raise ObservationError(f"policy '{contract.name}' did not get the input '{missing}', but others of last_action")
+    return build_action(contract.action_space, given, LAST_ACTION)
+
+
+def last_action_inputs(contract: Contract) -> list[TensorSpec]:
+    """Return what the inputs of a last action look like: as the outputs that gave it."""
+    return [
+        tensor.model_copy(update={"name": LAST_ACTION + tensor.name.removeprefix("action")})
+        for tensor in contract.outputs
+        if tensor.name == "action" or tensor.name.startswith("action.")
+    ]
 
 
 def _options(parameters: Mapping[str, Any]) -> tuple[bool, int | None, int | None, float | None]:
@@ -593,8 +648,10 @@ def repository_index(core: Core, *, ready: bool = False) -> list[dict[str, str]]
 
 def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]:
     """Return a model's inputs and outputs; `version` None is the default."""
-    contract = core.store().get(name, version).contract
+    policy = core.store().get(name, version)
+    contract = policy.contract
     versions = core.store().versions(name) if version is None else (contract.version,)
+    inputs = [*contract.inputs, *(last_action_inputs(contract) if policy.limited else ())]
 
     def described(tensor: TensorSpec) -> dict[str, Any]:
         return {"name": tensor.name, "datatype": datatype_of(tensor.dtype), "shape": tensor.shape}
@@ -603,7 +660,7 @@ def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]
         "name": name,
         "versions": versions,
         "platform": PLATFORM,
-        "inputs": [described(tensor) for tensor in contract.inputs],
+        "inputs": [described(tensor) for tensor in inputs],
         "outputs": [described(tensor) for tensor in contract.outputs if tensor.name in output_names(contract)],
     }
 

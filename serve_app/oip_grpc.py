@@ -186,8 +186,12 @@ class Grpc:
             )
         metadata = context.invocation_metadata()
         headers = [(name.encode(), _bytes(value)) for name, value in metadata]
-        self._core.guard.check({"headers": headers}, PATHS[method])
         given = {name: value for name, value in metadata if type(value) is str}
+        try:
+            self._core.guard.check({"headers": headers}, PATHS[method])
+        except RlservoError as error:
+            self._core.kept_out(PROTOCOL, error, given.get(REQUEST_ID))
+            raise
         return given.get(REQUEST_ID), given.get(SESSION)
 
     def _model_ready(self, request: Incoming) -> Any:

@@ -6,6 +6,7 @@ nothing of the web, ray, torch or gymnasium. The server is a thin edge over it (
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import time
 from collections import deque
@@ -64,6 +65,7 @@ GOLDEN_RTOL = (
     1e-4  # machines differ in the last bits of exp and in the order of sums; a wrong graph differs in the first
 )
 GOLDEN_ATOL = 1e-5  # the same for actions near zero
+SHOWN_HASH = 12  # hexadecimal digits: enough to tell the graphs apart that ever bear one name and version
 NOTICE_EVERY_S = 60.0  # an observation out of bounds comes a hundred times a second, and is worth a line a minute
 
 # onnxruntime's names of the types a policy's tensors have.
@@ -88,6 +90,11 @@ class Step:
     batch: int | None
     """How many observations there were; None for one that came alone."""
 
+    @property
+    def rows(self) -> int:
+        """How many episodes it was a step of."""
+        return self.batch or 1
+
 
 class Policy:
     """An exported policy, loaded and proven on this machine.
@@ -99,11 +106,19 @@ class Policy:
     """
 
     def __init__(
-        self, bundle: Bundle, session: onnxruntime.InferenceSession, options: PolicyOptions = DEFAULT_OPTIONS
+        self,
+        bundle: Bundle,
+        session: onnxruntime.InferenceSession,
+        options: PolicyOptions = DEFAULT_OPTIONS,
+        *,
+        graph_hash: str = "",
     ) -> None:
         """Wrap a session whose graph fits `bundle.contract`; use `Policy.load`."""
         contract = bundle.contract
         self._bundle = bundle
+        self._graph_hash = graph_hash
+        self.identity = f"{contract.name}/{contract.version}#{graph_hash[:SHOWN_HASH]}"
+        """What a memory of this policy's belongs to: name, version and graph, the same wherever it is loaded."""
         self._contract = contract
         self._session: onnxruntime.InferenceSession | None = session
         self._run: _Run = session.run
@@ -115,6 +130,9 @@ class Policy:
         self._logged_at = -NOTICE_EVERY_S
         self._reader = StructureReader(
             contract.name, contract.observation_space, options=options, notice=self._take_notice
+        )
+        self._silent_reader = StructureReader(
+            contract.name, contract.observation_space, options=PolicyOptions(out_of_bounds="accept")
         )
         actions = leaf_specs(contract.action_space, "action")
         self._guards = {name: ActionGuard(contract.name, name, leaf) for name, leaf in actions.items()}
@@ -168,7 +186,7 @@ class Policy:
         _check_copy(bundle, session)
         if check_golden:
             check_golden_vectors(bundle, session.run)
-        return cls(bundle, session, options)
+        return cls(bundle, session, options, graph_hash=hashlib.sha256(bundle.onnx.read_bytes()).hexdigest())
 
     @property
     def contract(self) -> Contract:
@@ -264,11 +282,18 @@ class Policy:
         own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
         return Step(build_action(space, own), action, after, rows if batch else None)
 
+    def fingerprint(self, obs: Observation) -> bytes:
+        """Return what tells an observation from others, in whatever form it comes. Raises ObservationError."""
+        digest = hashlib.blake2b(digest_size=16)
+        for array in self._silent_reader.read(obs)[0].values():
+            digest.update(array.tobytes())
+        return digest.digest()
+
     def twin(self) -> Policy:
         """Return another policy over the same graph, for another thread: its memory, notices and drift are its own."""
         if self._session is None:
             _refuse_closed([], {})
-        return Policy(self._bundle, self._session, self.options)
+        return Policy(self._bundle, self._session, self.options, graph_hash=self._graph_hash)
 
     def reset(self) -> None:
         """Start an episode: a recurrent policy forgets. Nothing to do for a stateless one."""

@@ -78,8 +78,10 @@ class ServerSettings(BaseModel):
 
     log_values: bool = False
     """Log the sentences of errors, which may name values of observations."""
+
     max_sessions: int = Field(1024, ge=1)
-    """Sessions one replica remembers at once; a further one is answered 503."""
+    """Episodes one replica remembers at once, in sessions and on streams (a batch is so many); a further one is
+    answered 503."""
 
     session_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
     """[s] A session that nobody asks anything for so long is forgotten; a stream's lives as long as the stream."""

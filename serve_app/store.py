@@ -33,8 +33,8 @@ from rlservo.serve_app.policy import Policy
 class EpisodeNote:
     """What a reply says of its episode."""
 
-    state: Mapping[str, Any] | None = None  # for the client to carry: arrays by state name
-    session_id: str | None = None
+    state: Mapping[str, Any] | None = None  # for the client to carry, as `carried.py` has it
+    session_id: str | int | None = None
     step: int | None = None  # how many actions this session or stream has given since its episode began
 
 
@@ -71,13 +71,20 @@ class Shadow:
 class PolicyStore:
     """Several policies in several versions; a name's default is its `production` alias, else its newest version."""
 
-    def __init__(self, policies: Iterable[Policy], plans: Mapping[str, PolicyPlan] | None = None) -> None:
-        """Take loaded policies, and by name which are to do what.
+    def __init__(
+        self,
+        policies: Iterable[Policy],
+        plans: Mapping[str, PolicyPlan] | None = None,
+        *,
+        changed: Iterable[str] = (),
+    ) -> None:
+        """Take loaded policies, and by name which are to do what; those `changed` were served otherwise before.
 
         A plan may name versions that are not among the policies; where it leads to one, that part of it is left out.
         Raises UsageError when two have the same name and version, or, without plans, when there is none.
         """
         self._policies: dict[str, dict[str, Policy]] = {}
+        self._changed = frozenset(changed)
         for policy in policies:
             name, version = policy.contract.name, policy.contract.version
             versions = self._policies.setdefault(name, {})
@@ -168,6 +175,19 @@ class PolicyStore:
             )
         return policy
 
+    def find(self, name: str, identity: str) -> Policy | None:
+        """Return the policy of a name that a memory belongs to (`Policy.identity`), if it is loaded."""
+        return next((each for each in self._policies.get(name, {}).values() if each.identity == identity), None)
+
+    def is_certain(self, name: str, version: str | None) -> bool:
+        """Whether a memory that does not say whose it is can only be of the policy that this request gets.
+
+        So it is where the version itself is named (an alias may lead elsewhere by now), and where there is and was
+        only one.
+        """
+        versions = self._versions(name)
+        return version in versions or (len(versions) == 1 and name not in self._changed)
+
     def version_of(self, name: str, reference: str) -> str:
         """Return the version that a version or an alias means, '' where there is none."""
         try:
@@ -207,7 +227,7 @@ class PolicyStore:
         """
         policy = self.choose(name, version, session)
         if policy.episodic:  # its memory belongs to one episode, and a server has many callers
-            raise RequestError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}")
+            raise RequestError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}", NEEDS)
         if policy.notices:
             policy.notices.clear()
         started = time.perf_counter()
@@ -252,10 +272,17 @@ def _draw(name: str, session: str | None, needs_session: bool) -> float:
     return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
 
 
-NEEDS_STATE = (
-    "remembers its episode: send 'state' ({} begins one, then what the last reply gave), or a 'session_id' with 'reset'"
+CARRY = "send 'state' ({} begins an episode, then what the last reply gave)"
+SESSION = (
+    "begin a session ('session_id' with 'reset'; in the Open Inference Protocol 'sequence_id' with 'sequence_start')"
 )
-NEEDS_LAST = "has a limit on the step from one action to the next: send 'last_action', or a 'session_id' with 'reset'"
+NEEDS_STATE = f"remembers its episode: {CARRY.replace('an episode', 'one')}, or the inputs 'state_in.*', or {SESSION}"
+NEEDS_LAST = (
+    f"has a limit on the step from one action to the next: {CARRY}, or 'last_action' (in the Open Inference Protocol "
+    f"an input, or 'sequence_start' for the first), or {SESSION}"
+)
+NEEDS: dict[str, Any] = {"send": "state"}
+"""Details of both refusals: a client that did not know that it has to carry something learns it from them."""
 
 
 def batch_of(action: Any, space: SpaceSpec) -> int | None:

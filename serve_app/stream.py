@@ -24,6 +24,7 @@ import secrets
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 from starlette.types import Message, Receive, Scope, Send
@@ -34,9 +35,9 @@ from rlservo.serve_app import wire
 from rlservo.serve_app.admission import IdleTimer
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.edge import encode_bug, encode_error, error_answer, request_id, session_of, status_of
+from rlservo.serve_app.edge import encode_bug, error_answer, request_id, session_of
 from rlservo.serve_app.keys import check_origin
-from rlservo.serve_app.policy import Policy
+from rlservo.serve_app.logs import FIELDS
 from rlservo.serve_app.sessions import Session
 from rlservo.serve_app.store import Decision
 
@@ -50,6 +51,21 @@ KNOWN = frozenset({"obs", *wire.OPTIONS, *wire.OF_EPISODE})
 PROTOCOL = "websocket"
 NO_OPTIONS: dict[str, Any] = {}
 DENIAL = "websocket.http.response"  # the ASGI extension that answers an upgrade with an HTTP error
+
+
+@dataclass(slots=True)
+class _Conversation:
+    """One connection, and the request that it is at."""
+
+    name: str
+    version: str | None
+    label: str  # whose requests these are, where a canary runs
+    session: Session | None
+    request_id: str | None  # of the connection; requests are told apart by `seq`
+    _: KW_ONLY
+    keep: bool  # whether the connection outlives errors
+    received: float | None = None
+    seq: Any = None  # as the client gave it
 
 
 class Stream:
@@ -70,101 +86,130 @@ class Stream:
             label = session_of(scope) or secrets.token_hex(8)
             policy = self._core.store().choose(name, version, label)
         except RlservoError as error:
-            self._core.failed(PROTOCOL, name, version, error.code)
+            self._failed(name, version, error, request_id(scope))
             await refuse(scope, receive, send, error)
             return
         await receive()  # websocket.connect
-        await send({"type": "websocket.accept"})
+        try:
+            await send({"type": "websocket.accept"})
+        except OSError:  # the client has gone already
+            return
         self._core.metrics.stream(name, 1)
         idle = IdleTimer(self._core.settings.stream_idle_s)
+        session = Session(policy) if policy.episodic else None
+        keep = KEEP in scope.get("query_string", b"").split(b"&")
+        conversation = _Conversation(name, version, label, session, request_id(scope), keep=keep)
         try:
             with self._core.admission.streaming():
                 await send(_binary(pack(_metadata(policy.contract))))
-                session = Session(policy) if policy.episodic else None
-                keep = KEEP in scope.get("query_string", b"").split(b"&")
-                await self._answer(name, version, label, session, receive, send, idle, keep=keep)
+                await self._answer(conversation, receive, send, idle)
         except asyncio.CancelledError:
             if not idle.expired:
                 raise
             if sys.version_info >= (3, 11) and (task := asyncio.current_task()) is not None:
                 task.uncancel()  # Python counts cancellations
             self._core.failed(PROTOCOL, name, version, "idle")
+            self._core.log.failed(
+                PROTOCOL, name, version, "idle", "silent for too long", request_id=conversation.request_id
+            )
             await _close_idle(send)
         except RlservoError as error:
-            self._core.failed(PROTOCOL, name, version, error.code)
-            self._core.log.failed(PROTOCOL, name, version, error.code, error.message, request_id=request_id(scope))
-            if status_of(error) >= 500:
-                logger.error("%s", error.message)
+            self._failed(name, version, error, conversation.request_id, conversation)
             await _fail(send, error_answer(error)[1])
+        except OSError:  # the client went while its reply was being sent: nobody is left to tell
+            logger.debug("a stream's client went before its reply could be sent")
         except Exception:
-            logger.exception("the stream of policy '%s' failed", name)
+            logger.exception(
+                "the stream of policy '%s' failed", name, extra={FIELDS: {"request_id": conversation.request_id}}
+            )
             self._core.metrics.failed(PROTOCOL, "", "", "internal")
             await _fail(send, encode_bug())
         finally:
             idle.stop()
+            if session is not None:
+                self._core.episodes.sessions.release(session)
             self._core.metrics.stream(name, -1)
 
-    async def _answer(
+    def _failed(
         self,
         name: str,
         version: str | None,
-        label: str,
-        session: Session | None,
-        receive: Receive,
-        send: Send,
-        idle: IdleTimer,
-        *,
-        keep: bool,
+        error: RlservoError,
+        request_id: str | None,
+        conversation: _Conversation | None = None,
     ) -> None:
+        """Count and log a request, or a connection, that was refused."""
+        self._core.failed(PROTOCOL, name, version, error.code)
+        received = None if conversation is None else conversation.received
+        self._core.log.failed(
+            PROTOCOL,
+            name,
+            version,
+            error.code,
+            error.message,
+            request_id=request_id,
+            seconds=None if received is None else time.perf_counter() - received,
+            seq=None if conversation is None else conversation.seq,
+        )
+
+    async def _answer(self, asked: _Conversation, receive: Receive, send: Send, idle: IdleTimer) -> None:
+        core, log = self._core, self._core.log
         previous_ms: float | None = None
         while True:
             message = await receive()
-            received = time.perf_counter()
+            asked.received = received = time.perf_counter()
+            asked.seq = None
             idle.touch()
             if message["type"] == "websocket.disconnect":
                 return
-            options: Mapping[str, Any] = NO_OPTIONS
             try:
-                obs, options = self._read(message, session)
-                reply, decision = self._decide(name, version, label, session, obs, options, received)
+                obs, options = self._read(message, asked)
+                asked.seq = options.get("seq")
+                reply, decision = self._decide(asked, obs, options, received)
             except RlservoError as error:
-                if not keep:
+                if not asked.keep:
                     raise
-                self._core.failed(PROTOCOL, name, version, error.code)
-                await send({"type": "websocket.send", "text": _with_seq(error, options.get("seq"))})
+                self._failed(asked.name, asked.version, error, asked.request_id, asked)
+                await send({"type": "websocket.send", "text": _with_seq(error_answer(error)[1], asked.seq)})
                 continue
             if previous_ms is not None:
                 reply["server_timing"]["prev_total_ms"] = previous_ms
             await send(_binary(pack(reply)))
-            taken = time.perf_counter() - received
+            taken, batch = time.perf_counter() - received, decision.batch or 1
             previous_ms = taken * 1e3
-            self._core.metrics.answered(PROTOCOL, decision, decision.batch or 1, taken)
+            core.metrics.answered(PROTOCOL, decision, batch, taken)
+            if log.every:
+                log.answered(
+                    PROTOCOL,
+                    decision.name,
+                    decision.version,
+                    taken,
+                    batch=batch,
+                    request_id=asked.request_id,
+                    seq=asked.seq,
+                )
 
     def _decide(
-        self,
-        name: str,
-        version: str | None,
-        label: str,
-        session: Session | None,
-        obs: Any,
-        options: Mapping[str, Any],
-        received: float,
+        self, asked: _Conversation, obs: Any, options: Mapping[str, Any], received: float
     ) -> tuple[dict[str, Any], Decision]:
         """Return (reply, decision) for one request."""
         explore, seed, seq, deadline_ms = wire.read_options(options) if options else (False, None, None, None)
         timestamp = wire.read_timestamp(options) if options else None
+        episode = wire.read_episode(options) if options else None
+        if asked.session is None and episode is not None and episode.reset and episode.session_id is None:
+            episode = replace(episode, reset=False)  # nothing is remembered here
         decision = self._core.act(
-            name,
-            version,
+            asked.name,
+            asked.version,
             obs,
             received=received,
             explore=explore,
             seed=seed,
             seq=seq,
             deadline_ms=deadline_ms,
-            episode=wire.read_episode(options) if options else None,
-            stream=session,
-            session=label,
+            episode=episode,
+            stream=asked.session,
+            session=asked.label,
         )
         reply: dict[str, Any] = {
             "actions": _chunks(decision.action, batch=decision.batch is not None),
@@ -201,7 +246,7 @@ class Stream:
             )
         return default, None
 
-    def _read(self, message: Message, session: Session | None) -> tuple[Any, Mapping[str, Any]]:
+    def _read(self, message: Message, asked: _Conversation) -> tuple[Any, Mapping[str, Any]]:
         """Return (observation, options) of one frame."""
         content = message.get("bytes")
         if content is None:
@@ -212,7 +257,7 @@ class Stream:
         if type(document) is not dict:
             raise RequestError(f"the message must be a map such as {{'obs': ...}}, got {type(document).__name__}")
         if "obs" not in document:  # element names and values
-            if session is not None and type(document.get("reset")) is bool and not _has(session.policy, "reset"):
+            if type(document.get("reset")) is bool and not self._names(asked, "reset"):
                 named = {name: value for name, value in document.items() if name != "reset"}
                 return named, {"reset": document["reset"]}
             return document, NO_OPTIONS
@@ -222,6 +267,13 @@ class Stream:
         if unknown:
             raise RequestError(f"unknown field '{unknown[0]}': known are {', '.join(sorted(KNOWN))}")
         return document["obs"], document
+
+    def _names(self, asked: _Conversation, name: str) -> bool:
+        """Whether an observation of this stream's policy has a part or an element of that name."""
+        session = asked.session
+        policy = self._core.store().get(asked.name, asked.version) if session is None else session.policy
+        space = policy.contract.observation_space
+        return name in (space.spaces if isinstance(space, DictSpec) else {element.name for element in space.elements})
 
 
 def _metadata(contract: Contract) -> dict[str, Any]:
@@ -235,12 +287,6 @@ def _metadata(contract: Contract) -> dict[str, Any]:
     }
 
 
-def _has(policy: Policy, name: str) -> bool:
-    """Whether an observation of the policy has a part or an element of that name."""
-    space = policy.contract.observation_space
-    return name in (space.spaces if isinstance(space, DictSpec) else {element.name for element in space.elements})
-
-
 def _chunks(action: Any, *, batch: bool) -> Any:
     """Return the action as chunks of one; each leaf of a nested one is a chunk."""
     if isinstance(action, dict):
@@ -250,9 +296,8 @@ def _chunks(action: Any, *, batch: bool) -> Any:
     return action[:, None, ...] if batch else action[None, ...]
 
 
-def _with_seq(error: RlservoError, seq: Any) -> str:
-    """Return an error's body, with the number of the request that it answers."""
-    content = encode_error(error)
+def _with_seq(content: bytes, seq: Any) -> str:
+    """Return an error's body with the number of the request that it answers."""
     if type(seq) is not int:
         return content.decode()
     return wire.encode_json({**json.loads(content), "seq": seq}).decode()

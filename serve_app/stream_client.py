@@ -87,8 +87,9 @@ class StreamClient:
         self._steps = 0  # of the connection's episode
         self._lost = False
         self._last: Any = None  # the last action of the episode, as the server sent it
+        self._begins = False  # an episode, with the next request; the first one begins with the connection
         self._connections = 0
-        self._fresh = True  # the connection has not answered yet, and knows nothing of the episode
+        self._unsure = True  # whether the connection knows the last action that was used: a new one does not
         self.stale = 0
         """Answers that came after their deadline, and were dropped."""
 
@@ -130,8 +131,10 @@ class StreamClient:
                 request["reset"] = self._steps == 0
             elif contract.state:
                 request["state"] = self._state
+            elif self._begins:  # where the server limits the step, the connection holds the last action
+                request["reset"] = True
             request.pop("last_action", None)
-            if self._fresh and self._last is not None:
+            if (held or not contract.state) and self._unsure and self._last is not None:
                 request["last_action"] = self._last  # where the server limits the step from it
             request["deadline_ms"] = max(0.0, 1e3 * (deadline - time.monotonic()))
             try:
@@ -143,6 +146,7 @@ class StreamClient:
                     raise
                 continue  # asking twice does no harm: no memory of ours has survived on the other side
             except DeadlineError:
+                self._unsure = True  # it may have acted, with an action that no robot has seen
                 silent_s = time.monotonic() - connection.heard_at
                 if silent_s > max(SILENT_S, SILENT_FACTOR * self._deadline_s):
                     self._drop()
@@ -155,17 +159,19 @@ class StreamClient:
                 if self._connections == 1 and time.monotonic() + WAIT_S < deadline:
                     continue
             check_sender(self.url, reply, number, contract)
-            action = restored(_first(reply.get("actions"), contract, batch), batch, contract)
+            sent = _first(reply.get("actions"), contract, batch)
+            action = restored(sent, batch, contract)
             if held:
                 self._steps = check_step(reply, self._steps)
             elif contract.state:
                 self._state = carried(reply, contract)
-            self._last, self._fresh = action, False
+            self._last, self._unsure, self._begins = sent, False, False
             return action
 
     def reset(self) -> None:
         """Start an episode: the next request says so. Sends nothing."""
         self._state, self._steps, self._lost, self._last = {}, 0, False, None
+        self._begins = True
 
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:
         """Return as soon as the server offers the policy.
@@ -244,7 +250,7 @@ class StreamClient:
         self._contract = self._contract or contract
         self._socket = connection
         self._connections += 1
-        self._fresh = True
+        self._unsure = True
         self._lost = self._steps > 0
 
     def _drop(self) -> None:

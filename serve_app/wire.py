@@ -50,7 +50,9 @@ class ActRequest(BaseModel):
     )
     state: dict[str, Any] | None = Field(
         None,
-        description="A recurrent policy's memory, carried by you: {} begins an episode, then what the last reply gave.",
+        description="A recurrent policy's memory, carried by you: {} begins an episode, then what the last reply gave, "
+        "all of it: it names the version that it is of (`@policy`), and goes to no other. Where a policy's action is "
+        "limited in its step, it holds the last action, too.",
     )
     session_id: str | None = Field(
         None,
@@ -178,11 +180,13 @@ def clock(timestamp: float, received: float) -> dict[str, float]:
 
 
 def _plain(action: Any) -> Any:
-    """Return an action for orjson, which takes no 0-d arrays."""
+    """Return an action, or a state, for orjson, which takes no 0-d arrays."""
     if isinstance(action, dict):
         return {key: _plain(part) for key, part in action.items()}
     if isinstance(action, tuple):
         return [_plain(part) for part in action]
+    if isinstance(action, str):  # what a state belongs to
+        return action
     return action if action.ndim else action.item()
 
 

@@ -177,6 +177,9 @@ def test_serve_refuses_a_broken_bundle_before_anything_starts(bundle: Path) -> N
     began = time.monotonic()
     refused(rlservo("serve", bundle.parent), 1, "golden.npz")
     assert time.monotonic() - began < 15.0
+    for words in ((bundle.parent,), ("nope",)):
+        done = rlservo("serve", *words)
+        assert done.returncode != 0 and "starting" not in done.stdout + done.stderr, done.stderr
 
 
 def test_every_command_has_help_with_an_example() -> None:

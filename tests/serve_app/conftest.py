@@ -41,6 +41,7 @@ from rlservo.export.bundle import (
     FormatParity,
     Parity,
     Provenance,
+    StateSpec,
     TensorSpec,
 )
 from rlservo.serve_app.keys import new_key
@@ -95,8 +96,11 @@ def save_graph(
     onnx.save(model, file)
 
 
-def write_bundle(folder: Path, contract: Contract, obs: NDArray[Any]) -> Path:
-    """Complete a folder that holds policy.onnx: TorchScript, golden vectors of `obs`, contract and hashes."""
+def write_bundle(folder: Path, contract: Contract, obs: NDArray[Any], **more: NDArray[Any]) -> Path:
+    """Complete a folder that holds policy.onnx: TorchScript, golden vectors of `obs`, contract and hashes.
+
+    `more` are further inputs by name, a dot written as two underscores.
+    """
     import torch
 
     with warnings.catch_warnings():
@@ -105,8 +109,9 @@ def write_bundle(folder: Path, contract: Contract, obs: NDArray[Any]) -> Path:
         torch.jit.save(scripted, folder / bundle_files.TORCHSCRIPT_FILE)
     session = onnxruntime.InferenceSession(folder / bundle_files.ONNX_FILE)
     names = [tensor.name for tensor in contract.outputs]
-    outputs = dict(zip(names, session.run(names, {"obs": obs}), strict=True))
-    bundle_files.write_golden(folder, {"obs": obs}, outputs)
+    inputs = {"obs": obs, **{name.replace("__", "."): array for name, array in more.items()}}
+    outputs = dict(zip(names, session.run(names, inputs), strict=True))
+    bundle_files.write_golden(folder, inputs, outputs)
     bundle_files.write_contract(folder, contract)
     return folder
 
@@ -240,6 +245,55 @@ def write_discrete_policy(root: Path, *, name: str = "gridworld", version: str =
         parity=PARITY,
     )
     return write_bundle(folder, contract, np.arange(5, dtype=np.int64))
+
+
+def write_leaky_policy(root: Path, *, name: str = "leaky", version: str = "1", seed: int = 0) -> Path:
+    """A policy with a memory, of three numbers: h becomes h / 2 + obs @ w, and h in [-1, 1] is the action of two."""
+    rng = np.random.default_rng(seed)
+    folder = root / name / version
+    folder.mkdir(parents=True)
+    nodes = [
+        helper.make_node("MatMul", ["obs", "w"], ["seen"]),
+        helper.make_node("Mul", ["state_in.h", "half"], ["left"]),
+        helper.make_node("Add", ["left", "seen"], ["state_out.h"]),
+        helper.make_node("Clip", ["state_out.h", "low", "high"], ["action"]),
+    ]
+    constants = {"w": weights(rng, 3, 2), "half": np.float32([0.5]), "low": np.float32(-1), "high": np.float32(1)}
+    save_graph(
+        folder / bundle_files.ONNX_FILE,
+        nodes,
+        {key: np.asarray(value) for key, value in constants.items()},
+        [("obs", TensorProto.FLOAT, ["batch", 3]), ("state_in.h", TensorProto.FLOAT, ["batch", 2])],
+        [("action", TensorProto.FLOAT, ["batch", 2]), ("state_out.h", TensorProto.FLOAT, ["batch", 2])],
+    )
+    contract = Contract(
+        name=name,
+        version=version,
+        observation_space=BoxSpec(shape=(3,), dtype="float32", low=None, high=None),
+        action_space=BoxSpec(shape=(2,), dtype="float32", low=-1.0, high=1.0),
+        inputs=(
+            TensorSpec(name="obs", dtype="float32", shape=(-1, 3)),
+            TensorSpec(name="state_in.h", dtype="float32", shape=(-1, 2)),
+        ),
+        outputs=(
+            TensorSpec(name="action", dtype="float32", shape=(-1, 2)),
+            TensorSpec(name="state_out.h", dtype="float32", shape=(-1, 2)),
+        ),
+        state=(StateSpec(name="h", dtype="float32", shape=(2,)),),
+        distribution=None,
+        baked_in=(BakedStep(step="network"), BakedStep(step="clip")),
+        control_rate_hz=10.0,
+        provenance=PROVENANCE,
+        parity=PARITY,
+    )
+    obs, state = (rng.standard_normal((8, size)).astype(np.float32) for size in (3, 2))
+    return write_bundle(folder, contract, obs, state_in__h=state)
+
+
+@pytest.fixture(scope="session")
+def leaky_policy() -> Callable[..., Path]:
+    """`write_leaky_policy`."""
+    return write_leaky_policy
 
 
 @pytest.fixture(scope="session")

@@ -156,7 +156,7 @@ def test_a_state_that_travels_in_json_gives_the_policys_own_episode(
         assert status == 200, reply
         same(store, name, reply["action"], action)
         state = reply["state"]
-        assert set(state) == {spec.name for spec in store.get(name).contract.state}
+        assert set(state) == {"@policy", *(spec.name for spec in store.get(name).contract.state)}
 
 
 @NAMES
@@ -358,7 +358,7 @@ def test_no_odd_request_gets_a_5xx(ask: Ask) -> None:
     fields = ("state", "session_id", "reset", "end", "reward", "last_action", "seq", "timestamp", "explore", "seed")
     usual = {"state": {}, "session_id": "odd", "reset": True, "reward": 0.5, "last_action": [0.1, 0.1], "seq": 1}
     seen: dict[int, int] = {}
-    for _ in range(500):
+    for _ in range(700):
         name = rng.choice(["lstm_box", "lstm_previous", "act_nested"])
         obs = plain(observations(name, 1)[0]) if rng.random() < 0.8 else odd()
         chosen = [field for field in fields if rng.random() < 0.3]

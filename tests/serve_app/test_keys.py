@@ -133,6 +133,9 @@ def test_without_a_known_key_every_protocol_answers_401_in_our_form(port: int, h
         stream(port, **headers)
     assert caught.value.response.status_code == 401
     assert json.loads(caught.value.response.body or b"")["code"] == "unauthenticated"
+    counted = call(port, "GET", "/metrics", None, authorization=f"Bearer {CELL}")[2].decode()
+    for protocol in ("http", "websocket"):  # whoever tries keys is seen
+        assert f'{{code="unauthenticated",policy="",protocol="{protocol}"' in counted
 
 
 @pytest.mark.parametrize("key", [CELL, OTHER, ADMIN])
@@ -169,6 +172,7 @@ def test_administration_wants_an_admin_key_even_where_no_key_is_asked_for(
 def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served: Serve) -> None:
     with served(create_app(lambda: store, ServerSettings())) as port:
         assert stream(port, origin=f"http://127.0.0.1:{port}")["policy"] == "ur5"
-        with pytest.raises(InvalidStatus) as caught:
-            stream(port, origin="http://evil.example")
-        assert caught.value.response.status_code == 403
+        for origin in ("http://evil.example", "null", "http://["):
+            with pytest.raises(InvalidStatus) as caught:
+                stream(port, origin=origin)
+            assert caught.value.response.status_code == 403

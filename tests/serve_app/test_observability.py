@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import logging
@@ -13,10 +14,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from rlservo.export import bundle as bundle_files
 from rlservo.export.bundle import BakedStep, BoxSpec
+from rlservo.serve_app.arrays import pack
 from rlservo.serve_app.drift import EVERY, Drift
 from rlservo.serve_app.http import create_app
 from rlservo.serve_app.logs import LOGGER, configure
@@ -150,6 +154,48 @@ def test_the_log_says_what_happened_and_values_only_when_asked(
     assert str(SECRET)[:6] not in text or values
 
 
+@pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+def test_requests_on_streams_are_logged_like_others(
+    ur5: Path, served: Callable[[Any], AbstractContextManager[int]], log_file: Path
+) -> None:
+    settings = ServerSettings(log_file=str(log_file), log_requests=True)
+    configure(settings)
+    store = PolicyStore.load([ur5])
+    with served(create_app(lambda: store, settings)) as port:
+        address = f"ws://127.0.0.1:{port}/v1/policies/ur5"
+
+        def connect(path: str) -> Any:
+            headers = {"x-request-id": "cell-7"}
+            return websockets.sync.client.connect(f"{address}{path}", additional_headers=headers)
+
+        with connect("/stream?errors=keep") as stream:
+            for request in (
+                {"obs": [SECRET] * 27, "seq": 3},
+                {"obs": [SECRET] * 26, "seq": 4},
+                {"obs": [SECRET] * 27, "seq": 5, "deadline_ms": 0},
+                {"obs": [SECRET] * 27},
+            ):
+                stream.send(pack(request))
+            for _ in range(5):
+                stream.recv()
+        with connect("/stream") as stream, contextlib.suppress(ConnectionClosed):
+            stream.send(b"\xc1")
+            while True:
+                stream.recv()
+        with pytest.raises(InvalidStatus):
+            connect("/versions/99/stream")
+    lines = [json.loads(line) for line in log_file.read_text().splitlines()]
+    assert [(line["code"], line.get("seq")) for line in lines] == [
+        ("ok", 3), ("bad-observation", 4), ("deadline-passed", 5), ("ok", None),
+        ("bad-request", None), ("unknown-version", None),
+    ]  # fmt: skip
+    assert {(line["protocol"], line["policy"], line["request_id"]) for line in lines} == {
+        ("websocket", "ur5", "cell-7")
+    }
+    assert all(line["ms"] > 0 for line in lines[:5]) and lines[0]["version"] == "10"
+    assert str(SECRET)[:6] not in log_file.read_text()
+
+
 def test_the_dashboard_asks_for_metrics_that_exist(
     filtered: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
@@ -157,6 +203,7 @@ def test_the_dashboard_asks_for_metrics_that_exist(
     with served(create_app(lambda: store, ServerSettings(), replica="r")) as port:
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27})[0] == 200
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0]})[0] == 422
+        assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27, "session_id": "s", "reset": True})[0] == 200
         exposed = {name for name, *_ in scrape(port)} | {"rlservo_streams"}  # that one needs a stream
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
         connection.request("GET", "/metrics")

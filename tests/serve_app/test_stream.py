@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import http.client
 import json
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 import websockets.sync.client
 from numpy.typing import NDArray
+from uvicorn.protocols.utils import ClientDisconnected
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from rlservo.export.bundle import Contract
@@ -145,6 +147,13 @@ def test_observations_come_as_named_elements_lists_batches_and_other_dtypes(port
         np.testing.assert_array_equal(actions[:, 0], expected(store, batch))
 
 
+def test_a_reset_is_taken_where_nothing_is_remembered(port: int, store: PolicyStore) -> None:
+    named = {f"element_{i}": value for i, value in enumerate(OBS)}
+    with OpenpiClient(port) as client:
+        for request in ({"obs": OBS, "reset": True}, {**named, "reset": True}):
+            np.testing.assert_array_equal(client.infer(request)["actions"][0], expected(store))
+
+
 def test_exploring_is_repeatable_by_seed(port: int) -> None:
     with OpenpiClient(port) as client:
         first, again, other = (
@@ -245,6 +254,28 @@ def test_no_damaged_frame_gets_anything_but_an_answer_or_a_named_error(port: int
             client = OpenpiClient(port)
     client.close()
     assert set(codes) <= {"bad-request", "bad-observation", "deadline-passed"} and sum(codes.values()) > 50, codes
+
+
+def test_a_client_that_goes_while_it_is_answered_is_no_failure_of_the_server(
+    store: PolicyStore, caplog: pytest.LogCaptureFixture
+) -> None:
+    app = create_app(lambda: store, ServerSettings())
+    frames = iter([{"type": "websocket.connect"}, {"type": "websocket.receive", "bytes": pack({"obs": OBS})}])
+    sent: list[str] = []
+
+    async def receive() -> Any:
+        return next(frames)
+
+    async def send(message: Any) -> None:
+        sent.append(message["type"])
+        if len(sent) > 2:  # after the acceptance and the metadata
+            raise ClientDisconnected
+
+    scope = {"type": "websocket", "path": "/v1/policies/ur5/stream", "headers": [], "query_string": b""}
+    asyncio.run(app(scope, receive, send))
+    assert sent == ["websocket.accept", "websocket.send", "websocket.send"]
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
+    assert b'code="internal"' not in app.state.core.exposition()
 
 
 def test_many_robots_stream_at_once_and_none_gets_anothers_action(port: int, store: PolicyStore) -> None:
