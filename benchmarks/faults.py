@@ -51,6 +51,7 @@ DEADLINE_MS = 10_000.0  # of those who have one: what is counted is failures, no
 PAUSE_S = 0.02  # between a client's requests
 BEFORE_S, CALM_S = 2.0, 4.0  # of load before a fault, and without a failure before it counts as over
 BOUND_S = 90.0  # for a fault to be over
+SETTLE_S = 10.0  # until a new proxy has taken over
 COME_S = 120.0  # for what was deployed to be there
 INSIDES = ("Traceback", "site-packages", 'File "')
 
@@ -164,21 +165,21 @@ class Bench:
         return Crowd(made, pause_s)
 
     def pids(self, title: str) -> list[int]:
-        return sorted(
-            pid
-            for pid, process in self.server.members().items()
-            if title in process.command.split(" ")[0]
-        )
+        return sorted(pid for pid, process in self.server.members().items() if title in process.command.split(" ")[0])
 
 
 # The faults: each does its harm, and returns when what it did has come to its end
 
 
-def kill(title: str, count: int) -> Callable[[Bench, Row], None]:
-    """Return the fault that kills one process with SIGKILL, and waits for as many as there were."""
+def kill(title: str, count: int, renews: str | None = None) -> Callable[[Bench, Row], None]:
+    """Return the fault that kills one process with SIGKILL, and waits for as many as there were.
+
+    `renews`: another process that Serve replaces for it, later.
+    """
 
     def fault(bench: Bench, row: Row) -> None:
         before = wait_for(lambda: len(found := bench.pids(title)) >= count and found, f"{count} {title}")
+        renewed = bench.pids(renews) if renews else []
         began = time.monotonic()
         os.kill(before[-1], signal.SIGKILL)
         wait_for(
@@ -186,6 +187,11 @@ def kill(title: str, count: int) -> Callable[[Bench, Row], None]:
             f"a new {title}",
         )
         row.notes.append(f"a new process after {time.monotonic() - began:.1f} s")
+        if renews:
+            wait_for(lambda: set(bench.pids(renews)) - set(renewed), f"a new {renews}")
+            row.notes.append(f"Serve's own after {time.monotonic() - began:.1f} s")
+        if "HAProxy" in f"{title}{renews}":
+            time.sleep(SETTLE_S)
 
     return fault
 
@@ -362,7 +368,7 @@ class Fault:
 REPLICAS = 2
 FAULTS = {
     "replica": Fault(kill("ray::ServeReplica", REPLICAS)),
-    "haproxy": Fault(kill("/haproxy", 1), free=False),
+    "haproxy": Fault(kill("/haproxy", 1, "ray::HAProxyManager"), free=False),
     "proxy-manager": Fault(kill("ray::HAProxyManager", 1), free=False),
     "proxy-actor": Fault(kill("ray::ProxyActor", 1)),
     "controller": Fault(kill("ray::ServeController", 1), smooth=True),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import selectors
 import socket
+import threading
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,8 +18,9 @@ from speed.rounds import session_of
 
 MANY = 512
 ROUNDS = 8
-LARGE, ROWS = 8, 1024
+LARGE, ROWS = 2, 256
 """So many of the connections ask first, for so many observations each: meanwhile a queue forms."""
+ALONE = 50
 WAIT_S = 30.0
 
 
@@ -29,6 +31,8 @@ class Flood:
     asked: int = 0
     refused_ms: list[float] = field(default_factory=list)
     answered_ms: list[float] = field(default_factory=list)
+    alone_ms: list[float] = field(default_factory=list)
+    """What one request takes when nobody floods."""
     wrong: list[str] = field(default_factory=list)
     broken: list[str] = field(default_factory=list)
     grown_mb: float = 0.0
@@ -42,7 +46,7 @@ class Flood:
 
         return (
             f"{MANY} connections, {ROUNDS} times: refused {shown(self.refused_ms)}, "
-            f"answered {shown(self.answered_ms)}, replicas grew by {self.grown_mb:.1f} MB"
+            f"answered {shown(self.answered_ms)}, alone {shown(self.alone_ms)}, replicas grew by {self.grown_mb:.1f} MB"
         )
 
 
@@ -55,6 +59,11 @@ def flood(port: int, case: Case, replicas: list[int]) -> Flood:
     requests = [_request(case, batch[part]) for part in parts]
     expected = [actions[part] for part in parts]
     before = 0.0
+    for _ in range(ALONE):
+        with socket.create_connection(("127.0.0.1", port), timeout=WAIT_S) as line:
+            alone = Flood()
+            _once([line], [requests[-1]], [expected[-1]], alone)
+            found.alone_ms += alone.answered_ms
     for turn in range(ROUNDS):
         lines = [socket.create_connection(("127.0.0.1", port), timeout=WAIT_S) for _ in range(MANY)]
         try:
@@ -84,11 +93,16 @@ def _once(lines: list[socket.socket], requests: list[bytes], expected: list[Any]
     sent: dict[int, float] = {}
     ended: dict[int, float] = {}
     got: dict[int, bytearray] = {}
-    for number, line in enumerate(lines):  # small ones fit into the socket's buffer; the large ones go first
-        line.sendall(requests[number])
-        sent[number] = time.perf_counter()
-        line.setblocking(False)
+
+    def send() -> None:
+        for number, line in enumerate(lines):  # the large ones first; a request fits into the socket's buffer, or waits
+            sent[number] = time.perf_counter()
+            line.sendall(requests[number])
+
+    for number, line in enumerate(lines):
         selector.register(line, selectors.EVENT_READ, number)
+    sender = threading.Thread(target=send)
+    sender.start()
     deadline = time.monotonic() + WAIT_S
     open_lines = len(lines)
     while open_lines and time.monotonic() < deadline:
@@ -105,6 +119,7 @@ def _once(lines: list[socket.socket], requests: list[bytes], expected: list[Any]
                 ended[number] = time.perf_counter()
                 selector.unregister(lines[number])
                 open_lines -= 1
+    sender.join()
     selector.close()
     found.asked += len(lines)
     for number, when in ended.items():  # afterwards: reading answers takes time that the others' clocks would show

@@ -22,6 +22,7 @@ import re
 import shlex
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -122,8 +123,9 @@ def _watch(binary: str, file: Path, note: Path) -> None:
 
 def _bridge(binary: str, file: Path, note: Path, raylet: int) -> None:
     """Stand in for a HAProxy that has ended, unless another one is there already or Serve has ended, too."""
-    if _others(binary, file) or _is_running(note, binary) or not _controller(raylet):
+    if _listens(file) or not _controller(raylet):
         return
+    old = set(_running(binary, file))  # replaced earlier, and busy with what they still carry
     copy = file.with_name(BRIDGE)
     copy.write_text(bridging(file.read_text()))
     process = subprocess.Popen([binary, "-db", "-f", str(copy)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -135,7 +137,7 @@ def _bridge(binary: str, file: Path, note: Path, raylet: int) -> None:
             controlled = now
         if now - controlled > ORPHAN_S or not _is_there(raylet):
             process.kill()
-        elif _others(binary, file) and KNOWS_REPLICAS.search(file.read_text()):
+        elif set(_running(binary, file)) - old and KNOWS_REPLICAS.search(file.read_text()):
             time.sleep(1.0)  # it listens by then
             note.unlink(missing_ok=True)
             process.send_signal(signal.SIGUSR1)  # answers what it has, and ends
@@ -144,7 +146,21 @@ def _bridge(binary: str, file: Path, note: Path, raylet: int) -> None:
     note.unlink(missing_ok=True)
 
 
-def _others(binary: str, file: Path) -> list[int]:
+def _listens(file: Path) -> bool:
+    """Whether somebody takes connections where the configuration says; where it does not say, nobody has to."""
+    found = FRONTENDS.search(file.read_text())
+    address = found and re.search(r"^ +bind (\S*):(\d+)", found[0], re.MULTILINE)
+    if not address:
+        return True
+    host = address[1] if address[1] not in ("", "*", "0.0.0.0") else "127.0.0.1"
+    try:
+        socket.create_connection((host.strip("[]"), int(address[2])), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
+
+
+def _running(binary: str, file: Path) -> list[int]:
     """Return the HAProxies that run with this configuration."""
     return [pid for pid in _pids() if _runs(pid, binary, file)]
 

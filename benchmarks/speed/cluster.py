@@ -18,6 +18,7 @@ from typing import Any
 
 import yaml
 
+from rlservo.serve_app.haproxy import find_binary, prepare
 from speed.catalogue import Case, asked
 from speed.servers import Server, environment, free_ports
 
@@ -80,6 +81,7 @@ def cluster(case: Case, policies: Path, folder: Path, *, cpus: int = 4) -> Clust
     variables = shipped_variables() | {
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
         "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_SERVE_HAPROXY_BINARY_PATH": str(prepare(home, find_binary() or "")),
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
