@@ -363,6 +363,7 @@ class Fault:
     free: bool = True  # nobody fails twice
     smooth: bool = False  # nobody fails at all
     only_on: str | None = None
+    pause_s: float = PAUSE_S
 
 
 REPLICAS = 2
@@ -385,7 +386,7 @@ FAULTS = {
     "fewer-replicas": Fault(deploy(_replicas(REPLICAS), _running(REPLICAS)), smooth=True, only_on="cluster"),
     "variable": Fault(_all_new(_variable), smooth=True, only_on="cluster"),
     "code": Fault(_all_new(_code), smooth=True, only_on="cluster"),
-    "autoscale": Fault(autoscale, smooth=True, only_on="cluster"),
+    "autoscale": Fault(autoscale, smooth=True, only_on="cluster", pause_s=0.25),
 }
 
 
@@ -494,7 +495,7 @@ def _listening(made: Cluster) -> bool:
 def undergo(name: str, fault: Fault, bench: Bench) -> Row:
     """Let a crowd ask, do the harm, wait until nobody has failed for a while, and count."""
     row = Row(name, free=fault.free, smooth=fault.smooth)
-    with bench.crowd() as crowd:
+    with bench.crowd(fault.pause_s) as crowd:
         time.sleep(BEFORE_S)
         began = time.monotonic()
         try:

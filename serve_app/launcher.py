@@ -40,6 +40,7 @@ STOP_TIMEOUT_S = 30.0
 MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
+FIRST_PORT, SERVERS, PORTS_PER_SERVER = 30_000, 21, 64  # up to 32687; outgoing connections begin at 32768
 STOP, STOP_NOW = "stop", "stop now"
 
 DEFAULT_MESSAGE = 4 << 20  # [bytes]
@@ -221,7 +222,9 @@ def _child(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Start the cluster's process, pass on what it reports, and end all that carries its mark."""
     mark = secrets.token_hex(16)
-    environment = ray_environment(folder, haproxy=haproxy, mark=mark, max_message=plan["settings"]["max_body_bytes"])
+    environment = ray_environment(
+        folder, haproxy=haproxy, mark=mark, port=plan["port"], max_message=plan["settings"]["max_body_bytes"]
+    )
     read_fd, write_fd = os.pipe()
     (folder / RAY_FOLDER).mkdir()
     full_plan = {
@@ -264,7 +267,7 @@ def _pass_on(read_fd: int, events: queue.SimpleQueue[Any]) -> None:
 
 
 def ray_environment(
-    folder: Path, *, haproxy: str | None, mark: str, max_message: int = DEFAULT_MESSAGE
+    folder: Path, *, haproxy: str | None, mark: str, port: int = 8000, max_message: int = DEFAULT_MESSAGE
 ) -> dict[str, str]:
     """Return the environment of the cluster: this process's, without its Ray settings, with ours.
 
@@ -290,6 +293,7 @@ def ray_environment(
             "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
             # gRPC reads a whole message before anybody can refuse it; Serve's default is 2 GiB.
             "RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(max_message),
+            **_replica_ports(port),
             # A busy or small computer needs longer than Serve's 5 s to start a proxy, and Serve kills one that does.
             "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
             # Requests take microseconds: replicas need not wait half a minute for stragglers when the server stops.
@@ -329,6 +333,21 @@ def ray_environment(
         }
     )
     return environment
+
+
+def _replica_ports(port: int) -> dict[str, str]:
+    """Return where replicas listen: below the ports of outgoing connections, and not where another server's do.
+
+    Ray's own range is the same for every cluster of a machine: a proxy that has not yet been told that a replica is
+    gone would ask the other server's that took its port.
+    """
+    window = PORTS_PER_SERVER * (port % SERVERS)
+    ranges = {"HTTP": FIRST_PORT + window, "GRPC": FIRST_PORT + SERVERS * PORTS_PER_SERVER + window}
+    return {
+        f"RAY_SERVE_DIRECT_INGRESS_{bound}_{protocol}_PORT": str(first + more)
+        for protocol, first in ranges.items()
+        for bound, more in (("MIN", 0), ("MAX", PORTS_PER_SERVER - 1))
+    }
 
 
 def _check_ray() -> None:

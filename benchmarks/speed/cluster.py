@@ -81,6 +81,7 @@ def cluster(case: Case, policies: Path, folder: Path, *, cpus: int = 4) -> Clust
     variables = shipped_variables() | {
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
         "RAY_USAGE_STATS_ENABLED": "0",
+        **_replica_ports(),
         "RAY_SERVE_HAPROXY_BINARY_PATH": str(prepare(home, find_binary() or "")),
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
@@ -99,6 +100,16 @@ def cluster(case: Case, policies: Path, folder: Path, *, cpus: int = 4) -> Clust
     server.grpc_port = grpc_port
     server.env = variables
     return Cluster(server, dashboard, home, variables, configuration)
+
+
+def _replica_ports() -> dict[str, str]:
+    """Return ranges that no other Ray cluster on this machine uses: those of all clusters are the same by default."""
+    first = 29_000 + 8 * secrets.randbelow(40)
+    return {
+        f"RAY_SERVE_DIRECT_INGRESS_{bound}_{protocol}_PORT": str(first + start + more)
+        for protocol, start in (("HTTP", 0), ("GRPC", 500))
+        for bound, more in (("MIN", 0), ("MAX", 63))
+    }
 
 
 def shipped_variables() -> dict[str, str]:

@@ -46,7 +46,7 @@ def test_the_documentation_is_drawn_without_the_internet(
     store = PolicyStore.load([policies])
     with served(create_app(lambda: store, ServerSettings())) as port:
         done = subprocess.run(
-            [browser, *FLAGS, OFFLINE, f"--user-data-dir={tmp_path}", "--dump-dom", f"http://127.0.0.1:{port}/docs"],
+            [browser, *FLAGS, "--virtual-time-budget=20000", OFFLINE, f"--user-data-dir={tmp_path}", "--dump-dom", f"http://127.0.0.1:{port}/docs"],
             capture_output=True, text=True, timeout=120,
         )  # fmt: skip
     drawn = set(re.findall(r'data-path="([^"]*)"', done.stdout))  # what Swagger UI makes of /openapi.json
