@@ -187,8 +187,9 @@ def kill(title: str, count: int, renews: str | None = None) -> Callable[[Bench, 
             f"a new {title}",
         )
         row.notes.append(f"a new process after {time.monotonic() - began:.1f} s")
-        if renews:
-            wait_for(lambda: set(bench.pids(renews)) - set(renewed), f"a new {renews}")
+        if renews is not None:
+            other = renews
+            wait_for(lambda: set(bench.pids(other)) - set(renewed), f"a new {other}")
             row.notes.append(f"Serve's own after {time.monotonic() - began:.1f} s")
         if "HAProxy" in f"{title}{renews}":
             time.sleep(SETTLE_S)

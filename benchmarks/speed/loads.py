@@ -222,16 +222,18 @@ class GrpcLine:
 
         # A subchannel of its own: others' failures would make it wait before it connects.
         self._channel = grpc.insecure_channel(f"127.0.0.1:{port}", [("grpc.use_local_subchannel_pool", 1)])
-        self._failed: type[Any] = grpc.RpcError
         self._call: Any = self._channel.unary_unary(INFER)  # without serializers: bytes in, bytes out
         self._request = infer_request(model, obs)
 
     def __call__(self) -> bytes:
         """Return the serialized ModelInferResponse. Raises LoadError with the status."""
+        import grpc
+
         try:
             answer: bytes = self._call(self._request, timeout=30)
-        except self._failed as error:
-            raise LoadError(f"{error.code().name}: {error.details()}") from None
+        except grpc.RpcError as error:
+            told: Any = error  # it has the call's methods, which its class does not say
+            raise LoadError(f"{told.code().name}: {told.details()}") from None
         return answer
 
     def close(self) -> None:
