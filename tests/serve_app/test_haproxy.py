@@ -6,6 +6,7 @@ import contextlib
 import http.client
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from pathlib import Path
 import pytest
 
 from rlservo.serve_app import haproxy
+from rlservo.serve_app.launcher import ray_environment
 from rlservo.serve_app.processes import free_ports
 
 BINARY = haproxy.find_binary() or ""
@@ -232,3 +234,28 @@ def test_a_bridge_has_none_of_what_is_rays_own(tmp_path: Path) -> None:
     bridge = haproxy.bridging(haproxy.mend(text, tmp_path / "503.http"))
     assert "stats" not in bridge
     assert "bind 127.0.0.1:1" in bridge and "server SERVE_REPLICA" in bridge
+
+
+def test_the_cluster_gets_the_variables_that_the_launcher_sets(tmp_path: Path) -> None:
+    """deploy/serve.yaml tells operators to export what `rlservo serve` does by itself."""
+    text = (Path(__file__).resolve().parents[2] / "deploy" / "serve.yaml").read_text()
+    comment = "".join(re.findall(r"^#(.*)$", text, re.MULTILINE))
+    told = dict(re.findall(r'(RAY_SERVE_\w+)="?((?<=")[^"]*|[^"\s]+)', comment))
+    ours = ray_environment(tmp_path, haproxy="/bin/true", mark="test")
+    own = {"RAY_SERVE_HAPROXY_BINARY_PATH", "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S"}  # a folder; no updates
+    assert len(told) > 10
+    assert {name: ours.get(name) for name in told.keys() - own} == {name: told[name] for name in told.keys() - own}
+
+
+def test_servers_on_ports_next_to_each_other_have_replicas_on_others(tmp_path: Path) -> None:
+    taken: set[int] = set()
+    for port in range(8000, 8021):
+        environment = ray_environment(tmp_path, haproxy=None, mark="test", port=port)
+        for protocol in ("HTTP", "GRPC"):
+            first, last = (
+                int(environment[f"RAY_SERVE_DIRECT_INGRESS_{bound}_{protocol}_PORT"]) for bound in ("MIN", "MAX")
+            )
+            ports = set(range(first, last + 1))
+            assert len(ports) == 64 and not ports & taken
+            taken |= ports
+    assert min(taken) >= 30_000 and max(taken) < 32_768  # where Linux begins with outgoing connections
