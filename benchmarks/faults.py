@@ -37,10 +37,10 @@ from rlservo.export.bundle import ONNX_FILE
 from rlservo.serve_app.client import PolicyClient
 from rlservo.serve_app.stream_client import StreamClient
 from serving import OUT, ROOT
-from speed.asks import Episode, WrongError, askers, episode_of
+from speed.asks import Episode, WrongError, askers, episode_of, open_stream
 from speed.catalogue import Case, case_of, rlservo
 from speed.cluster import Cluster, cluster
-from speed.loads import LoadError, PoliteError
+from speed.loads import LoadError, PoliteError, WebSocketLine
 from speed.servers import Server, StartError, free_ports, running, started, wait_until_answering
 
 CHECKPOINTS = ROOT / "examples" / "checkpoints"
@@ -51,6 +51,7 @@ DEADLINE_MS = 10_000.0  # of those who have one: what is counted is failures, no
 PAUSE_S = 0.02  # between a client's requests
 BEFORE_S, CALM_S = 2.0, 4.0  # of load before a fault, and without a failure before it counts as over
 BOUND_S = 90.0  # for a fault to be over
+OLD_STREAM_S = 140.0  # Ray's own limit for a replaced HAProxy is 120
 SETTLE_S = 10.0  # until a new proxy has taken over
 COME_S = 120.0  # for what was deployed to be there
 INSIDES = ("Traceback", "site-packages", 'File "')
@@ -346,6 +347,30 @@ def autoscale(bench: Bench, row: Row) -> None:
     row.notes.append(f"1 again after {time.monotonic() - began:.0f} s")
 
 
+def old_streams(bench: Bench, row: Row) -> None:
+    """Kill a replica, so that HAProxy is replaced; the other's streams stay on the old one, and outlive Ray's limit."""
+    with ExitStack() as cleanup:
+        streams = [open_stream(bench.server) for _ in range(4)]
+        for stream in streams:
+            cleanup.callback(stream.close)
+        kill("ray::ServeReplica", REPLICAS)(bench, row)
+        began, left = time.monotonic(), [stream for stream in streams if _answers(stream)]
+        while time.monotonic() < began + OLD_STREAM_S:
+            time.sleep(5)  # uvicorn pings, and closes streams that do not answer
+            left = [stream for stream in left if _answers(stream)]
+        row.notes.append(f"{len(left)} of {len(streams)} streams still answered {OLD_STREAM_S:g} s later")
+        if not left:
+            row.broken.append("no stream outlived HAProxy's replacement")
+
+
+def _answers(stream: WebSocketLine) -> bool:
+    try:
+        stream()
+    except (LoadError, OSError):
+        return False
+    return True
+
+
 def overload(bench: Bench, row: Row) -> None:
     """512 connections at once (`flood.py`)."""
     replicas = bench.pids("ServeReplica")
@@ -374,6 +399,7 @@ FAULTS = {
     "proxy-manager": Fault(kill("ray::HAProxyManager", 1), free=False),
     "proxy-actor": Fault(kill("ray::ProxyActor", 1)),
     "controller": Fault(kill("ray::ServeController", 1), smooth=True),
+    "old-streams": Fault(old_streams),
     "overload": Fault(overload, free=False),
     "user-config": Fault(
         deploy(_user_config, lambda bench: _versions(bench)["policies"][-1]["version"] == "2"),
