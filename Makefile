@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test check bench soak wheel setup clean
+.PHONY: demo test check bench soak faults wheel setup clean
 
 demo: setup  ## Export the two shipped checkpoints, serve them, drive both simulators; a table and a picture in demo/
 	$(BIN)/rlservo demo --out demo
@@ -27,6 +27,10 @@ bench: setup  ## Simulator, export and serving speed, printed and written to ben
 
 soak: setup  ## Ten minutes of mixed load over every protocol: wrong answers, and whether memory stays flat
 	$(BIN)/python benchmarks/soak.py
+
+faults: setup  ## What clients see when replicas, proxy and controller are killed, and when deployments change
+	$(BIN)/python benchmarks/faults.py
+	$(BIN)/python benchmarks/faults.py --on cluster
 
 wheel: setup  ## Build the wheel into dist/
 	$(BIN)/python -m build --wheel --outdir dist .

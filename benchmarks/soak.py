@@ -11,7 +11,6 @@ an answer was wrong or memory grew. Written to bench/soak.json.
 from __future__ import annotations
 
 import argparse
-import gzip
 import json
 import re
 import secrets
@@ -23,25 +22,23 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from serving import OUT, policy
-from speed.catalogue import Case, binary, case_of, plain, rlservo
-from speed.loads import ClosedError, GrpcLine, HttpLine, LoadError, WebSocketLine
+from speed.asks import Asker, askers
+from speed.catalogue import Case, case_of, rlservo
+from speed.loads import ClosedError, LoadError
 from speed.machine import PROXY, REPLICA, rss_mb
-from speed.rounds import session_of
 from speed.servers import START_S, Exchange, Server, StartError, ask, running
 
 WARM_UP = 0.5  # of the time: allocators and caches fill up first
 SETTLE_S = 10.0  # after the last replica is there: Serve replaces HAProxy's process for each
 REPLICA_LABEL = re.compile(rb'rlservo_policy_loaded\{[^}]*replica="([^"]*)"')
 FLAT_MB = 3.0  # growth over the fitted time that counts as none: allocators move in steps of this size
-ROWS = 64
 
 Ask = Callable[[], None]
 
@@ -103,104 +100,22 @@ def parse() -> argparse.Namespace:
 
 def mix(case: Case, server: Server, cleanup: ExitStack) -> dict[str, Ask]:
     """Return what is asked in turn, by name; each checks its own answer."""
-    name, port = case.name, server.port
-    expected = session_of(case).run(["action"], {"obs": case.batch(ROWS)})[0]
-    act = f"/v1/policies/{name}/act"
-    rows = Exchange("POST", act, json.dumps({"obs": case.batch(ROWS).tolist()}).encode())
-    tensor = {"name": "obs", "shape": [1, len(case.obs)], "datatype": "FP32", "data": case.obs.tolist()}
-    oip = Exchange("POST", f"/v2/models/{name}/infer", json.dumps({"inputs": [tensor]}).encode())
-    large = binary(case, ROWS)
-    zipped = replace(large, body=gzip.compress(large.body, 1), headers=(*large.headers, ("Content-Encoding", "gzip")))
-
-    def http(exchange: Exchange, check: Callable[[bytes], None], status: int = 200) -> Ask:
-        line = HttpLine(port, exchange, status=status)
-        cleanup.callback(lambda: line.close())
-
-        def ask() -> None:
-            nonlocal line
-            try:
-                check(line())
-            except (ConnectionError, ClosedError):  # an idle connection may be closed; a robot opens another
-                line.close()
-                line = HttpLine(port, exchange, status=status)
-                check(line())
-
-        return ask
-
-    def kept() -> Ask:
-        line = open_stream(server)
-        cleanup.callback(lambda: line.close())
-
-        def ask() -> None:
-            nonlocal line
-            try:
-                _same(_streamed(line()), case.action)
-            except (LoadError, OSError):  # that counts as wrong; the next one is on a new connection
-                line.close()
-                line = open_stream(server)
-                raise
-
-        return ask
-
-    def anew() -> None:
-        line = open_stream(server)
-        try:
-            _same(_streamed(line()), case.action)
-        finally:
-            line.close()
-
-    def get(path: str, holds: bytes) -> Ask:
-        return http(Exchange("GET", path, b""), lambda answer: _holds(answer, holds))
-
-    asks = {
-        "json": http(plain(case, act), lambda answer: _same(json.loads(answer)["action"], case.action)),
-        "json batch": http(rows, lambda answer: _same(json.loads(answer)["action"], expected)),
-        "json refused": http(
-            Exchange("POST", act, b'{"obs": [1, 2]}'), lambda answer: _holds(answer, b"bad-observation"), 422
-        ),
-        "oip json": http(oip, lambda answer: _same(json.loads(answer)["outputs"][0]["data"], case.action)),
-        "oip binary": http(large, lambda answer: _same(_raw(answer, expected), expected)),
-        "oip compressed": http(zipped, lambda answer: _same(_raw(answer, expected), expected)),
-        "websocket": kept(),
-        "websocket anew": anew,
-        "contract": get(f"/v1/policies/{name}", b"observation_space"),
-        "metadata": get(f"/v2/models/{name}", b"onnx"),
-        "metrics": get("/metrics", b"rlservo_requests_total"),
-    }
-    if server.grpc_port is not None:
-        line = GrpcLine(server.grpc_port, name, case.obs[None])
-        cleanup.callback(line.close)
-        asks["grpc"] = lambda: _holds(line(), case.action.tobytes())
+    asks: dict[str, Ask] = {}
+    for name, make in askers(case, server).items():
+        cleanup.callback((asker := make()).close)
+        asks[name] = asker if name.startswith("websocket") else partial(_patiently, asker)
     return asks
+
+
+def _patiently(asker: Asker) -> None:
+    try:
+        asker()
+    except (ConnectionError, ClosedError):  # an idle connection may be closed; a robot opens another
+        asker()
 
 
 MIX = ("json", "websocket", "oip binary", "json", "websocket", "grpc", "json", "oip json", "websocket", "json batch")
 SELDOM = ("websocket anew", "json refused", "oip compressed", "contract", "metadata", "metrics")  # one in every turn
-
-
-def open_stream(server: Server) -> WebSocketLine:
-    assert server.stream is not None
-    return WebSocketLine(server.port, server.stream, server.message, greets=server.greets)
-
-
-def _streamed(message: bytes) -> Any:
-    from rlservo.serve_app.arrays import unpack
-
-    return unpack(message)["actions"][0]
-
-
-def _raw(answer: bytes, expected: NDArray[Any]) -> NDArray[Any]:
-    return np.frombuffer(answer[-expected.nbytes :], expected.dtype).reshape(expected.shape)
-
-
-def _same(action: Any, expected: NDArray[Any]) -> None:
-    if not np.allclose(action, expected, atol=1e-4):
-        raise LoadError(f"a wrong action: {action}")
-
-
-def _holds(answer: bytes, part: bytes) -> None:
-    if part not in answer:
-        raise LoadError(f"an answer without {part!r}: {answer[:200]!r}")
 
 
 # The run

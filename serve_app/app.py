@@ -103,7 +103,7 @@ def _serve_limit(settings: ServerSettings) -> int:
     # A line per request costs more than the policy; below this level Serve makes one all the same and drops it (5%).
     logging_config={"enable_access_log": False, "log_level": "WARNING"},
     health_check_period_s=5,
-    graceful_shutdown_timeout_s=5,
+    graceful_shutdown_timeout_s=15,  # streams are closed with a code at its beginning, and cut at its end
     user_config={},
     **SURGE,
 )

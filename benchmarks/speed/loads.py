@@ -28,6 +28,7 @@ from speed.servers import Exchange
 Call = Callable[[], object]
 UNITS_MS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
 WARM_UP = 30  # calls before a round counts
+POLITE = (b"\x03\xe9", b"\x03\xf4")
 INFER = "/inference.GRPCInferenceService/ModelInfer"
 
 
@@ -49,6 +50,10 @@ class LoadError(Exception):
 
 class ClosedError(LoadError):
     """A server that closed a kept connection."""
+
+
+class PoliteError(ClosedError):
+    """A server that said why it closes a stream: going away (1001) or restarting (1012), RFC 6455 and its registry."""
 
 
 def wrk(port: int, exchange: Exchange, folder: Path, *, connections: int, seconds: int) -> Load:
@@ -134,6 +139,8 @@ class HttpLine(Line):
         headers = "".join(f"{name}: {value}\r\n" for name, value in exchange.headers)
         head = f"{exchange.method} {exchange.path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n{headers}"
         self._bytes = f"{head}Content-Length: {len(exchange.body)}\r\n\r\n".encode() + exchange.body
+        self.ended = False
+        """Whether the server has said that it closes the connection: nothing may be asked on it any more."""
 
     def __call__(self) -> bytes:
         """Return the answer's body. Raises LoadError unless it has the status asked for."""
@@ -144,6 +151,7 @@ class HttpLine(Line):
         head = answer[: end + 2].lower()
         if not head.startswith(self._expected):
             raise LoadError(f"the server answered {answer[:300]!r}")
+        self.ended = b"\r\nconnection: close\r\n" in head
         start = head.index(b"content-length:") + 15
         length = int(head[start : head.index(b"\r", start)])
         return self._read(answer, end + 4 + length)[end + 4 :]
@@ -190,6 +198,8 @@ class WebSocketLine(Line):
                 return content
             if kind == 9:  # a ping: uvicorn closes a connection whose client does not answer
                 self._socket.sendall(_frame(content, kind=0x8A))
+            elif kind == 8 and content[:2] in POLITE:
+                raise PoliteError(f"the server closed the stream with {int.from_bytes(content[:2], 'big')}")
             else:
                 raise LoadError(f"the server sent a frame of kind {kind}: {content[:300]!r}")
 
@@ -210,13 +220,20 @@ class GrpcLine:
     def __init__(self, port: int, model: str, obs: NDArray[np.float32]) -> None:
         import grpc
 
-        self._channel = grpc.insecure_channel(f"127.0.0.1:{port}")
+        # A subchannel of its own: others' failures would make it wait before it connects.
+        self._channel = grpc.insecure_channel(f"127.0.0.1:{port}", [("grpc.use_local_subchannel_pool", 1)])
         self._call: Any = self._channel.unary_unary(INFER)  # without serializers: bytes in, bytes out
         self._request = infer_request(model, obs)
 
     def __call__(self) -> bytes:
-        """Return the serialized ModelInferResponse."""
-        answer: bytes = self._call(self._request, timeout=30)
+        """Return the serialized ModelInferResponse. Raises LoadError with the status."""
+        import grpc
+
+        try:
+            answer: bytes = self._call(self._request, timeout=30)
+        except grpc.RpcError as error:
+            told: Any = error  # it has the call's methods, which its class does not say
+            raise LoadError(f"{told.code().name}: {told.details()}") from None
         return answer
 
     def close(self) -> None:

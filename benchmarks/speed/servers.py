@@ -69,9 +69,18 @@ class Server:
 @contextmanager
 def running(server: Server, folder: Path, mark: str) -> Iterator[None]:
     """Start the server, wait until it answers, and at the end stop it and all its processes."""
+    began = time.perf_counter()
+    with started(server, folder, mark) as log:
+        wait_until_answering(server, log)
+        server.cold_start_s = time.perf_counter() - began
+        yield
+
+
+@contextmanager
+def started(server: Server, folder: Path, mark: str) -> Iterator[Path]:
+    """Start the server, give its log, and at the end stop it and all its processes."""
     log = folder / f"{server.port}.log"
     server.mark = f"{mark}:{server.port}"
-    started = time.perf_counter()
     with log.open("wb") as output:
         server.process = subprocess.Popen(
             server.command,
@@ -82,9 +91,7 @@ def running(server: Server, folder: Path, mark: str) -> Iterator[None]:
             start_new_session=True,
         )
     try:
-        wait_until_answering(server, log)
-        server.cold_start_s = time.perf_counter() - started
-        yield
+        yield log
     finally:
         stop(server)
 

@@ -434,8 +434,14 @@ def live_server(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
 @pytest.fixture(scope="session")
 def client_environment(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """Install packages that cannot share our environment into one of their own; gives its Python, or skips."""
+    made: dict[tuple[str, ...], Path] = {}
 
     def install(*packages: str) -> Path:
+        if packages not in made:
+            made[packages] = new(*packages)
+        return made[packages]
+
+    def new(*packages: str) -> Path:
         folder = tmp_path_factory.mktemp("client")
         commands = [[sys.executable, "-m", "venv", str(folder)]]
         commands.append([str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", *packages])

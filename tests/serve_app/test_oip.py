@@ -71,7 +71,7 @@ def request(*tensors: dict[str, Any], **more: Any) -> dict[str, Any]:
 def test_tritons_own_client_works_unchanged(
     client_environment: Callable[..., Path], port: int, store: PolicyStore
 ) -> None:
-    python = client_environment("tritonclient[http]")
+    python = client_environment("tritonclient[http,grpc]==2.71.0")
     done = subprocess.run(
         [str(python), str(CLIENT), f"127.0.0.1:{port}"],
         input=json.dumps({"obs": BATCH.tolist()}),

@@ -18,17 +18,21 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from rlservo.export.errors import ConflictError, RefusedError, UnauthenticatedError
+from rlservo.serve_app import haproxy
 from rlservo.serve_app.admin_client import AdminClient
 from rlservo.serve_app.keys import new_key
 from rlservo.serve_app.processes import MARK, end_marked, free_ports, remove_folder
+from rlservo.serve_app.stream_client import StreamClient
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
@@ -124,13 +128,38 @@ class Cluster:
             time.sleep(0.2)
         raise AssertionError(json.dumps(seen, indent=1))
 
+    def status(self) -> tuple[str, str]:
+        """Return (status, messages) of the application, as `serve status` tells them."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.dashboard, timeout=60)
+        connection.request(
+            "GET",
+            "/api/serve/applications/",
+            headers={"authorization": f"Bearer {self.environment['RAY_AUTH_TOKEN']}"},
+        )
+        found = json.loads(connection.getresponse().read())["applications"]["rlservo"]
+        connection.close()
+        messages = [found["message"], *(each["message"] for each in found["deployments"].values())]
+        return found["status"], " ".join(messages)
+
+    def wait_for_status(self, wanted: str, timeout_s: float = 90) -> str:
+        """Wait until the application has this status; return its messages."""
+        deadline = time.monotonic() + timeout_s
+        while (found := self.status())[0] != wanted:
+            assert time.monotonic() < deadline, found
+            time.sleep(0.2)
+        return found[1]
+
     def replica_pids(self) -> list[int]:
+        return self.pids_of("ServeReplica:rlservo:PolicyServer")
+
+    def pids_of(self, part: str) -> list[int]:
+        """Return our processes with this in their title or program."""
         pids = []
         for entry in Path("/proc").iterdir():
             if entry.name.isdigit():
                 with contextlib.suppress(OSError):
                     title = (entry / "cmdline").read_bytes().decode(errors="replace")
-                    if "ServeReplica:rlservo:PolicyServer" in title and self._owns(int(entry.name)):
+                    if part in title.split("\0")[0] and self._owns(int(entry.name)):
                         pids.append(int(entry.name))
         return sorted(pids)
 
@@ -253,6 +282,8 @@ def cluster(repository: Path) -> Iterator[Cluster]:
         "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "a.sock"),
         "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
         "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
+        "RAY_SERVE_HAPROXY_BINARY_PATH": str(haproxy.prepare(folder, haproxy.find_binary() or "haproxy")),
+        "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "1",
     }
     plan = json.dumps({"dashboard": dashboard, "folder": str(folder)})
     process = subprocess.Popen(
@@ -359,8 +390,8 @@ def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_bac
     with cluster.admin() as admin:
         admin.alias("ur5", "candidate", "3")
     generation = {each["generation"] for each in cluster.replicas()}
+    cluster.wait_for(lambda _: len(cluster.replica_pids()) == 2)  # those before the update may still be ending
     pids = cluster.replica_pids()
-    assert len(pids) == 2
     with loaded(cluster) as load:
         os.kill(pids[0], signal.SIGKILL)
         cluster.wait_for(lambda replicas: len(replicas) == 2 and pids[0] not in cluster.replica_pids(), timeout_s=90)
@@ -370,6 +401,74 @@ def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_bac
     assert len(load.first_failures) <= CLIENTS  # each had one request in it at most
     assert set(load.versions) == {"3"}
     assert {each["generation"] for each in cluster.replicas()} == generation
+
+
+def test_a_killed_proxy_is_back_at_once_and_nobody_is_told_that_the_policy_is_unknown(cluster: Cluster) -> None:
+    manager = cluster.pids_of("ray::HAProxyManager")
+    proxies = cluster.pids_of("/haproxy")
+    assert len(manager) == 1 and proxies
+    with loaded(cluster) as load:
+        for pid in proxies:
+            os.kill(pid, signal.SIGKILL)
+        began = time.monotonic()
+        while (now := cluster.pids_of("ray::HAProxyManager")) == manager or not now:
+            assert time.monotonic() - began < 60
+            time.sleep(0.2)
+        while list(cluster.folder.glob("*/bridge.pid")):
+            assert time.monotonic() - began < 60
+            time.sleep(0.2)
+        answered = load.answered
+        cluster.wait_for(lambda seen: len(seen) == 2 and load.answered > answered + 50)
+    assert load.first_failures
+    assert {failure.partition(":")[0] for failure in load.first_failures} <= {
+        "ConnectionRefusedError", "RemoteDisconnected", "ConnectionResetError", "BrokenPipeError", "IncompleteRead",
+    }, Counter(load.first_failures)  # fmt: skip
+    assert load.answered > 50
+
+
+def test_a_killed_controller_costs_nobody_anything_and_commands_work_again(cluster: Cluster) -> None:
+    (controller,) = cluster.pids_of("ray::ServeController")
+    with loaded(cluster) as load:
+        os.kill(controller, signal.SIGKILL)
+        cluster.wait_for(lambda _: cluster.pids_of("ray::ServeController") not in ([], [controller]))
+        cluster.wait_for_status("RUNNING")
+        with cluster.admin() as admin:
+            admin.alias("ur5", "candidate", "1")
+        cluster.wait_for(lambda seen: len(seen) == 2)
+    assert load.failures == [], Counter(load.failures)
+
+
+def test_a_rolling_update_of_the_environment_keeps_streams_and_broken_code_changes_nothing(
+    cluster: Cluster,
+) -> None:
+    stop, steps = threading.Event(), 0
+
+    def stream() -> None:
+        nonlocal steps
+        with StreamClient(f"http://127.0.0.1:{cluster.port}", "ur5", api_key=KEY, deadline_ms=20_000) as client:
+            while not stop.is_set():
+                client.act(np.array(OBS, np.float32))
+                steps += 1
+                time.sleep(0.01)
+
+    with loaded(cluster) as load, ThreadPoolExecutor(1) as pool:
+        streaming = pool.submit(stream)
+        try:
+            cluster.application["import_path"] = "rlservo.serve_app.app:not_there"
+            cluster.deploy()
+            assert "not_there" in cluster.wait_for_status("DEPLOY_FAILED")
+            cluster.application["import_path"] = "rlservo.serve_app.app:build"
+            old = {each["replica"] for each in cluster.replicas()}
+            cluster.application["runtime_env"] = {"env_vars": {"RLSERVO_UPDATE": "1"}}
+            cluster.deploy()
+            cluster.wait_for(lambda seen: len(seen) == 2 and not old & {each["replica"] for each in seen}, timeout_s=90)
+            cluster.wait_for_status("RUNNING")
+            time.sleep(2)  # the old ones drain
+        finally:
+            stop.set()
+        streaming.result()
+    assert load.failures == [], Counter(load.failures)
+    assert load.answered > 50 and steps > 50
 
 
 def test_administration_needs_the_admin_key_and_says_what_it_will_not_do(cluster: Cluster) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 from rlservo.export.errors import BundleError, UsageError
+from rlservo.serve_app import haproxy
 from rlservo.serve_app.launcher import serve_policies
 from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.processes import check_port, free_ports, port_holder
@@ -301,6 +302,7 @@ def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
         "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "rlservo.serve_app.ingress:middlewares",
+        "RAY_SERVE_HAPROXY_BINARY_PATH": str(haproxy.prepare(ray_folder, haproxy.find_binary() or "haproxy")),
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),

@@ -24,7 +24,7 @@ from rlservo.serve_app.processes import free_ports
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
 CLIENT = Path(__file__).parent / "clients" / "triton_grpc.py"
-TRITON = ("tritonclient[grpc]==2.71.0",)
+TRITON = ("tritonclient[http,grpc]==2.71.0",)
 OBS = np.random.default_rng(6).standard_normal((5, 27)).astype(np.float32)
 Call = Callable[..., Any]
 

@@ -1,0 +1,600 @@
+"""What clients see when parts of a running server die or are replaced under load, one row of a table per fault.
+
+    python benchmarks/faults.py [--on serve|cluster] [FAULT ...]
+
+The UR5 policy and the LSTM policy that ship, two replicas, on `rlservo serve` or on a cluster by `serve deploy
+deploy/serve.yaml`. Meanwhile clients ask without end, over JSON, the Open Inference Protocol (binary, gRPC) and
+WebSockets, and through `PolicyClient` and `StreamClient` with the LSTM's memory; each tries once more when it has
+failed, and checks every action. Exits with 1 when an answer was wrong, when a client learned of our insides, or when
+what must cost nothing cost something. Written to bench/faults-serve.json or bench/faults-cluster.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from flood import flood
+from rlservo.export.bundle import ONNX_FILE
+from rlservo.serve_app.client import PolicyClient
+from rlservo.serve_app.stream_client import StreamClient
+from serving import OUT, ROOT
+from speed.asks import Episode, WrongError, askers, episode_of, open_stream
+from speed.catalogue import Case, case_of, rlservo
+from speed.cluster import Cluster, cluster
+from speed.loads import LoadError, PoliteError, WebSocketLine
+from speed.servers import Server, StartError, running, started, wait_until_answering
+
+CHECKPOINTS = ROOT / "examples" / "checkpoints"
+SHIPPED = {"ur5": CHECKPOINTS / "ur5_positioning", "sparse": CHECKPOINTS / "mir100_sparse_fixes"}
+PROTOCOLS = ("json", "oip binary", "grpc", "websocket", "websocket anew")
+STEPS = 50  # of an episode
+DEADLINE_MS = 10_000.0  # of those who have one: what is counted is failures, not how slow a busy machine is
+PAUSE_S = 0.02  # between a client's requests
+BEFORE_S, CALM_S = 2.0, 4.0  # of load before a fault, and without a failure before it counts as over
+BOUND_S = 90.0  # for a fault to be over
+OLD_STREAM_S = 140.0  # Ray's own limit for a replaced HAProxy is 120
+SETTLE_S = 10.0  # until a new proxy has taken over
+COME_S = 120.0  # for what was deployed to be there
+INSIDES = ("Traceback", "site-packages", 'File "')
+
+
+@dataclass
+class Seen:
+    """What the clients of one kind saw."""
+
+    asked: int = 0
+    told: int = 0
+    """How often the server said that a memory is gone, or closed a stream with the code for it."""
+    first: list[tuple[float, str]] = field(default_factory=list)  # (when, what) of failed first tries
+    twice: list[tuple[float, str]] = field(default_factory=list)
+    wrong: list[str] = field(default_factory=list)
+
+
+class Crowd:
+    """Clients that ask without end, each in a thread of its own, and try once more when that failed."""
+
+    def __init__(self, made: dict[str, Callable[[], Any]], pause_s: float = PAUSE_S) -> None:
+        self.seen = {name: Seen() for name in made}
+        self._stop = threading.Event()
+        self._pause_s = pause_s
+        self._threads = [threading.Thread(target=self._ask, args=each) for each in made.items()]
+
+    def __enter__(self) -> Crowd:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+
+    def last_failure(self) -> float:
+        """Return when somebody last failed (`time.monotonic`), 0 for never."""
+        return max((each.first[-1][0] for each in self.seen.values() if each.first), default=0.0)
+
+    def _ask(self, name: str, make: Callable[[], Any]) -> None:
+        ask, seen = make(), self.seen[name]
+        while not self._stop.is_set():
+            if (failure := _failure(ask, seen)) is not None:
+                seen.first.append((time.monotonic(), failure))
+                if (failure := _failure(ask, seen)) is not None:
+                    seen.twice.append((time.monotonic(), failure))
+            seen.asked += 1
+            time.sleep(self._pause_s)
+        seen.told += getattr(ask, "told", 0)
+        ask.close()
+
+
+def _failure(ask: Callable[[], None], seen: Seen) -> str | None:
+    try:
+        ask()
+    except PoliteError:
+        seen.told += 1
+        return _failure(ask, seen)
+    except WrongError as error:
+        seen.wrong.append(str(error)[:300])
+    except (LoadError, OSError) as error:
+        return f"{type(error).__name__}: {error}"[:200]
+    return None
+
+
+@dataclass
+class Row:
+    """What one fault cost."""
+
+    fault: str
+    asked: int = 0
+    first: int = 0
+    twice: int = 0
+    wrong: int = 0
+    told: int = 0
+    over_s: float = 0.0
+    """From the fault to the last failure."""
+    free: bool = False
+    """Whether no try but the first of each may fail (and for `smooth`, not even that)."""
+    smooth: bool = False
+    notes: list[str] = field(default_factory=list)
+    kinds: dict[str, int] = field(default_factory=dict)
+    broken: list[str] = field(default_factory=list)
+    """Why this does not hold; empty when it does."""
+
+
+@dataclass
+class Bench:
+    """The running server, and what it is asked."""
+
+    case: Case
+    lstm: Path
+    server: Server
+    cluster: Cluster | None
+    folder: Path
+    console: Console
+
+    def crowd(self, pause_s: float = PAUSE_S) -> Crowd:
+        made: dict[str, Callable[[], Any]] = {}
+        kinds = askers(self.case, self.server)
+        for name in PROTOCOLS:
+            if name in kinds:
+                made[name] = kinds[name]
+        seen, expected = episode_of(self.lstm, STEPS)
+        url = f"http://127.0.0.1:{self.server.port}"
+        name = self.lstm.parent.name
+        made["lstm, state carried"] = lambda: Episode(PolicyClient(url, name, deadline_ms=DEADLINE_MS), seen, expected)
+        made["lstm, stream"] = lambda: Episode(
+            StreamClient(url, name, server_state=True, deadline_ms=DEADLINE_MS), seen, expected, held=True
+        )
+        return Crowd(made, pause_s)
+
+    def pids(self, title: str) -> list[int]:
+        return sorted(pid for pid, process in self.server.members().items() if title in process.command.split(" ")[0])
+
+
+# The faults: each does its harm, and returns when what it did has come to its end
+
+
+def kill(title: str, count: int, renews: str | None = None) -> Callable[[Bench, Row], None]:
+    """Return the fault that kills one process with SIGKILL, and waits for as many as there were.
+
+    `renews`: another process that Serve replaces for it, later.
+    """
+
+    def fault(bench: Bench, row: Row) -> None:
+        before = wait_for(lambda: len(found := bench.pids(title)) >= count and found, f"{count} {title}")
+        renewed = bench.pids(renews) if renews else []
+        began = time.monotonic()
+        os.kill(before[-1], signal.SIGKILL)
+        wait_for(
+            lambda: len(now := bench.pids(title)) >= count and set(now) - set(before),
+            f"a new {title}",
+        )
+        row.notes.append(f"a new process after {time.monotonic() - began:.1f} s")
+        if renews is not None:
+            other = renews
+            wait_for(lambda: set(bench.pids(other)) - set(renewed), f"a new {other}")
+            row.notes.append(f"Serve's own after {time.monotonic() - began:.1f} s")
+        if "HAProxy" in f"{title}{renews}":
+            time.sleep(SETTLE_S)
+
+    return fault
+
+
+def deploy(change: Callable[[Bench], None], arrived: Callable[[Bench], Any]) -> Callable[[Bench, Row], None]:
+    """Return the fault that deploys a changed configuration, and waits until it is there."""
+
+    def fault(bench: Bench, row: Row) -> None:
+        assert bench.cluster is not None
+        kept = json.dumps(bench.cluster.configuration)
+        old = set(bench.cluster.replicas())
+        change(bench)
+        taken, said = bench.cluster.deploy()
+        if not taken:
+            row.notes.append(f"`serve deploy` refused it: {said.strip().splitlines()[-1][:200]}")
+        told = wait_for(lambda: arrived(bench), "what was deployed")
+        if isinstance(told, str):
+            row.notes.append(told[:300])
+            bench.cluster.configuration = json.loads(kept)
+            bench.cluster.deploy()
+        row.notes.append(f"{len(set(bench.cluster.replicas()) - old)} new replicas")
+
+    return fault
+
+
+def _user_config(bench: Bench) -> None:
+    assert bench.cluster is not None
+    bench.cluster.application["deployments"] = served("2")
+
+
+def served(production: str) -> list[dict[str, Any]]:
+    """Return the deployments' part of the configuration: version 1, and another one if that is the default."""
+    versions = sorted({"1", production})
+    config = {"policies": {"ur5": {"versions": versions, "aliases": {"production": production}}}}
+    return [{"name": "PolicyServer", "user_config": config}]
+
+
+def _versions(bench: Bench) -> dict[str, Any]:
+    return get(bench.server, "/v1/policies")
+
+
+def _replicas(number: int) -> Callable[[Bench], None]:
+    def change(bench: Bench) -> None:
+        assert bench.cluster is not None
+        bench.cluster.application["args"]["replicas"] = number
+
+    return change
+
+
+def _running(number: int) -> Callable[[Bench], Any]:
+    return lambda bench: bench.cluster is not None and len(bench.cluster.replicas()) == number
+
+
+def _all_new(change: Callable[[Bench], None]) -> Callable[[Bench, Row], None]:
+    old: set[str] = set()
+
+    def changed(bench: Bench) -> None:
+        assert bench.cluster is not None
+        old.clear()
+        old.update(bench.cluster.replicas())
+        change(bench)
+
+    def arrived(bench: Bench) -> bool:
+        assert bench.cluster is not None
+        now = set(bench.cluster.replicas())
+        return len(now) == len(old) and not now & old and bench.cluster.status()["status"] == "RUNNING"
+
+    return deploy(changed, arrived)
+
+
+def _variable(bench: Bench) -> None:
+    assert bench.cluster is not None
+    bench.cluster.application["runtime_env"] = {"env_vars": {"RLSERVO_RUN": secrets.token_hex(4)}}
+
+
+def _code(bench: Bench) -> None:
+    """Another module, on a path that only the changed runtime environment knows."""
+    assert bench.cluster is not None
+    home = bench.folder / "code"
+    home.mkdir(exist_ok=True)
+    (home / "changed_app.py").write_text(
+        "from rlservo.serve_app import app\n\n\ndef build(args: app.BuildArguments):\n    return app.build(args)\n"
+    )
+    bench.cluster.application["import_path"] = "changed_app:build"
+    bench.cluster.application["runtime_env"] = {"env_vars": {"PYTHONPATH": str(home)}}
+
+
+def _broken_version(bench: Bench) -> None:
+    assert bench.cluster is not None
+    bench.cluster.application["deployments"] = served("3")
+
+
+def _refused(bench: Bench) -> str | None:
+    refused = _versions(bench).get("refused")
+    return None if not refused else f"/v1/policies: {refused['reason']}"
+
+
+def _broken_code(bench: Bench) -> None:
+    assert bench.cluster is not None
+    bench.cluster.application["import_path"] = "rlservo.serve_app.app:not_there"
+
+
+def _broken_folder(bench: Bench) -> None:
+    assert bench.cluster is not None
+    bench.cluster.application["args"]["policies"] = [str(bench.folder / "nowhere")]
+
+
+def _failed(bench: Bench) -> str | None:
+    assert bench.cluster is not None
+    status = bench.cluster.status()
+    messages = [str(status.get("message", ""))]
+    messages += [str(each.get("message", "")) for each in status.get("deployments", {}).values()]
+    if status.get("status") not in ("DEPLOY_FAILED", "UNHEALTHY"):
+        return None
+    return f"{status['status']}: {' '.join(' '.join(messages).split())[-300:]}"
+
+
+def autoscale(bench: Bench, row: Row) -> None:
+    """Deploy with one to two replicas by load; the load makes two, its end one."""
+    assert bench.cluster is not None
+    bench.cluster.application["deployments"] = [
+        {
+            **served("1")[0],
+            "autoscaling_config": {
+                "min_replicas": 1,
+                "max_replicas": 2,
+                "upscale_delay_s": 2,
+                "downscale_delay_s": 5,
+                "metrics_interval_s": 1,
+                "look_back_period_s": 3,
+                "policy": {"policy_function": "rlservo.serve_app.scaling:by_load"},
+            },
+        }
+    ]
+    bench.cluster.application["args"]["replicas"] = 1
+    began = time.monotonic()
+    taken, said = bench.cluster.deploy()
+    if not taken:
+        row.broken.append(said.strip().splitlines()[-1])
+    wait_for(lambda: _running(1)(bench), "one replica")
+    row.notes.append(f"1 replica after {time.monotonic() - began:.0f} s")
+    kind = askers(bench.case, bench.server)["json batch"]
+    with Crowd({f"busy {number}": kind for number in range(6)}, pause_s=0.0) as busy:
+        began = time.monotonic()
+        wait_for(lambda: _running(2)(bench), "a second replica")
+        row.notes.append(f"2 under load after {time.monotonic() - began:.0f} s")
+        time.sleep(3)
+    add(row, busy, began)
+    began = time.monotonic()
+    wait_for(lambda: _running(1)(bench), "one replica less")
+    row.notes.append(f"1 again after {time.monotonic() - began:.0f} s")
+
+
+def old_streams(bench: Bench, row: Row) -> None:
+    """Kill a replica, so that HAProxy is replaced; the other's streams stay on the old one, and outlive Ray's limit."""
+    with ExitStack() as cleanup:
+        streams = [open_stream(bench.server) for _ in range(4)]
+        for stream in streams:
+            cleanup.callback(stream.close)
+        kill("ray::ServeReplica", REPLICAS)(bench, row)
+        began, left = time.monotonic(), [stream for stream in streams if _answers(stream)]
+        while time.monotonic() < began + OLD_STREAM_S:
+            time.sleep(5)  # uvicorn pings, and closes streams that do not answer
+            left = [stream for stream in left if _answers(stream)]
+        row.notes.append(f"{len(left)} of {len(streams)} streams still answered {OLD_STREAM_S:g} s later")
+        if not left:
+            row.broken.append("no stream outlived HAProxy's replacement")
+
+
+def _answers(stream: WebSocketLine) -> bool:
+    try:
+        stream()
+    except (LoadError, OSError):
+        return False
+    return True
+
+
+def overload(bench: Bench, row: Row) -> None:
+    """512 connections at once (`flood.py`)."""
+    replicas = bench.pids("ServeReplica")
+    found = flood(bench.server.port, bench.case, replicas)
+    row.asked += found.asked
+    row.wrong += len(found.wrong)
+    row.notes.append(found.sentence())
+    row.broken += found.wrong[:3] + found.broken
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault, and what it may cost."""
+
+    do: Callable[[Bench, Row], None]
+    free: bool = True  # nobody fails twice
+    smooth: bool = False  # nobody fails at all
+    only_on: str | None = None
+    pause_s: float = PAUSE_S
+
+
+REPLICAS = 2
+FAULTS = {
+    "replica": Fault(kill("ray::ServeReplica", REPLICAS)),
+    "haproxy": Fault(kill("/haproxy", 1, "ray::HAProxyManager"), free=False),
+    "proxy-manager": Fault(kill("ray::HAProxyManager", 1), free=False),
+    "proxy-actor": Fault(kill("ray::ProxyActor", 1)),
+    "controller": Fault(kill("ray::ServeController", 1), smooth=True),
+    "old-streams": Fault(old_streams),
+    "overload": Fault(overload, free=False),
+    "user-config": Fault(
+        deploy(_user_config, lambda bench: _versions(bench)["policies"][-1]["version"] == "2"),
+        smooth=True,
+        only_on="cluster",
+    ),
+    "broken-version": Fault(deploy(_broken_version, _refused), smooth=True, only_on="cluster"),
+    "broken-code": Fault(deploy(_broken_code, _failed), smooth=True, only_on="cluster"),
+    "broken-folder": Fault(deploy(_broken_folder, _failed), smooth=True, only_on="cluster"),
+    "more-replicas": Fault(deploy(_replicas(3), _running(3)), smooth=True, only_on="cluster"),
+    "fewer-replicas": Fault(deploy(_replicas(REPLICAS), _running(REPLICAS)), smooth=True, only_on="cluster"),
+    "variable": Fault(_all_new(_variable), smooth=True, only_on="cluster"),
+    "code": Fault(_all_new(_code), smooth=True, only_on="cluster"),
+    "autoscale": Fault(autoscale, smooth=True, only_on="cluster", pause_s=0.25),
+}
+
+
+def main() -> None:
+    arguments = parse()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the server is ended then, too
+    console = Console(highlight=False, width=200)
+    rows: list[Row] = []
+    with ExitStack() as cleanup:
+        folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="rlsf-", ignore_cleanup_errors=True)))
+        policies = shutil.copytree(exported(arguments.keep, folder, console), folder / "served")
+        case = case_of(policies / "ur5" / "1", Path())
+        try:
+            bench = cleanup.enter_context(serving(arguments.on, case, policies, folder, console))
+            for name in arguments.faults:
+                console.print(f"{name} ...")
+                rows.append(undergo(name, FAULTS[name], bench))
+                tell(rows[-1], console)
+        except StartError as error:
+            raise SystemExit(str(error)) from None
+        finally:
+            console.print("stopping the server ...")
+    console.print(table(rows))
+    OUT.mkdir(exist_ok=True)
+    (OUT / f"faults-{arguments.on}.json").write_text(json.dumps([vars(row) for row in rows], indent=1) + "\n")
+    sys.exit(1 if any(row.broken for row in rows) else 0)
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--on", choices=("serve", "cluster"), default="serve")
+    parser.add_argument("--keep", type=Path, help="a folder for the exported policies, to be used again")
+    parser.add_argument("faults", nargs="*", metavar="FAULT", help=f"default: all. {', '.join(FAULTS)}")
+    arguments = parser.parse_args()
+    if unknown := [name for name in arguments.faults if name not in FAULTS]:
+        parser.error(f"unknown fault {unknown[0]!r}: known are {', '.join(FAULTS)}")
+    possible = [name for name, fault in FAULTS.items() if fault.only_on in (None, arguments.on)]
+    if impossible := [name for name in arguments.faults if name not in possible]:
+        parser.error(f"{impossible[0]!r} needs --on {FAULTS[impossible[0]].only_on}")
+    arguments.faults = arguments.faults or possible
+    return arguments
+
+
+def exported(keep: Path | None, folder: Path, console: Console) -> Path:
+    """Return the repository, exported now unless it was kept."""
+    root = (keep or folder / "policies").absolute()
+    if not root.exists():
+        export(root, console)
+    return root
+
+
+def export(root: Path, console: Console) -> None:
+    """Make a repository: both policies in version 1, ur5 in 2 as well, and in 3 with a byte of its weights changed."""
+    console.print("exporting the shipped checkpoints ...")
+    for name in (*SHIPPED, "ur5", "ur5"):
+        command = [sys.executable, "-m", "rlservo.deploy.cli", "export", str(SHIPPED[name])]
+        done = subprocess.run([*command, "--out", str(root), "--name", name], capture_output=True, text=True)
+        if done.returncode != 0:
+            raise SystemExit(f"the shipped checkpoint could not be exported:\n{done.stderr[-2000:]}")
+    weights = root / "ur5" / "3" / ONNX_FILE
+    content = bytearray(weights.read_bytes())
+    content[len(content) // 2] ^= 1
+    weights.write_bytes(content)
+
+
+@contextmanager
+def serving(on: str, case: Case, policies: Path, folder: Path, console: Console) -> Iterator[Bench]:
+    """Start the server, and give it when all of its replicas answer."""
+    console.print("starting the server ...")
+    mark, lstm = secrets.token_hex(8), policies / "sparse" / "1"
+    if on == "serve":
+        server = rlservo(case, folder, replicas=REPLICAS)
+        server.command[server.command.index("serve") + 1] = str(policies)
+        shutil.rmtree(policies / "ur5" / "3")  # whoever starts with a damaged version does not start
+        with running(server, folder, mark):
+            bench = Bench(case, lstm, server, None, folder, console)
+            wait_for(lambda: len(bench.pids("ray::ServeReplica")) == REPLICAS, "the replicas")
+            time.sleep(CALM_S)  # Serve replaces HAProxy for each
+            yield bench
+        return
+    made = cluster(case, policies, folder)
+    made.application["args"]["replicas"] = REPLICAS
+    made.application["deployments"] = served("1")
+    with started(made.server, folder, mark) as log:
+        wait_for(lambda: _listening(made), "the cluster")
+        began = time.monotonic()
+        taken, said = made.deploy()
+        if not taken:
+            raise StartError(f"`serve deploy` failed: {said[-1000:]}")
+        wait_until_answering(made.server, log)
+        console.print(f"first deployment: answering {time.monotonic() - began:.0f} s after `serve deploy` was called")
+        wait_for(lambda: len(made.replicas()) == REPLICAS, "the replicas")
+        time.sleep(CALM_S)
+        yield Bench(case, lstm, made.server, made, folder, console)
+
+
+def _listening(made: Cluster) -> bool:
+    with suppress(OSError, ValueError, KeyError):
+        made.status()
+        return True
+    return False
+
+
+def undergo(name: str, fault: Fault, bench: Bench) -> Row:
+    """Let a crowd ask, do the harm, wait until nobody has failed for a while, and count."""
+    row = Row(name, free=fault.free, smooth=fault.smooth)
+    with bench.crowd(fault.pause_s) as crowd:
+        time.sleep(BEFORE_S)
+        began = time.monotonic()
+        try:
+            fault.do(bench, row)
+        except TimeoutError as error:
+            row.broken.append(str(error))
+        while time.monotonic() < began + BOUND_S and time.monotonic() < max(crowd.last_failure(), began) + CALM_S:
+            time.sleep(0.1)
+    add(row, crowd, began)
+    if crowd.last_failure() > time.monotonic() - CALM_S / 2:
+        row.broken.append("it did not recover")
+    if fault.smooth and row.first:
+        row.broken.append("a request failed")
+    if fault.free and row.twice:
+        row.broken.append("a client failed twice")
+    return row
+
+
+def add(row: Row, crowd: Crowd, began: float) -> None:
+    """Count what a crowd saw."""
+    kinds: Counter[str] = Counter(row.kinds)
+    for name, seen in crowd.seen.items():
+        row.asked += seen.asked
+        row.told += seen.told
+        row.first += len(seen.first)
+        row.twice += len(seen.twice)
+        row.wrong += len(seen.wrong)
+        row.over_s = max(row.over_s, seen.first[-1][0] - began if seen.first else 0.0)
+        kinds.update(f"{name}: {what[:150]}" for _, what in seen.first)
+        row.broken += [f"{name}: {what}" for what in seen.wrong[:2]]
+        row.broken += [f"{name} was shown: {what}" for _, what in seen.first if any(part in what for part in INSIDES)]
+        row.notes += [f"{name} asked {seen.asked}, {len(seen.first)}/{len(seen.twice)}"] if seen.first else []
+    row.kinds = dict(kinds.most_common(12))
+
+
+def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = COME_S) -> Any:
+    """Return what the condition tells when that is true. Raises TimeoutError."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        with suppress(OSError, KeyError, ValueError, IndexError):
+            if found := condition():
+                return found
+        time.sleep(0.25)
+    raise TimeoutError(f"{what} did not come within {timeout_s:g} s")
+
+
+def get(server: Server, path: str) -> dict[str, Any]:
+    from http.client import HTTPConnection
+
+    connection = HTTPConnection("127.0.0.1", server.port, timeout=10)
+    try:
+        connection.request("GET", path)
+        document: dict[str, Any] = json.loads(connection.getresponse().read())
+    finally:
+        connection.close()
+    return document
+
+
+def tell(row: Row, console: Console) -> None:
+    for note in row.notes:
+        console.print(f"  {note}", markup=False)
+    for kind, times in row.kinds.items():
+        console.print(f"  {times} x {kind}", markup=False)
+    for reason in row.broken:
+        console.print(f"  BROKEN: {reason}", markup=False, style="red")
+
+
+def table(rows: list[Row]) -> Table:
+    found = Table("fault", "asked", "first try failed", "retry failed", "wrong", "told", "over after s", "holds")
+    for row in rows:
+        cells = (row.asked, row.first, row.twice, row.wrong, row.told, f"{row.over_s:.1f}", not row.broken)
+        found.add_row(row.fault, *map(str, cells))
+    return found
+
+
+if __name__ == "__main__":
+    main()

