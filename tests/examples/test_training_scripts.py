@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SCRIPTS = ("training_inference_ur.py", "training_inference_mir.py")
 
 
@@ -53,3 +56,25 @@ def test_help_lists_robo_gyms_arguments(script: str, run_script: Any, tmp_path: 
         "--explore-during-inference", "--num-episodes-during-inference",
     ):  # fmt: skip
         assert argument in done.out
+
+
+@pytest.mark.parametrize(
+    ("script", "task", "policy"),
+    [
+        ("training_inference_ur", "TASK", "ur5_positioning"),
+        ("training_inference_mir", "NAVIGATION", "mir100_navigation"),
+    ],
+)
+def test_scripts_train_with_the_settings_beside_the_policy_that_ships(
+    script: str, task: str, policy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    common = importlib.import_module("training_inference")
+    chosen = getattr(importlib.import_module(script), task)
+    args = common.argument_parser(chosen, "").parse_args([])
+    settings = yaml.safe_load((EXAMPLES / "checkpoints" / policy / "training.yaml").read_text())
+    config = common.algorithm_config(chosen, args, 2)
+    assert (config.env, config.env_config, config.seed) == (settings["env"], settings["env_config"], settings["seed"])
+    assert {name: getattr(config, name) for name in settings["training"]} == settings["training"]
+    assert {name: getattr(config._model_config, name) for name in settings["model"]} == settings["model"]
+    assert (args.stop_timesteps, args.stop_reward) == (settings["stop"]["env_steps"], settings["stop"]["value"])
