@@ -169,9 +169,10 @@ def ray_session(
             take_sigterm()  # Ray has set a handler of its own
             yield
         finally:
-            ray.shutdown()
-            if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)
+            with _undisturbed():
+                ray.shutdown()
+                if folder is not None:
+                    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _start(folder: str, num_cpus: int, num_gpus: float, quiet: Mapping[str, Any], attempts: int = 3) -> None:
@@ -232,6 +233,17 @@ def _sigterm_as_ctrl_c() -> Iterator[Callable[[], None]]:
         yield take
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Let no second Ctrl-C leave Ray's processes and folder behind."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
 @contextlib.contextmanager
@@ -332,13 +344,7 @@ def train(
 ) -> Outcome:
     """Train until one of the stop criteria holds (Ray must be running); see `resume` for what is raised."""
     name = f"{run.algorithm}-{run.env_id.split('/')[-1].split(':')[-1]}-{time.strftime('%Y%m%d-%H%M%S')}"
-    folder = storage.expanduser().resolve() / name
-    while folder.exists():
-        folder = folder.with_name(f"{folder.name}-{secrets.token_hex(2)}")
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
+    folder = _new_folder(storage, name)
     (folder / RUN_FILE).write_text(json.dumps(asdict(run) | {"swept": list(swept)}, indent=2) + "\n")
     print(f"run: {folder}\ncurves: tensorboard --logdir {folder}\nCtrl-C stops; --resume {folder} goes on", flush=True)
     tuner = tune.Tuner(
@@ -370,6 +376,20 @@ def train(
         ),
     )
     return _fit(tuner, folder, run, swept)
+
+
+def _new_folder(storage: Path, name: str) -> Path:
+    """Make a folder of this name, or a longer one: jobs of an array begin in the same second."""
+    folder = storage.expanduser().resolve() / name
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir()
+                return folder
+            folder = folder.with_name(f"{name}-{secrets.token_hex(2)}")
+    except OSError as error:
+        raise UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
 
 
 def _trial_name(trial: Any) -> str:
