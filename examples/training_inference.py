@@ -150,6 +150,7 @@ def run(task: Task, parser: argparse.ArgumentParser) -> None:
         with training_run.ray_session(num_cpus=described.num_cpus, num_gpus=described.num_gpus):
             outcome = training_run.resume(args.resume)
     else:
+        training_run.check_storage(args.storage)
         described = Run(
             args.run,
             task.env_id,

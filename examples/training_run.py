@@ -20,6 +20,7 @@ import re
 import secrets
 import shutil
 import signal
+import socket
 import sys
 import tempfile
 import time
@@ -196,7 +197,10 @@ def _start(folder: str, num_cpus: int, num_gpus: float, quiet: Mapping[str, Any]
 
 
 def _join(address: str, quiet: Mapping[str, Any]) -> None:
+    host, colon, port = address.rpartition(":")
     try:
+        if colon and "/" not in address:  # Ray itself tries for minutes
+            socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
         ray.init(address, **quiet)
     except Exception as error:  # Ray's own tree, RuntimeError, ConnectionError, ValueError: all say the same
         raise UsageError(
@@ -378,11 +382,25 @@ def train(
     return _fit(tuner, folder, run, swept)
 
 
+def check_storage(storage: Path) -> None:
+    """Raise UsageError when no folder can be made in `storage`: better now than when Ray has started."""
+    try:
+        with tempfile.TemporaryDirectory(dir=_made(storage)):
+            pass
+    except OSError as error:
+        raise UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
+
+
+def _made(storage: Path) -> Path:
+    folder = storage.expanduser().resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def _new_folder(storage: Path, name: str) -> Path:
     """Make a folder of this name, or a longer one: jobs of an array begin in the same second."""
-    folder = storage.expanduser().resolve() / name
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder = _made(storage) / name
         while True:
             with contextlib.suppress(FileExistsError):
                 folder.mkdir()
@@ -435,6 +453,8 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
         results = tuner.fit()
     except KeyboardInterrupt:
         raise Interrupted(folder) from None
+    except Exception as error:  # before a trial has begun, or Tune's own; a trial's are in the results
+        raise RlservoError(f"training failed: {_cause(error)}") from error
     trials, failed, unfinished = [], [], False
     for result in (results[index] for index in range(len(results))):
         if result.error is not None:
