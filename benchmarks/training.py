@@ -104,17 +104,23 @@ def main() -> None:
     print(f"PPO on {args.env}, {args.batch:,} steps an iteration, median of {args.iterations}\n{HEADER}", flush=True)
     until = time.monotonic() + 60.0 * args.minutes
     with training_run.ray_session(num_cpus=max(args.runners) + 1):
+        warm_up()
         configurations = list(itertools.product(args.runners, args.envs))
         for done, (runners, envs) in enumerate(configurations):
             limit = max(1.0, (until - time.monotonic()) / (len(configurations) - done))
             rows.append(measure(args.env, runners, envs, args.iterations, args.batch, limit))
             print(line(rows[-1]), flush=True)
-            document = {"env": args.env, "batch": args.batch, "rows": [asdict(row) for row in rows]}
-            (args.out / "training.json").write_text(json.dumps(document, indent=2) + "\n")
-            plot([row for row in rows if isinstance(row, Row)], args.env, args.out / "training.png")
+            write(rows, args.env, args.batch, args.out)
     print(f"written: {args.out / 'training.json'}, {args.out / 'training.png'}")
     if all(isinstance(row, Failed) for row in rows):
         raise RlservoError("no configuration finished an iteration in time: give more with --minutes")
+
+
+def warm_up() -> None:
+    """Train once: an import on first use that the time limit cut off would break everything after it."""
+    config = configuration("CartPole-v1", 0, 1, MINIBATCH)
+    with training_run.built(config.build_algo()) as algorithm:
+        algorithm.train()
 
 
 class TimeLimit:
@@ -167,7 +173,7 @@ def measure(env: str, runners: int, envs: int, iterations: int, batch: int, limi
         if not time_limit.up:  # Ray's `wait` makes a SystemError of TimeUp
             return Failed(runners, envs, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
     if not taken:
-        return Failed(runners, envs, f"no iteration ended within {limit:.0f} s")
+        return Failed(runners, envs, f"no iteration ended within {limit:.3g} s")
     medians = [statistics.median(getattr(one, name) for one in taken) for name in Iteration.__dataclass_fields__]
     return Row(runners, envs, len(taken), *medians)
 
@@ -241,6 +247,13 @@ def parts(result: dict[str, Any]) -> tuple[float, float, float]:
     )
     simulators, network, pipelines = (seconds / sum(each) for seconds in each)
     return simulators, network, pipelines
+
+
+def write(rows: list[Row | Failed], env: str, batch: int, out: Path) -> None:
+    """Write what has been measured so far."""
+    document = {"env": env, "batch": batch, "rows": [asdict(row) for row in rows]}
+    (out / "training.json").write_text(json.dumps(document, indent=2) + "\n")
+    plot([row for row in rows if isinstance(row, Row)], env, out / "training.png")
 
 
 def plot(rows: list[Row], env: str, path: Path) -> None:

@@ -174,6 +174,8 @@ def check_arguments(parser: argparse.ArgumentParser, args: argparse.Namespace) -
     for name in ("num_gpus_per_learner", "max_concurrent_trials"):
         if getattr(args, name) is not None and getattr(args, name) < (name != "num_gpus_per_learner"):
             parser.error(f"--{name.replace('_', '-')} is {getattr(args, name)}: expected more")
+    if args.run == "SAC" and args.use_lstm:
+        parser.error("--use-lstm: RLlib's SAC fails with a recurrent network (ray 2.60); use PPO, APPO, IMPALA or DQN")
     if args.num_gpus and args.num_gpus_per_learner is not None:
         parser.error("give either --num-gpus (for all learners) or --num-gpus-per-learner")
     if args.restart_failed_env_runners and args.ignore_env_runner_failures:
@@ -277,7 +279,7 @@ def algorithm_config(
     if args.run in ("DQN", "SAC"):
         # By default a result comes every second, however slow the machine: then --stop-iters means nothing.
         config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=1000)
-    if args.run in ("DQN", "SAC") and args.use_lstm:
+    if args.run == "DQN" and args.use_lstm:
         cast(Any, config).training(
             replay_buffer_config={"type": "EpisodeReplayBuffer"}
         )  # the prioritised one has no sequences

@@ -547,10 +547,12 @@ def report(outcome: Outcome, run: Run) -> None:
         ]
         for trial in outcome.trials
     ]
-    table = Table(*columns, title=f"{run.metric}, the best first", title_justify="left")
+    table = Table(title=f"{run.metric}, the best first", title_justify="left")
+    for column in columns:
+        table.add_column(column, overflow="fold")
     for row in rows:
         table.add_row(*row)
-    Console(width=max(100, _out.width), highlight=False).print(table)
+    Console(width=max(100, _out.width) if _out.is_terminal else 200, highlight=False).print(table)
     with (outcome.folder / "results.csv").open("w", newline="") as file:
         csv.writer(file).writerows([columns, *rows])
     picture = plot_curves(outcome, run)

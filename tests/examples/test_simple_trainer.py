@@ -112,6 +112,10 @@ WRONG: list[tuple[str, str]] = [
     ),
     ("--storage /dev/null/runs", "--storage /dev/null/runs: cannot be written: Not a directory"),
     ("--address 127.0.0.1:1", "no Ray cluster answers there .*Connection refused.* start one with 'ray start --head'"),
+    (
+        "--run SAC --use-lstm --name-env Pendulum-v1",
+        "SAC fails with a recurrent network .* use PPO, APPO",
+    ),
     ("--run foo", "--run foo: expected one of PPO, APPO"),
     ("--run DQN --name-env rlservo/NoObstacleNavigationMir100Sim-v0", "use --run PPO, APPO, IMPALA or SAC$"),
     ("--sweep num_workers=3", "use --num-cpus instead"),
