@@ -236,13 +236,6 @@ def session_cores(run: Run) -> int:
     return run.num_cpus * max(1, (os.cpu_count() or 1) // run.num_cpus)
 
 
-def local_gpus() -> float:
-    """Return how many GPUs torch sees here."""
-    import torch
-
-    return float(torch.cuda.device_count()) if torch.cuda.is_available() else 0.0
-
-
 def algorithm_config(
     args: argparse.Namespace, spaces: tuple[Any, Any], env_config: Mapping[str, Any]
 ) -> AlgorithmConfig:
@@ -426,7 +419,7 @@ def main() -> None:
     else:
         sys.path.insert(0, str(args.app_dir.resolve()))
         if args.address is None:
-            gpus = local_gpus() if gpus_needed(args) else 0.0
+            gpus = training_run.local_gpus() if gpus_needed(args) else 0.0
             check_machine(args, os.cpu_count() or 1, gpus, "this machine", joined=False)
         training_run.check_storage(args.storage)
         config, run, swept = set_up(args)

@@ -66,8 +66,11 @@ def main() -> None:
     training_run.pickle_by_value(sys.modules[__name__])
     settings = Settings(args.out.resolve(), args.quick, not args.no_video)
     settings.out.mkdir(parents=True, exist_ok=True)
-    for stop in args.stops or stops:
-        stops[stop](settings)
+    try:
+        for stop in args.stops or stops:
+            stops[stop](settings)
+    except training_run.Interrupted:
+        raise KeyboardInterrupt from None  # a tour begins anew
 
 
 def heading(text: str) -> None:
@@ -180,6 +183,7 @@ def cartpole(settings: Settings) -> None:
             storage=settings.out / "runs",
             stop={RETURN: 400, STEPS: 60_000, "training_iteration": 2 if settings.quick else 40},
             checkpoint_frequency=1,
+            resumable=False,
         )
         training_run.report(outcome, run)
         checkpoint = training_run.best_checkpoint_of(outcome)

@@ -93,10 +93,16 @@ def check_arguments(parser: argparse.ArgumentParser, args: argparse.Namespace) -
     for name in ("stop_iters", "stop_timesteps", "num_envs_per_env_runner", "checkpoint_frequency"):
         if getattr(args, name) < 1:
             parser.error(f"--{name.replace('_', '-')} is {getattr(args, name)}: expected at least 1")
-    for name in ("num_cpus", "num_episodes_during_inference"):
+    for name in ("num_cpus", "num_episodes_during_inference", "seed"):
         if getattr(args, name) < 0:
             parser.error(f"--{name.replace('_', '-')} is {getattr(args, name)}: expected 0 or more")
-    gpus_asked_for(parser)
+    if args.num_cpus > max(2, cores := os.cpu_count() or 1):
+        parser.error(f"--num-cpus is {args.num_cpus}: this machine has {cores}; 0 is all of them")
+    if (gpus := gpus_asked_for(parser)) > 0 and gpus > training_run.local_gpus():
+        parser.error(
+            f"RLLIB_NUM_GPUS is {gpus:g}: this machine has {training_run.local_gpus():g} GPUs that torch can use; "
+            "unset it to learn on the CPU"
+        )
 
 
 def gpus_asked_for(parser: argparse.ArgumentParser) -> float:

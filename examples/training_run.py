@@ -214,6 +214,13 @@ def cores() -> int:
     return int(ray.cluster_resources().get("CPU", 0))
 
 
+def local_gpus() -> float:
+    """Return how many GPUs torch sees here."""
+    import torch
+
+    return float(torch.cuda.device_count()) if torch.cuda.is_available() else 0.0
+
+
 def gpus() -> float:
     """Return how many GPUs the running Ray has."""
     return float(ray.cluster_resources().get("GPU", 0.0))
@@ -345,12 +352,17 @@ def train(
     max_concurrent: int | None = None,
     max_failures: int = 0,
     swept: Sequence[str] = (),
+    resumable: bool = True,
 ) -> Outcome:
-    """Train until one of the stop criteria holds (Ray must be running); see `resume` for what is raised."""
+    """Train until one of the stop criteria holds (Ray must be running); see `resume` for what is raised.
+
+    `resumable` is whether the script has a `--resume`, which it then tells of.
+    """
     name = f"{run.algorithm}-{run.env_id.split('/')[-1].split(':')[-1]}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder = _new_folder(storage, name)
     (folder / RUN_FILE).write_text(json.dumps(asdict(run) | {"swept": list(swept)}, indent=2) + "\n")
-    print(f"run: {folder}\ncurves: tensorboard --logdir {folder}\nCtrl-C stops; --resume {folder} goes on", flush=True)
+    print(f"run: {folder}\ncurves: tensorboard --logdir {folder}", flush=True)
+    print("Ctrl-C stops" + (f"; --resume {folder} goes on" if resumable else ""), flush=True)
     tuner = tune.Tuner(
         run.algorithm,
         param_space=cast(Any, config),  # Tune takes an AlgorithmConfig, its annotation says dict

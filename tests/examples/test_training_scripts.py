@@ -38,6 +38,9 @@ def test_wrong_arguments_are_refused_in_a_sentence(script: str, refusals: Callab
         "--run A3C": "--run A3C: expected one of PPO",
         "--stop-iters 0": "--stop-iters is 0: expected at least 1",
         "--num-cpus -1": "--num-cpus is -1: expected 0 or more",
+        "--num-cpus 3500": "--num-cpus is 3500: this machine has .*; 0 is all of them",
+        "--seed -1": "--seed is -1: expected 0 or more",
+        "--storage /dev/null/runs": "--storage /dev/null/runs: cannot be written: Not a directory",
         "--resume .": "not the folder of a run",
     }
     arguments = [one.split() for one in wrong]
@@ -45,6 +48,16 @@ def test_wrong_arguments_are_refused_in_a_sentence(script: str, refusals: Callab
         assert ended.code == 2
         assert re.search(sentence, ended.err.strip().splitlines()[-1])
         assert "Traceback" not in ended.err
+
+
+@pytest.mark.slow
+def test_more_gpus_than_there_are_are_refused_before_anything_starts(
+    refusals: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RLLIB_NUM_GPUS", "64")
+    (ended,) = refusals("training_inference_ur", [[]])
+    assert ended.code == 2
+    assert re.search(r"RLLIB_NUM_GPUS is 64: this machine has \d+ GPUs", ended.err.strip().splitlines()[-1])
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
