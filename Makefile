@@ -19,9 +19,11 @@ check: setup  ## Lint, format and types, as CI runs them
 	$(BIN)/mypy
 	$(BIN)/pyright
 
-bench: setup  ## Simulator, export and serving speed, printed and written to bench/
+bench: setup  ## Simulator, training, export and serving speed, printed and written to bench/
 	$(BIN)/python benchmarks/simulators.py
 	$(BIN)/python benchmarks/robot_server.py
+	$(BIN)/python benchmarks/vectorisation.py --quick
+	$(BIN)/python benchmarks/training.py --quick
 	$(BIN)/python benchmarks/export_policy.py
 	$(BIN)/python benchmarks/serving.py
 

@@ -1,130 +1,231 @@
 """How fast training goes, and where its time goes: env runners x environments each, the learner included.
 
-    python benchmarks/training.py                 # 1 and 2 runners, 1 to 16 environments, UR5
+    python benchmarks/training.py            # 1 and 2 runners, 1, 4 and 16 environments, UR5; ten minutes or so
+    python benchmarks/training.py --quick    # the same with small batches, at most 3 minutes
     python benchmarks/training.py --env CartPole-v1 --iterations 5
 
-Prints a table and writes `bench/training.json` and `bench/training.png`. Each row is the median of `--iterations`
-iterations after one of warm-up: PPO as the UR5 script trains it, a batch of `--batch` steps, 4 epochs. `--vectorised`
-measures the same with Gymnasium's AsyncVectorEnv (a process per simulator), and MuJoCo alone: stepping substep by
-substep (as our simulators do), in one call, and many robots on MuJoCo's own threads (`mujoco.rollout`).
+PPO as the UR5 script trains it: a batch of `--batch` steps, 4 epochs. A row is the median of `--iterations` iterations
+after one of warm-up. `--minutes` are divided among the configurations: one whose time is up keeps the iterations it has
+finished, or is written down as failed, and the next one is measured. Table and plot (`bench/training.json`, `.png`) are
+written after each row. `vectorisation.py` compares ways to step several simulators in one process.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import os
+import signal
 import statistics
 import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 
 import training_run
 
+from rlservo.export.errors import RlservoError
+
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
+
+
+MINIBATCH = 512
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """The shares are of a runner's own time, by RLlib's timers, which are smoothed."""
+
+    steps_per_s: float
+    steps_per_cpu_s: float  # of the driver's and the runners' processor time, which a busy machine leaves comparable
+    iteration_s: float
+    sample_s: float  # waiting for the runners
+    learn_s: float
+    rest_s: float  # sending weights, results, evaluation
+    env_step_share: float  # of a runner's sampling: the simulators
+    inference_share: float  # the network
+    connectors_share: float  # RLlib's pipelines before and after the network
 
 
 @dataclass(frozen=True)
 class Row:
-    """One configuration's medians per iteration; the parts of a runner are its means, and fit into `sample_s`."""
+    """A configuration's medians over so many iterations."""
 
     runners: int
     envs: int
-    vectorize: str
+    iterations: int
     steps_per_s: float
-    steps_per_cpu_s: (
-        float  # the driver's and the runners' processor time together: what a busy machine leaves comparable
-    )
+    steps_per_cpu_s: float
     iteration_s: float
-    sample_s: float  # waiting for the runners (RLlib's own timer, smoothed over iterations, as the next ones)
+    sample_s: float
     learn_s: float
-    rest_s: float  # sending weights and filters, results, evaluation
-    env_step_share: float  # of a runner's sampling: the simulators
-    inference_share: float  # the network
-    connectors_share: float  # RLlib's pipelines before and after the network
+    rest_s: float
+    env_step_share: float
+    inference_share: float
+    connectors_share: float
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A configuration that gave no figures."""
+
+    runners: int
+    envs: int
+    reason: str
+
+
+class TimeUp(Exception):
+    """A configuration took longer than it may."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default=UR5)
     parser.add_argument("--runners", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--envs", type=int, nargs="+", default=[1, 2, 4, 8, 16])
-    parser.add_argument("--iterations", type=int, default=3)
-    parser.add_argument("--batch", type=int, default=4096, help="environment steps an iteration")
-    parser.add_argument("--vectorised", action="store_true", help="also the other ways to step several simulators")
+    parser.add_argument("--envs", type=int, nargs="+", default=[1, 4, 16])
+    parser.add_argument("--iterations", type=int, help="default: 3; with --quick 2")
+    parser.add_argument("--batch", type=int, help="environment steps an iteration; default: 4096; with --quick 1024")
+    parser.add_argument("--minutes", type=float, help="for all of it; default: 15; with --quick 3")
+    parser.add_argument("--quick", action="store_true", help="small batches")
     parser.add_argument("--out", type=Path, default=Path("bench"))
     args = parser.parse_args()
+    for name, default, quick in (("iterations", 3, 2), ("batch", 4096, 1024), ("minutes", 15.0, 3.0)):
+        if getattr(args, name) is None:
+            setattr(args, name, quick if args.quick else default)
+    if min(*args.runners, *args.envs, args.iterations, args.minutes) <= 0 or args.batch < MINIBATCH:
+        parser.error(f"expected positive numbers, and a --batch of at least {MINIBATCH}")
     args.out.mkdir(parents=True, exist_ok=True)
-    rows: list[Row] = []
-    print(f"PPO on {args.env}, {args.batch:,} steps an iteration, median of {args.iterations}\n{HEADER}")
+    os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 would measure the machine's other work
+    rows: list[Row | Failed] = []
+    print(f"PPO on {args.env}, {args.batch:,} steps an iteration, median of {args.iterations}\n{HEADER}", flush=True)
+    until = time.monotonic() + 60.0 * args.minutes
     with training_run.ray_session(num_cpus=max(args.runners) + 1):
-        for runners in args.runners:
-            for envs in args.envs:
-                rows.append(measure(args.env, runners, envs, "sync", args.iterations, args.batch))
-                print(line(rows[-1]), flush=True)
-        if args.vectorised:
-            rows.append(measure(args.env, 1, 2, "async", args.iterations, args.batch))
+        warm_up()
+        configurations = list(itertools.product(args.runners, args.envs))
+        for done, (runners, envs) in enumerate(configurations):
+            limit = max(1.0, (until - time.monotonic()) / (len(configurations) - done))
+            rows.append(measure(args.env, runners, envs, args.iterations, args.batch, limit))
             print(line(rows[-1]), flush=True)
-    physics = measure_physics() if args.vectorised else []
-    for name, rate in physics:
-        print(f"{name:52} {rate:>10,.0f} substeps/s")
-    document = {"env": args.env, "rows": [asdict(row) for row in rows], "physics": dict(physics)}
-    (args.out / "training.json").write_text(json.dumps(document, indent=2) + "\n")
-    plot(rows, args.env, args.out / "training.png")
+            write(rows, args.env, args.batch, args.out)
     print(f"written: {args.out / 'training.json'}, {args.out / 'training.png'}")
+    if all(isinstance(row, Failed) for row in rows):
+        raise RlservoError("no configuration finished an iteration in time: give more with --minutes")
+
+
+def warm_up() -> None:
+    """Train once: an import on first use that the time limit cut off would break everything after it."""
+    config = configuration("CartPole-v1", 0, 1, MINIBATCH)
+    with training_run.built(config.build_algo()) as algorithm:
+        algorithm.train()
+
+
+class TimeLimit:
+    """Raises TimeUp in the block when the time is up: Ray's calls look for signals while they wait."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self.up = False
+
+    def __enter__(self) -> TimeLimit:
+        self._before = signal.signal(signal.SIGALRM, self._on_alarm)
+        signal.setitimer(signal.ITIMER_REAL, self.seconds)
+        return self
+
+    def _on_alarm(self, *_: Any) -> None:
+        self.up = True
+        raise TimeUp
+
+    def __exit__(self, *_: object) -> None:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, self._before)
 
 
 COLUMNS = ("runners x envs", "steps/s", "per CPU s", "iteration", "sampling", "learning", "rest")
 HEADER = " ".join(f"{column:>14}" for column in COLUMNS) + "   of sampling: env, network, connectors"
 
 
-def line(row: Row) -> str:
-    name = f"{row.runners} x {row.envs}" + (f" {row.vectorize}" if row.vectorize != "sync" else "")
+def line(row: Row | Failed) -> str:
+    name = f"{row.runners} x {row.envs}"
+    if isinstance(row, Failed):
+        return f"{name:>14} {row.reason}"
     seconds = (row.iteration_s, row.sample_s, row.learn_s, row.rest_s)
     cells = [name, f"{row.steps_per_s:,.0f}", f"{row.steps_per_cpu_s:,.0f}", *(f"{one:.2f} s" for one in seconds)]
     shares = f"{row.env_step_share:.0%}, {row.inference_share:.0%}, {row.connectors_share:.0%}"
-    return " ".join(f"{cell:>14}" for cell in cells) + f"   {shares}"
+    few = "" if row.iterations > 1 else "   (one iteration only)"
+    return " ".join(f"{cell:>14}" for cell in cells) + f"   {shares}{few}"
 
 
-def measure(env: str, runners: int, envs: int, vectorize: str, iterations: int, batch: int) -> Row:
-    """Train a few iterations and return the medians."""
+def measure(env: str, runners: int, envs: int, iterations: int, batch: int, limit: float) -> Row | Failed:
+    """Train a few iterations and return the medians of those that ended in time."""
+    taken: list[Iteration] = []
+    time_limit = TimeLimit(limit)
+    try:
+        with time_limit, training_run.built(configuration(env, runners, envs, batch).build_algo()) as algorithm:
+            clock = Clock(algorithm)
+            clock.iteration()  # the first one warms up
+            for _ in range(iterations):
+                taken.append(clock.iteration())
+    except Exception as error:  # Ray's and the environment's own: the other configurations are still worth measuring
+        if not time_limit.up:  # Ray's `wait` makes a SystemError of TimeUp
+            return Failed(runners, envs, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
+    if not taken:
+        return Failed(runners, envs, f"no iteration ended within {limit:.3g} s")
+    medians = [statistics.median(getattr(one, name) for one in taken) for name in Iteration.__dataclass_fields__]
+    return Row(runners, envs, len(taken), *medians)
+
+
+def configuration(env: str, runners: int, envs: int, batch: int) -> Any:
+    """Return PPO's configuration as the UR5 script trains it, the batch smaller."""
     from ray.rllib.algorithms.ppo import PPOConfig
 
     config = training_run.default_config("PPO")
     assert isinstance(config, PPOConfig)
     config.environment(env, env_config={"rs_state_to_info": False} if env.startswith("rlservo/") else {})
-    config.env_runners(
-        num_env_runners=runners,
-        num_envs_per_env_runner=envs,
-        gym_env_vectorize_mode=cast(Any, vectorize),  # its annotation names the old strings only
-    )
-    config.training(train_batch_size_per_learner=batch, minibatch_size=512, num_epochs=4)
+    config.env_runners(num_env_runners=runners, num_envs_per_env_runner=envs)
+    config.training(train_batch_size_per_learner=batch, minibatch_size=MINIBATCH, num_epochs=4)
     config.rl_module(model_config={"fcnet_hiddens": [256, 256], "fcnet_activation": "tanh", "vf_share_layers": False})
+    config.fault_tolerance(restart_failed_env_runners=False)
     config.debugging(seed=0)
-    with training_run.built(config.build_algo()) as algorithm:
-        algorithm.train()
-        taken: list[tuple[float, float, float, float, float]] = []
-        shares: list[dict[str, float]] = []
-        sampled = 0.0
-        for _ in range(iterations):
-            began, cpu = time.perf_counter(), cpu_seconds(algorithm)
-            before = sampled
-            result = algorithm.train()
-            wall, cpu = time.perf_counter() - began, cpu_seconds(algorithm) - cpu
-            sampled = float(result[training_run.STEPS])
-            timers = result["timers"]
-            steps = sampled - before if before else float(result["env_runners"]["num_env_steps_sampled"])
-            taken.append(
-                (steps / wall, steps / cpu, wall, timers["env_runner_sampling_timer"], timers["learner_update_timer"])
-            )
-            shares.append(parts(result))
-    rate, per_cpu, wall, sample, learn = (statistics.median(column) for column in zip(*taken, strict=True))
-    env_share, network, connectors = (statistics.median(one[name] for one in shares) for name in shares[0])
-    rest = max(0.0, wall - sample - learn)
-    return Row(runners, envs, vectorize, rate, per_cpu, wall, sample, learn, rest, env_share, network, connectors)
+    return config
+
+
+class Clock:
+    """Times an algorithm's iterations, and in them sampling and learning: RLlib's own timers are smoothed over many."""
+
+    def __init__(self, algorithm: Any) -> None:
+        self._algorithm = algorithm
+        self._seconds = {"sample": 0.0, "learn": 0.0}
+        self._steps = 0.0
+        group, learners = algorithm.env_runner_group, algorithm.learner_group
+        group.foreach_env_runner = self._timed("sample", group.foreach_env_runner)
+        learners.update = self._timed("learn", learners.update)
+
+    def _timed(self, part: str, function: Any) -> Any:
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            began = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self._seconds[part] += time.perf_counter() - began
+
+        return timed
+
+    def iteration(self) -> Iteration:
+        """Train once and return the figures."""
+        cpu, steps = cpu_seconds(self._algorithm), self._steps
+        self._seconds = {"sample": 0.0, "learn": 0.0}
+        began = time.perf_counter()
+        result = self._algorithm.train()
+        wall = time.perf_counter() - began
+        sample, learn = self._seconds.values()
+        cpu = cpu_seconds(self._algorithm) - cpu
+        self._steps = float(result[training_run.STEPS])
+        steps = self._steps - steps
+        return Iteration(steps / wall, steps / cpu, wall, sample, learn, wall - sample - learn, *parts(result))
 
 
 def cpu_seconds(algorithm: Any) -> float:
@@ -133,61 +234,26 @@ def cpu_seconds(algorithm: Any) -> float:
     return time.process_time() + float(sum(runners))
 
 
-def parts(result: dict[str, Any]) -> dict[str, float]:
+def parts(result: dict[str, Any]) -> tuple[float, float, float]:
     """Return the shares of a runner's own time: its simulators, network and pipelines."""
     runner = result["env_runners"]
-    pipelines = sum(
-        float(runner[name]["connector_pipeline_timer"])
-        for name in ("env_to_module_connector", "module_to_env_connector")
+    each = (
+        float(runner["env_step_timer"]),
+        float(runner["rlmodule_inference_timer"]),
+        sum(
+            float(runner[name]["connector_pipeline_timer"])
+            for name in ("env_to_module_connector", "module_to_env_connector")
+        ),
     )
-    each = {
-        "env_step_timer": float(runner["env_step_timer"]),
-        "rlmodule_inference_timer": float(runner["rlmodule_inference_timer"]),
-        "connectors": pipelines,
-    }
-    total = sum(each.values())
-    return {name: seconds / total for name, seconds in each.items()}
+    simulators, network, pipelines = (seconds / sum(each) for seconds in each)
+    return simulators, network, pipelines
 
 
-def measure_physics(seconds: float = 2.0) -> list[tuple[str, float]]:
-    """Return substeps per second of the UR5's model, by way of stepping it."""
-    import gymnasium as gym
-    import mujoco
-    import numpy as np
-    from mujoco import rollout
-
-    env = cast(Any, gym.make(UR5, disable_env_checker=True).unwrapped)
-    env.reset(seed=0)
-    model, data = env.simulation.model, env.simulation.data
-    block = 200
-    found = []
-
-    def rate(work: Any, substeps: int) -> float:
-        count, began = 0, time.perf_counter()
-        while time.perf_counter() - began < seconds:
-            work()
-            count += substeps
-        return count / (time.perf_counter() - began)
-
-    def one_by_one() -> None:
-        for _ in range(block):
-            mujoco.mj_step(model, data)
-
-    found.append(("mj_step, one at a time from Python", rate(one_by_one, block)))
-    found.append(("mj_step, 200 in one call", rate(lambda: mujoco.mj_step(model, data, nstep=block), block)))
-    robots = 8
-    size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    state = np.zeros(size)
-    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    states = np.tile(state, (robots, 1))
-    control = np.zeros((robots, block, model.nu))
-    for threads in (1, 2):
-        datas = [mujoco.MjData(model) for _ in range(threads)]
-        with rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
-            many = rate(lambda pool=pool, datas=datas: pool.rollout(model, datas, states, control), robots * block)
-        found.append((f"mujoco.rollout, 8 robots on {threads} thread{'s' if threads > 1 else ''}", many))
-    env.close()
-    return found
+def write(rows: list[Row | Failed], env: str, batch: int, out: Path) -> None:
+    """Write what has been measured so far."""
+    document = {"env": env, "batch": batch, "rows": [asdict(row) for row in rows]}
+    (out / "training.json").write_text(json.dumps(document, indent=2) + "\n")
+    plot([row for row in rows if isinstance(row, Row)], env, out / "training.png")
 
 
 def plot(rows: list[Row], env: str, path: Path) -> None:
@@ -199,18 +265,20 @@ def plot(rows: list[Row], env: str, path: Path) -> None:
 
     figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
     for runners in sorted({row.runners for row in rows}):
-        own = [row for row in rows if row.runners == runners and row.vectorize == "sync"]
-        axes.plot([row.envs for row in own], [row.steps_per_s for row in own], marker="o", label=f"{runners} runners")
+        own = [row for row in rows if row.runners == runners]
+        label = f"{runners} env runner{'s' if runners > 1 else ''}"
+        axes.plot([row.envs for row in own], [row.steps_per_s for row in own], marker="o", label=label)
     axes.set_xscale("log", base=2)
     axes.set(
         xlabel="environments per env runner", ylabel="environment steps/s, learner included", title=f"PPO on {env}"
     )
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
-    axes.legend()
+    if rows:
+        axes.legend()
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
 
 if __name__ == "__main__":
-    main()
+    training_run.main_with_sentences(main, __file__)

@@ -13,6 +13,7 @@ with today's.
 from __future__ import annotations
 
 import difflib
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ import ray_settings  # before Ray
 import yaml
 from ray import tune
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.tune.search.sample import Categorical, Domain
 
 from rlservo.export.errors import UsageError
 
@@ -144,3 +146,29 @@ def apply(config: AlgorithmConfig, settings: Mapping[str, Any], option: str) -> 
             setattr(config, name, value)
         except Exception as error:  # RLlib's deprecated names raise in their setters
             raise UsageError(f"{option} {name}: RLlib refuses it: {str(error).splitlines()[0]}") from error
+
+
+def validate(config: AlgorithmConfig, of: str = "this configuration") -> None:
+    """Raise UsageError when RLlib would refuse the configuration."""
+    try:
+        config.copy(copy_frozen=False).validate()
+    except Exception as error:  # RLlib's checks raise ValueError and much else
+        raise UsageError(f"RLlib refuses {of}: {' '.join(str(error).split())}") from error
+
+
+def check_combinations(config: AlgorithmConfig, space: Mapping[str, Any], at_most: int = 100) -> None:
+    """Raise UsageError for a combination of swept values that RLlib would refuse: of lists all, of ranges one value."""
+    axes = [_values(domain) for domain in space.values()]
+    for values in itertools.islice(itertools.product(*axes), at_most) if space else ():
+        combination = dict(zip(space, values, strict=True))
+        one = config.copy(copy_frozen=False)
+        apply(one, combination, "--sweep")
+        validate(one, " ".join(f"{name}={value}" for name, value in combination.items()))
+
+
+def _values(domain: Any) -> list[Any]:
+    if isinstance(domain, Mapping):
+        return list(domain["grid_search"])
+    if isinstance(domain, Categorical):
+        return list(domain.categories)
+    return [domain.sample()] if isinstance(domain, Domain) else [domain]

@@ -174,6 +174,8 @@ def check_arguments(parser: argparse.ArgumentParser, args: argparse.Namespace) -
     for name in ("num_gpus_per_learner", "max_concurrent_trials"):
         if getattr(args, name) is not None and getattr(args, name) < (name != "num_gpus_per_learner"):
             parser.error(f"--{name.replace('_', '-')} is {getattr(args, name)}: expected more")
+    if args.run == "SAC" and args.use_lstm:
+        parser.error("--use-lstm: RLlib's SAC fails with a recurrent network (ray 2.60); use PPO, APPO, IMPALA or DQN")
     if args.num_gpus and args.num_gpus_per_learner is not None:
         parser.error("give either --num-gpus (for all learners) or --num-gpus-per-learner")
     if args.restart_failed_env_runners and args.ignore_env_runner_failures:
@@ -210,10 +212,13 @@ def gpus_per_learner(args: argparse.Namespace) -> float:
     return float(args.num_gpus / max(1, args.num_learners))
 
 
-def check_machine(args: argparse.Namespace, cores: int, gpus: float, where: str) -> None:
-    """Raise UsageError when the machine or cluster has too little, with numbers that fit."""
+def check_machine(args: argparse.Namespace, cores: int, gpus: float, where: str, *, joined: bool) -> None:
+    """Raise UsageError when the machine or cluster has too little, with numbers that fit.
+
+    On a machine of our own the driver may share the last core; a cluster that was joined gives no more than it has.
+    """
     needed = cores_needed(args)
-    if needed > cores + 1:
+    if needed > cores + (not joined):
         raise UsageError(
             f"--num-cpus {args.num_cpus} takes {needed} cores ({args.num_cpus} for env runners, "
             f"{needed - 1 - args.num_cpus} for learners and evaluation, one for the driver); {where} has {cores}: "
@@ -229,13 +234,6 @@ def check_machine(args: argparse.Namespace, cores: int, gpus: float, where: str)
 def session_cores(run: Run) -> int:
     """Return the cores a private Ray is started with: of as many trials at once as the machine holds."""
     return run.num_cpus * max(1, (os.cpu_count() or 1) // run.num_cpus)
-
-
-def local_gpus() -> float:
-    """Return how many GPUs torch sees here."""
-    import torch
-
-    return float(torch.cuda.device_count()) if torch.cuda.is_available() else 0.0
 
 
 def algorithm_config(
@@ -329,7 +327,7 @@ def inspect_environment(args: argparse.Namespace, env_config: Mapping[str, Any])
         env.close()
     kinds = ACTIONS.get(args.run)
     if kinds and not isinstance(spaces[1], kinds):
-        fit = "PPO, APPO or IMPALA" + (" or SAC" if isinstance(spaces[1], Box) else "")
+        fit = "PPO, APPO, IMPALA or SAC" if isinstance(spaces[1], Box) else "PPO, APPO or IMPALA"
         raise UsageError(
             f"--run {args.run}: it needs {' or '.join(kind.__name__ for kind in kinds)} actions, {args.name_env} takes "
             f"{spaces[1]}; use --run {fit}"
@@ -352,10 +350,7 @@ def set_up(args: argparse.Namespace) -> tuple[AlgorithmConfig, Run, list[str]]:
     if several := [name for name, values in fixed.items() if len(values) > 1]:
         raise UsageError(f"--set {several[0]}: expected one value; --sweep {several[0]}=... tries several")
     search_space.apply(config, {name: values[0] for name, values in fixed.items()}, "--set")
-    try:
-        config.copy(copy_frozen=False).validate()
-    except Exception as error:  # RLlib's checks raise ValueError and much else
-        raise UsageError(f"RLlib refuses this configuration: {' '.join(str(error).split())}") from error
+    search_space.validate(config)
     grid = {
         name: tune.grid_search(values) for name, values in search_space.read_settings(args.sweep, "--sweep").items()
     }
@@ -364,6 +359,7 @@ def set_up(args: argparse.Namespace) -> tuple[AlgorithmConfig, Run, list[str]]:
         raise UsageError(f"{twice[0]} is given twice, by --set, --sweep or --search-space: once is enough")
     search_space.apply(config, grid, "--sweep")
     search_space.apply(config, space, "--search-space")
+    search_space.check_combinations(config, grid | space)
     run = Run(
         args.run,
         args.name_env,
@@ -423,7 +419,9 @@ def main() -> None:
     else:
         sys.path.insert(0, str(args.app_dir.resolve()))
         if args.address is None:
-            check_machine(args, os.cpu_count() or 1, local_gpus() if gpus_needed(args) else 0.0, "this machine")
+            gpus = training_run.local_gpus() if gpus_needed(args) else 0.0
+            check_machine(args, os.cpu_count() or 1, gpus, "this machine", joined=False)
+        training_run.check_storage(args.storage)
         config, run, swept = set_up(args)
         with training_run.ray_session(
             num_cpus=session_cores(run),
@@ -433,7 +431,8 @@ def main() -> None:
             app_dir=args.app_dir,
         ):
             if args.address is not None:
-                check_machine(args, training_run.cores() - 1, training_run.gpus(), f"the cluster at {args.address}")
+                cluster = f"the cluster at {args.address}"
+                check_machine(args, training_run.cores(), training_run.gpus(), cluster, joined=True)
             print(
                 f"{args.run} on {args.name_env}: {args.num_cpus} env runners with {args.num_envs_per_env_runner} "
                 f"environments each, {args.num_learners or 'the driver as'} learner, {run.num_cpus} cores"

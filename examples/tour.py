@@ -34,6 +34,7 @@ from rlservo.serve_app.video import VideoFile
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
 SHIPPED = Path(__file__).resolve().parent / "checkpoints" / "ur5_positioning"
 ARROWS = "←↓→↑"  # FrozenLake's actions
+EXPLORED = 5_000  # steps on FrozenLake, after which it hardly explores any more
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,11 @@ def main() -> None:
     training_run.pickle_by_value(sys.modules[__name__])
     settings = Settings(args.out.resolve(), args.quick, not args.no_video)
     settings.out.mkdir(parents=True, exist_ok=True)
-    for stop in args.stops or stops:
-        stops[stop](settings)
+    try:
+        for stop in args.stops or stops:
+            stops[stop](settings)
+    except training_run.Interrupted:
+        raise KeyboardInterrupt from None  # a tour begins anew
 
 
 def heading(text: str) -> None:
@@ -179,6 +183,7 @@ def cartpole(settings: Settings) -> None:
             storage=settings.out / "runs",
             stop={RETURN: 400, STEPS: 60_000, "training_iteration": 2 if settings.quick else 40},
             checkpoint_frequency=1,
+            resumable=False,
         )
         training_run.report(outcome, run)
         checkpoint = training_run.best_checkpoint_of(outcome)
@@ -282,31 +287,41 @@ def frozen_lake(settings: Settings) -> None:
     # A field is a number; the network sees it one-hot. (RLlib's annotation is narrower than what it takes.)
     config.env_runners(
         env_to_module_connector=cast(Any, lambda env, spaces, device: FlattenObservations()),
-        num_envs_per_env_runner=4,
-        rollout_fragment_length=3,  # 12 steps, as n_step needs three in a row, then one update
+        num_envs_per_env_runner=8,
+        rollout_fragment_length=4,
     )
     config.training(
-        lr=1e-3,
-        gamma=0.95,
-        n_step=3,
-        epsilon=[[0, 1.0], [8_000, 0.05]],
-        num_steps_sampled_before_learning_starts=1000,
-        target_network_update_freq=500,
+        gamma=0.9,  # nearer 1, a detour costs so little that some of the arrows point in circles
+        n_step=1,
+        lr=[[0, 2e-3], [5_000, 3e-4]],
+        epsilon=[[0, 1.0], [4_000, 0.1]],
+        num_steps_sampled_before_learning_starts=500,
+        target_network_update_freq=100,
         dueling=False,
         double_q=True,
-        train_batch_size_per_learner=128,
+        train_batch_size_per_learner=64,
+        training_intensity=16,  # an update in four steps
+        replay_buffer_config={"type": "EpisodeReplayBuffer", "capacity": 20_000},
     )
     config.rl_module(model_config={"fcnet_hiddens": [64]})
-    config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=1000)
+    config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=500)
+    config.evaluation(evaluation_interval=1, evaluation_duration=1, evaluation_config={"explore": False})
     log = settings.out / "runs" / "DQN-FrozenLake-v1"
     shutil.rmtree(log, ignore_errors=True)
     log.mkdir(parents=True)
     config.debugging(seed=1)
     with training_run.ray_session(num_cpus=1), training_run.built(config.build_algo()) as algorithm:
-        for iteration in range(2 if settings.quick else 14):
+        steps, arrived = 0, False  # one episode tells: without slipping, every episode of a policy is the same
+        while not (arrived and (settings.quick or steps >= EXPLORED)) and steps < 4 * EXPLORED:
             result = algorithm.train()
+            steps = result[STEPS]
+            arrived = result["evaluation"]["env_runners"]["episode_return_mean"] == 1.0
             mean = result["env_runners"].get("episode_return_mean", float("nan"))
-            print(f"iteration {iteration}: {result[STEPS]:,.0f} steps, mean return {mean:.2f}", flush=True)
+            print(
+                f"{steps:6,.0f} steps, mean return {mean:.2f} while exploring; "
+                f"without, the goal is {'reached' if arrived else 'not reached'}",
+                flush=True,
+            )
         checkpoint = Path(str(algorithm.save_to_path(str(log / "checkpoint"))))
     print(f"random actions had {baseline:.2f}")
 

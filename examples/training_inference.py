@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import training_run  # before Ray  # isort: skip
+import yaml
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from training_run import RETURN, STEPS, Run
 
+SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 SUPPORTED = ("PPO", "APPO", "IMPALA", "SAC")
 
 
@@ -30,9 +32,28 @@ class Task:
     env_config: dict[str, Any]
     stop_timesteps: int
     stop_reward: float
-    gamma: float
+    gamma: float  # every algorithm's
+    training: dict[str, Any]  # PPO's
+    model: dict[str, Any]
     inference_config: dict[str, Any] = field(default_factory=dict)  # the environment's, for the episodes afterwards
-    training: dict[str, Any] = field(default_factory=dict)
+
+
+def shipped_task(name: str) -> Task:
+    """Return the task of a policy that ships, with the settings of `examples/checkpoints/NAME/training.yaml`.
+
+    Processes and environments in each are the command line's, not the file's: it describes one process.
+    """
+    settings = yaml.safe_load((SHIPPED / name / "training.yaml").read_text(encoding="utf-8"))
+    training = dict(settings["training"])
+    return Task(
+        env_id=settings["env"],
+        env_config=settings["env_config"],
+        stop_timesteps=settings["stop"]["env_steps"],
+        stop_reward=settings["stop"]["value"],
+        gamma=training.pop("gamma"),
+        training=training,
+        model=settings["model"],
+    )
 
 
 def argument_parser(task: Task, description: str) -> argparse.ArgumentParser:
@@ -72,10 +93,16 @@ def check_arguments(parser: argparse.ArgumentParser, args: argparse.Namespace) -
     for name in ("stop_iters", "stop_timesteps", "num_envs_per_env_runner", "checkpoint_frequency"):
         if getattr(args, name) < 1:
             parser.error(f"--{name.replace('_', '-')} is {getattr(args, name)}: expected at least 1")
-    for name in ("num_cpus", "num_episodes_during_inference"):
+    for name in ("num_cpus", "num_episodes_during_inference", "seed"):
         if getattr(args, name) < 0:
             parser.error(f"--{name.replace('_', '-')} is {getattr(args, name)}: expected 0 or more")
-    gpus_asked_for(parser)
+    if args.num_cpus > max(2, cores := os.cpu_count() or 1):
+        parser.error(f"--num-cpus is {args.num_cpus}: this machine has {cores}; 0 is all of them")
+    if (gpus := gpus_asked_for(parser)) > 0 and gpus > training_run.local_gpus():
+        parser.error(
+            f"RLLIB_NUM_GPUS is {gpus:g}: this machine has {training_run.local_gpus():g} GPUs that torch can use; "
+            "unset it to learn on the CPU"
+        )
 
 
 def gpus_asked_for(parser: argparse.ArgumentParser) -> float:
@@ -105,11 +132,7 @@ def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: floa
     )
     config.resources(num_cpus_for_main_process=cast(Any, 1 if cpus >= 2 else 0.5))
     config.learners(num_learners=0, num_gpus_per_learner=gpus)
-    config.rl_module(
-        model_config=DefaultModelConfig(
-            fcnet_hiddens=[256, 256], fcnet_activation="tanh", vf_share_layers=False, max_seq_len=20
-        )
-    )
+    config.rl_module(model_config=DefaultModelConfig(**task.model, max_seq_len=20))
     config.training(gamma=task.gamma)
     if args.run == "PPO":
         config.training(**task.training)
@@ -133,6 +156,7 @@ def run(task: Task, parser: argparse.ArgumentParser) -> None:
         with training_run.ray_session(num_cpus=described.num_cpus, num_gpus=described.num_gpus):
             outcome = training_run.resume(args.resume)
     else:
+        training_run.check_storage(args.storage)
         described = Run(
             args.run,
             task.env_id,

@@ -20,6 +20,7 @@ import re
 import secrets
 import shutil
 import signal
+import socket
 import sys
 import tempfile
 import time
@@ -169,9 +170,10 @@ def ray_session(
             take_sigterm()  # Ray has set a handler of its own
             yield
         finally:
-            ray.shutdown()
-            if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)
+            with _undisturbed():
+                ray.shutdown()
+                if folder is not None:
+                    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _start(folder: str, num_cpus: int, num_gpus: float, quiet: Mapping[str, Any], attempts: int = 3) -> None:
@@ -195,7 +197,10 @@ def _start(folder: str, num_cpus: int, num_gpus: float, quiet: Mapping[str, Any]
 
 
 def _join(address: str, quiet: Mapping[str, Any]) -> None:
+    host, colon, port = address.rpartition(":")
     try:
+        if colon and "/" not in address:  # Ray itself tries for minutes
+            socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
         ray.init(address, **quiet)
     except Exception as error:  # Ray's own tree, RuntimeError, ConnectionError, ValueError: all say the same
         raise UsageError(
@@ -207,6 +212,13 @@ def _join(address: str, quiet: Mapping[str, Any]) -> None:
 def cores() -> int:
     """Return how many cores the running Ray has."""
     return int(ray.cluster_resources().get("CPU", 0))
+
+
+def local_gpus() -> float:
+    """Return how many GPUs torch sees here."""
+    import torch
+
+    return float(torch.cuda.device_count()) if torch.cuda.is_available() else 0.0
 
 
 def gpus() -> float:
@@ -232,6 +244,17 @@ def _sigterm_as_ctrl_c() -> Iterator[Callable[[], None]]:
         yield take
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Let no second Ctrl-C leave Ray's processes and folder behind."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
 @contextlib.contextmanager
@@ -329,18 +352,17 @@ def train(
     max_concurrent: int | None = None,
     max_failures: int = 0,
     swept: Sequence[str] = (),
+    resumable: bool = True,
 ) -> Outcome:
-    """Train until one of the stop criteria holds (Ray must be running); see `resume` for what is raised."""
+    """Train until one of the stop criteria holds (Ray must be running); see `resume` for what is raised.
+
+    `resumable` is whether the script has a `--resume`, which it then tells of.
+    """
     name = f"{run.algorithm}-{run.env_id.split('/')[-1].split(':')[-1]}-{time.strftime('%Y%m%d-%H%M%S')}"
-    folder = storage.expanduser().resolve() / name
-    while folder.exists():
-        folder = folder.with_name(f"{folder.name}-{secrets.token_hex(2)}")
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
+    folder = _new_folder(storage, name)
     (folder / RUN_FILE).write_text(json.dumps(asdict(run) | {"swept": list(swept)}, indent=2) + "\n")
-    print(f"run: {folder}\ncurves: tensorboard --logdir {folder}\nCtrl-C stops; --resume {folder} goes on", flush=True)
+    print(f"run: {folder}\ncurves: tensorboard --logdir {folder}", flush=True)
+    print("Ctrl-C stops" + (f"; --resume {folder} goes on" if resumable else ""), flush=True)
     tuner = tune.Tuner(
         run.algorithm,
         param_space=cast(Any, config),  # Tune takes an AlgorithmConfig, its annotation says dict
@@ -370,6 +392,34 @@ def train(
         ),
     )
     return _fit(tuner, folder, run, swept)
+
+
+def check_storage(storage: Path) -> None:
+    """Raise UsageError when no folder can be made in `storage`: better now than when Ray has started."""
+    try:
+        with tempfile.TemporaryDirectory(dir=_made(storage)):
+            pass
+    except OSError as error:
+        raise UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
+
+
+def _made(storage: Path) -> Path:
+    folder = storage.expanduser().resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _new_folder(storage: Path, name: str) -> Path:
+    """Make a folder of this name, or a longer one: jobs of an array begin in the same second."""
+    try:
+        folder = _made(storage) / name
+        while True:
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir()
+                return folder
+            folder = folder.with_name(f"{name}-{secrets.token_hex(2)}")
+    except OSError as error:
+        raise UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
 
 
 def _trial_name(trial: Any) -> str:
@@ -415,6 +465,8 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
         results = tuner.fit()
     except KeyboardInterrupt:
         raise Interrupted(folder) from None
+    except Exception as error:  # before a trial has begun, or Tune's own; a trial's are in the results
+        raise RlservoError(f"training failed: {_cause(error)}") from error
     trials, failed, unfinished = [], [], False
     for result in (results[index] for index in range(len(results))):
         if result.error is not None:
@@ -507,10 +559,12 @@ def report(outcome: Outcome, run: Run) -> None:
         ]
         for trial in outcome.trials
     ]
-    table = Table(*columns, title=f"{run.metric}, the best first", title_justify="left")
+    table = Table(title=f"{run.metric}, the best first", title_justify="left")
+    for column in columns:
+        table.add_column(column, overflow="fold")
     for row in rows:
         table.add_row(*row)
-    Console(width=max(100, _out.width), highlight=False).print(table)
+    Console(width=max(100, _out.width) if _out.is_terminal else 200, highlight=False).print(table)
     with (outcome.folder / "results.csv").open("w", newline="") as file:
         csv.writer(file).writerows([columns, *rows])
     picture = plot_curves(outcome, run)

@@ -20,6 +20,10 @@ def test_every_stop_ends_in_a_bundle(tmp_path: Path, run_script: Any) -> None:
     assert len(re.findall(r"random actions: mean return -?[\d.]+", ended.out)) == 3
     assert "the exported graph gives the same: largest difference" in ended.out
     assert len(re.findall(r"^[SFHG] [←↓→↑] +-?[\d.]+(   [SFHG] [←↓→↑] +-?[\d.]+){3}$", ended.out, re.MULTILINE)) == 4
+    lake = ended.out.split("=== FrozenLake: DQN")[1].split("===")[0]
+    assert float(re.findall(r"random actions had (-?[\d.]+)", lake)[0]) < 0.1
+    crossing = ended.out.split("=== FrozenLake: export")[1].split("===")[0]
+    assert "the exported policy: return 1.00 in 6 steps" in crossing  # the shortest way: it has learnt
     assert re.search(r"step +0: value +-?[\d.]+, action mean", ended.out)
     bundles = {path.parent.parent.name for path in (tmp_path / "tour" / "bundles").glob("*/*/contract.json")}
     assert len(bundles) == 3

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SCRIPTS = ("training_inference_ur.py", "training_inference_mir.py")
 
 
@@ -35,6 +38,9 @@ def test_wrong_arguments_are_refused_in_a_sentence(script: str, refusals: Callab
         "--run A3C": "--run A3C: expected one of PPO",
         "--stop-iters 0": "--stop-iters is 0: expected at least 1",
         "--num-cpus -1": "--num-cpus is -1: expected 0 or more",
+        "--num-cpus 3500": "--num-cpus is 3500: this machine has .*; 0 is all of them",
+        "--seed -1": "--seed is -1: expected 0 or more",
+        "--storage /dev/null/runs": "--storage /dev/null/runs: cannot be written: Not a directory",
         "--resume .": "not the folder of a run",
     }
     arguments = [one.split() for one in wrong]
@@ -42,6 +48,16 @@ def test_wrong_arguments_are_refused_in_a_sentence(script: str, refusals: Callab
         assert ended.code == 2
         assert re.search(sentence, ended.err.strip().splitlines()[-1])
         assert "Traceback" not in ended.err
+
+
+@pytest.mark.slow
+def test_more_gpus_than_there_are_are_refused_before_anything_starts(
+    refusals: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RLLIB_NUM_GPUS", "64")
+    (ended,) = refusals("training_inference_ur", [[]])
+    assert ended.code == 2
+    assert re.search(r"RLLIB_NUM_GPUS is 64: this machine has \d+ GPUs", ended.err.strip().splitlines()[-1])
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
@@ -53,3 +69,25 @@ def test_help_lists_robo_gyms_arguments(script: str, run_script: Any, tmp_path: 
         "--explore-during-inference", "--num-episodes-during-inference",
     ):  # fmt: skip
         assert argument in done.out
+
+
+@pytest.mark.parametrize(
+    ("script", "task", "policy"),
+    [
+        ("training_inference_ur", "TASK", "ur5_positioning"),
+        ("training_inference_mir", "NAVIGATION", "mir100_navigation"),
+    ],
+)
+def test_scripts_train_with_the_settings_beside_the_policy_that_ships(
+    script: str, task: str, policy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    common = importlib.import_module("training_inference")
+    chosen = getattr(importlib.import_module(script), task)
+    args = common.argument_parser(chosen, "").parse_args([])
+    settings = yaml.safe_load((EXAMPLES / "checkpoints" / policy / "training.yaml").read_text())
+    config = common.algorithm_config(chosen, args, 2)
+    assert (config.env, config.env_config, config.seed) == (settings["env"], settings["env_config"], settings["seed"])
+    assert {name: getattr(config, name) for name in settings["training"]} == settings["training"]
+    assert {name: getattr(config._model_config, name) for name in settings["model"]} == settings["model"]
+    assert (args.stop_timesteps, args.stop_reward) == (settings["stop"]["env_steps"], settings["stop"]["value"])

@@ -1,4 +1,7 @@
-"""Train on each edge environment for a moment, as the trainer would, in one Ray; print one JSON document."""
+"""Train on edge environments for a moment, as the trainer would, in one Ray; print one JSON document.
+
+python train_edges.py FOLDER NAME [NAME ...]      NAME is one of RUNS
+"""
 
 from __future__ import annotations
 
@@ -37,16 +40,19 @@ RUNS = {
 }
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, names: list[str]) -> None:
     training_run.pickle_by_value(simple_trainer, episode_traces)
     found = {}
     with training_run.ray_session(num_cpus=2, app_dir=Path(__file__).parent / "app"):
-        for name, more in RUNS.items():
+        for name in names:
+            more = RUNS[name]
             env = f"edge_environments:edge/{name.split()[0]}-v0"
             common = ["--num-cpus", "0", "--name-env", env, "--stop-iters", "2", "--hidden", "16"]
             if name.startswith("Crashing"):  # an absolute path: Tune's workers run in the trial's folder
                 common += ["--env-arg", f"log={folder / name.replace(' ', '_')}.txt"]
-            own = more if "DQN" in more else [*more, "--set", "train_batch_size_per_learner=300"]
+            own = (
+                more if "DQN" in more else [*more, "--set", "train_batch_size_per_learner=300", "--set", "num_epochs=2"]
+            )
             parser = simple_trainer.argument_parser()
             args = parser.parse_args([*common, *own])
             simple_trainer.check_arguments(parser, args)
@@ -77,4 +83,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), sys.argv[2:])
