@@ -3,10 +3,11 @@
     python examples/train_shipped.py mir100_obstacle_avoidance
 
 `examples/checkpoints/NAME/training.yaml` says what is trained and when to stop; `--seed` and `--set` change that
-for one run. The run goes to `runs/NAME`: the best checkpoint so far (by the mean of the last episodes), `curve.csv` and
-`curve.png`. `--install` then puts the pruned checkpoint and the curve beside the settings. One process, one thread:
-RLlib samples in the driver, because two sampling processes get `MeanStdFilter` statistics merged wrongly (DESIGN.md).
-It knows nothing of how good a policy is afterwards: that is `evaluate_shipped.py`.
+for one run. The run goes to `runs/NAME`: the best checkpoint so far (by the mean of the last episodes or, where the
+settings have `validation`, by episodes of the exported policy, without exploration), `curve.csv` and `curve.png`.
+`--install` then puts the pruned checkpoint and the curve beside the settings. One process, one thread: RLlib samples in
+the driver, because two sampling processes get `MeanStdFilter` statistics merged wrongly (DESIGN.md). How good a policy
+is afterwards `evaluate_shipped.py` tells, on other seeds.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import os
 import resource
 import shutil
 import sys
+import tempfile
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -29,6 +31,7 @@ from typing import Any, cast
 os.environ.setdefault("RAY_AUTH_MODE", "token")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
+import evaluate_shipped
 import ray
 import torch
 import yaml
@@ -37,6 +40,9 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.tune.registry import get_trainable_cls
+
+from rlservo.export.exporter import export_checkpoint
+from rlservo.serve_app.policy import Policy
 
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 MILESTONE = 0.95  # the success rate whose time is printed
@@ -94,6 +100,31 @@ def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any 
         metrics_logger.log_value(("shipped", key), float(value), reduce="sum")
 
 
+@dataclass
+class Validation:
+    """Which checkpoint is best, judged as the cards judge: exported, without exploration, on seeds of its own."""
+
+    episodes: int
+    seed: int
+    env_steps: int  # from one to the next
+    above: float  # training success below which it is not worth the time
+    _next: int = 0
+
+    def is_due(self, row: Row) -> bool:
+        if row.env_steps < self._next or row.success < self.above:
+            return False
+        self._next = row.env_steps + self.env_steps
+        return True
+
+    def success(self, checkpoint: Path, settings: dict[str, Any]) -> float:
+        """Return the share of successes, over all that the settings evaluate."""
+        with tempfile.TemporaryDirectory() as folder:
+            bundle = export_checkpoint(checkpoint, Path(folder), name="candidate", notify=lambda line: None)
+            with Policy.load(bundle.path) as policy:
+                measured = evaluate_shipped.evaluate(policy, settings, self.episodes, self.seed)
+        return sum(one.successes or 0 for one in measured) / sum(one.episodes for one in measured)
+
+
 def change_setting(settings: dict[str, Any], change: str) -> None:
     """Apply `a.b=value` (YAML) to the settings. Raises ValueError for a setting that is not there."""
     key, equals, value = change.partition("=")
@@ -139,6 +170,7 @@ def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
 def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
     """Train until the stop metric or the steps are reached; leave `folder/checkpoint` (the best) and `curve.csv`."""
     stop = settings["stop"]
+    validation = Validation(**settings["validation"]) if "validation" in settings else None
     rows: list[Row] = []
     best, reached_milestone = float("-inf"), False
     checkpoint = folder / "checkpoint"
@@ -168,6 +200,14 @@ def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
                         f"steps, {row.wall_s:.0f} s ({row.cpu_s:.0f} s of processor time)"
                     )
                 value = getattr(row, stop["metric"])
+                if validation is not None:
+                    if not filled or not validation.is_due(row):
+                        value = float("-inf")
+                    else:
+                        candidate = folder / "candidate"
+                        algorithm.save_to_path(str(candidate.resolve()))
+                        value = validation.success(candidate, settings)
+                        print(f"{value:.1%} success of the exported policy over {validation.episodes} episodes")
                 if filled and value > best:
                     best = value
                     algorithm.save_to_path(str(checkpoint.resolve()))
