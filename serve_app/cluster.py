@@ -35,7 +35,7 @@ def main() -> int:
 
     from rlservo.serve_app import app
 
-    _leave_out_monitors()
+    _leave_out_extras()
     try:
         ray.init(
             address="local",  # whatever RAY_ADDRESS or a running cluster says
@@ -70,12 +70,15 @@ def main() -> int:
     return 0
 
 
-def _leave_out_monitors() -> None:
-    """Keep Ray from starting its autoscaler's monitor and its log forwarder: 165 MB, a second, and no use here.
+def _leave_out_extras() -> None:
+    """Keep Ray (2.60) from starting what nothing here uses and an answer waits for, where its own switches do not.
 
-    `ray start` has flags for both and `ray.init` has none (ray 2.60). Where the private class has moved, they start.
+    The autoscaler's monitor and the log forwarder are 165 MB and a second; `ray start` has flags for both, `ray.init`
+    none. The node waits 3 s for the ports of its agent's HTTP and gRPC servers, which are for the dashboard; Ray leaves
+    them out where the dashboard's packages are missing, so here it is told that they are. Where these private names
+    have moved, everything starts.
     """
-    from ray._private import parameter
+    from ray._private import parameter, utils
 
     with contextlib.suppress(AttributeError):
         parameter.RayParams = functools.partial(  # type: ignore[misc, assignment]
@@ -83,6 +86,8 @@ def _leave_out_monitors() -> None:
             no_monitor=True,
             include_log_monitor=False,  # type: ignore[arg-type]
         )
+    if hasattr(utils, "get_dashboard_dependency_error"):
+        utils.get_dashboard_dependency_error = lambda: ImportError("left out")
 
 
 def _watch_input(stop: threading.Event, started: threading.Event, plan: dict[str, Any]) -> None:

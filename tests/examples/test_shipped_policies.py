@@ -65,7 +65,14 @@ def card_figures(name: str) -> list[dict[str, Any]]:
 
 
 def test_these_policies_ship() -> None:
-    assert NAMES == ["cartpole_dqn", "mir100_navigation", "mir100_sparse_fixes", "pendulum_sac", "ur5_positioning"]
+    assert NAMES == [
+        "cartpole_dqn",
+        "mir100_navigation",
+        "mir100_obstacle_avoidance",
+        "mir100_sparse_fixes",
+        "pendulum_sac",
+        "ur5_positioning",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -157,6 +164,18 @@ def test_training_again_leaves_a_curve_and_a_checkpoint_that_exports(tmp_path: P
     measured = run_script("evaluate_shipped.py", *arguments, home=tmp_path)
     assert measured.returncode == 0, measured.stderr
     assert "| anywhere | 3 |" in measured.stdout
+
+
+@pytest.mark.slow
+def test_checkpoints_are_judged_as_the_cards_do_where_the_settings_ask_for_it(tmp_path: Path) -> None:
+    changes = ("stop.env_steps=20000", "stop.episodes=3", "validation.above=0", "validation.episodes=2")
+    arguments = [word for change in changes for word in ("--set", change)]
+    done = run_script("train_shipped.py", "mir100_obstacle_avoidance", *arguments, home=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("% success of the exported policy over 2 episodes") == 1  # next in 100,000 steps
+    run = tmp_path / "runs" / "mir100_obstacle_avoidance"
+    assert len((run / "curve.csv").read_text().splitlines()) == 4  # 8,192 steps an iteration
+    assert (run / "checkpoint" / "rllib_checkpoint.json").exists()
 
 
 @pytest.mark.parametrize(
