@@ -90,7 +90,7 @@ def wrk(port: int, exchange: Exchange, folder: Path, *, connections: int, second
 
 
 def _percentile(text: str, which: int) -> float:
-    match = re.search(rf"^\s+{which}%\s+([\d.]+)(us|ms|s)$", text, re.MULTILINE)
+    match = re.search(rf"^\s+{which}%\s+([\d.]+)(us|ms|s) *$", text, re.MULTILINE)
     assert match is not None, text
     return float(match[1]) * UNITS_MS[match[2]]
 

@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError
 from rlservo.envs.robot_server.launch_line import parse_launch_line
 from rlservo.envs.robot_server.messages import SERVER_MANAGER, ManagerStatus, ServerRequest
 from rlservo.envs.robot_server.robot import CLOCKS
-from rlservo.envs.robot_server.server import OPTIONS, PortInUseError, bind
+from rlservo.envs.robot_server.server import OPTIONS, PortInUseError, arrives, bind, stop_signals
 from rlservo.envs.robot_server.server_process import ServerProcess
 from rlservo.envs.robot_server.settings import Settings, URSettings
 
@@ -220,9 +220,7 @@ def serve_manager(
     on_ready: Callable[[int], None],
 ) -> None:
     """Run a manager until SIGTERM or SIGINT; nothing is left running. Main thread only."""
-    stopped = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopped.set())
+    signals = stop_signals()
     servers = RobotServers(host=host, clock=clock, max_servers=max_servers, orphan_s=orphan_s)
     try:
         manager = ServerManager(host=host, port=port, servers=servers)
@@ -231,7 +229,7 @@ def serve_manager(
         raise
     try:
         on_ready(manager.port)
-        stopped.wait()
+        arrives(signals)
     finally:
         manager.close()
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import queue
 import signal
 import socket
 import sys
@@ -95,16 +96,35 @@ def _probe(host: str, port: int) -> None:
         probe.bind(address)
 
 
+def stop_signals() -> queue.SimpleQueue[int]:
+    """Return where SIGTERM and SIGINT arrive from now on. Main thread only.
+
+    Not an Event: `set` in a handler waits for ever when the signal interrupts its own thread inside `wait`, at a moment
+    in which that holds the lock. A SimpleQueue's `put` may interrupt its `get`.
+    """
+    arrived: queue.SimpleQueue[int] = queue.SimpleQueue()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, _frame: arrived.put(number))
+    return arrived
+
+
+def arrives(signals: queue.SimpleQueue[int], timeout_s: float | None = None) -> bool:
+    """Wait for a signal; return whether one has come within the time."""
+    try:
+        signals.get(timeout=timeout_s)
+    except queue.Empty:
+        return False
+    return True
+
+
 def serve_robot(settings: Settings, *, on_ready: Callable[[int], None], orphan_s: float | None = None) -> None:
     """Serve until SIGTERM or SIGINT, or until nobody has been connected for `orphan_s` seconds. Main thread only."""
-    stopped = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopped.set())
+    signals = stop_signals()
     server = RobotServer(settings)
     try:
         on_ready(server.port)
         alone_since = time.monotonic()
-        while not stopped.wait(WATCH_INTERVAL_S if orphan_s is not None else None):
+        while not arrives(signals, WATCH_INTERVAL_S if orphan_s is not None else None):
             if count_connections(server.port) != 0:
                 alone_since = time.monotonic()
                 continue
