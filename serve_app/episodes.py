@@ -73,26 +73,23 @@ class Episodes:
             session = str(episode.session_id)
             begun = self.sessions.peek(name, episode.session_id) is not None or (episode.reset and self._alone())
             if begun or store.choose(name, version, session).episodic:
-                return self._in_session(store, name, version, obs, episode, explore=explore, seed=seed, seq=seq)
+                return self._in_session(_Asked(store, name, version, obs, episode, explore, seed, session), seq)
             # There is nothing to remember: the id says only which requests belong together.
             episode = replace(episode, session_id=None, reset=False, end=False)
         if episode.end or (episode.reset and stream is None):
             word = "end" if episode.end else "reset"
             raise RequestError(f"'{word}' is for a session: send its 'session_id', too")
+        asked = _Asked(store, name, version, obs, episode, explore, seed, session)
         if episode.state is not None:
-            return self._carried(
-                store, name, version, obs, episode, stream=stream, explore=explore, seed=seed, session=session
-            )
+            return self._carried(asked, stream)
         if stream is not None:
-            return self._on_stream(
-                store, name, version, obs, episode, stream, explore=explore, seed=seed, session=session
-            )
-        policy = store.choose(name, version, session)
+            return self._on_stream(asked, stream)
+        policy = asked.choose()
         if policy.contract.state:
             raise RequestError(f"policy '{name}' {NEEDS_STATE}", NEEDS)
         if policy.limited and episode.last_action is None:
             raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
-        return _timed(policy, obs, episode, NOTHING, explore=explore, seed=seed).decision(policy, None)
+        return _timed(policy, asked).decision(policy, None)
 
     def policy_of(
         self, store: PolicyStore, name: str, version: str | None, session_id: SessionId | None, identity: Any
@@ -104,26 +101,15 @@ class Episodes:
         own = store.find(name, identity) if type(identity) is str and version is None else None
         return own or store.get(name, version)
 
-    def _carried(
-        self,
-        store: PolicyStore,
-        name: str,
-        version: str | None,
-        obs: Any,
-        episode: Episode,
-        *,
-        stream: Session | None,
-        explore: bool,
-        seed: int | None,
-        session: str | None,
-    ) -> Decision:
+    def _carried(self, asked: _Asked, stream: Session | None) -> Decision:
         """Act from a memory that came with the request, for the version that it is of."""
+        store, name, version, episode = asked.store, asked.name, asked.version, asked.episode
         assert episode.state is not None
         carried = Carried.read(episode.state)
         if carried.belongs_to is not None:
             policy = _owner(store, name, version, carried.belongs_to)
         else:
-            policy = store.choose(name, version, session)
+            policy = asked.choose()
             if stream is not None and _is_loaded(store, stream.policy) and version is None:
                 policy = stream.policy
             if carried.arrays and policy.contract.state and not store.is_certain(name, version):
@@ -135,33 +121,20 @@ class Episodes:
                 )
         if policy.limited and not carried.begins and carried.last_action is None and episode.last_action is None:
             raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
-        taken = _timed(policy, obs, episode, carried, explore=explore, seed=seed)
+        taken = _timed(policy, asked, carried)
         carries = bool(policy.contract.state) or policy.limited
         return taken.decision(policy, EpisodeNote(state=carry(policy, taken.step)) if carries else None)
 
-    def _on_stream(
-        self,
-        store: PolicyStore,
-        name: str,
-        version: str | None,
-        obs: Any,
-        episode: Episode,
-        stream: Session,
-        *,
-        explore: bool,
-        seed: int | None,
-        session: str | None,
-    ) -> Decision:
+    def _on_stream(self, asked: _Asked, stream: Session) -> Decision:
         """Act from the memory that the connection keeps."""
-        policy, begins = stream.policy, episode.reset
+        policy, begins = stream.policy, asked.episode.reset
         try:
-            self._check_version(store, name, version, stream)
+            self._check_version(asked, stream)
         except SessionError:
             if not begins:
                 raise
-            policy = store.choose(name, version, session)  # an episode begins: with what is there now
-        before = Session(policy) if begins else stream
-        taken = _timed(policy, obs, episode, NOTHING, session=before, explore=explore, seed=seed)
+            policy = asked.choose()  # an episode begins: with what is there now
+        taken = _timed(policy, asked, session=Session(policy) if begins else stream)
         rows = taken.step.rows if policy.episodic else 0
         if rows != stream.rows:
             self.sessions.hold(stream, rows)
@@ -170,24 +143,15 @@ class Episodes:
         stream.keep(taken.step)
         return taken.decision(policy, EpisodeNote(step=stream.steps))
 
-    def _in_session(
-        self,
-        store: PolicyStore,
-        name: str,
-        version: str | None,
-        obs: Any,
-        episode: Episode,
-        *,
-        explore: bool,
-        seed: int | None,
-        seq: int | None,
-    ) -> Decision:
+    def _in_session(self, asked: _Asked, seq: int | None) -> Decision:
+        """Act from the memory that stands under the request's id; `seq` tells a request sent again."""
+        name, episode = asked.name, asked.episode
         session_id = episode.session_id
         assert session_id is not None
         if episode.state is not None:
             raise RequestError("the request has a 'state' and a 'session_id': either you carry the state, or we do")
         if episode.reset:
-            policy = store.choose(name, version, str(session_id))
+            policy = asked.choose()
             if not self._alone():
                 raise SessionError(
                     "this server has several replicas, and requests of a session would reach any of them: send the "
@@ -198,11 +162,11 @@ class Episodes:
             session = Session(policy)
         else:
             session = self.sessions.find(name, session_id)
-            self._check_version(store, name, version, session, session_id)
-            repeated = session.repeated(seq, obs)
+            self._check_version(asked, session, session_id)
+            repeated = session.repeated(seq, asked.obs)
             if repeated is not None:
                 return repeated
-        taken = _timed(session.policy, obs, episode, NOTHING, session=session, explore=explore, seed=seed)
+        taken = _timed(session.policy, asked, session=session)
         if episode.end:
             self.sessions.end(name, session_id)
         elif episode.reset:
@@ -210,31 +174,43 @@ class Episodes:
         session.keep(taken.step)
         decision = taken.decision(session.policy, EpisodeNote(session_id=session_id, step=session.steps))
         session.seq, session.answer = seq, decision
-        session.asked = b"" if seq is None else session.policy.fingerprint(obs)
+        session.asked = b"" if seq is None else session.policy.fingerprint(taken.step.fed)
         return decision
 
-    def _check_version(
-        self,
-        store: PolicyStore,
-        name: str,
-        version: str | None,
-        session: Session,
-        session_id: SessionId | None = None,
-    ) -> None:
+    def _check_version(self, asked: _Asked, session: Session, session_id: SessionId | None = None) -> None:
         """A session stays with the version it began with, for as long as that is loaded."""
+        name, version = asked.name, asked.version
         own = session.policy.contract.version
         which = "this stream's episode" if session_id is None else f"session '{shown(session_id)}'"
-        if not _is_loaded(store, session.policy):
+        if not _is_loaded(asked.store, session.policy):
             if session_id is not None:
                 self.sessions.end(name, session_id, lost=True)
             raise SessionLostError(
                 f"{which} was with version {own} of policy '{name}', which is no longer loaded: begin an episode"
             )
-        if version is not None and store.get(name, version) is not session.policy:
+        if version is not None and asked.store.get(name, version) is not session.policy:
             raise SessionError(
                 f"{which} is with version {own} of policy '{name}', and the request names version {version[:32]}: "
                 "begin an episode with that one"
             )
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """A request of an episode."""
+
+    store: PolicyStore
+    name: str
+    version: str | None
+    obs: Any
+    episode: Episode
+    explore: bool
+    seed: int | None
+    session: str | None  # whose it is, for the canary's share
+
+    def choose(self) -> Policy:
+        """Return the policy for whoever is with none yet."""
+        return self.store.choose(self.name, self.version, self.session)
 
 
 def _is_loaded(store: PolicyStore, policy: Policy) -> bool:
@@ -275,28 +251,20 @@ class _Taken:
         )
 
 
-def _timed(
-    policy: Policy,
-    obs: Any,
-    episode: Episode,
-    carried: Carried,
-    *,
-    session: Session | None = None,
-    explore: bool,
-    seed: int | None,
-) -> _Taken:
+def _timed(policy: Policy, asked: _Asked, carried: Carried = NOTHING, *, session: Session | None = None) -> _Taken:
     """Take a step from what the client carries, or from a session's memory."""
+    episode = asked.episode
     policy.notices.clear()
     started = time.perf_counter()
     step = policy.step(
-        obs,
+        asked.obs,
         before=None if session is None else session.state,
         last=None if session is None else session.last,
         state=carried.arrays if carried.arrays or (policy.contract.state and not carried.begins) else None,
         last_action=carried.last_action if episode.last_action is None else episode.last_action,
         reward=episode.reward,
-        explore=explore,
-        seed=seed,
+        explore=asked.explore,
+        seed=asked.seed,
     )
     taken_ms = (time.perf_counter() - started) * 1e3
     return _Taken(step, taken_ms, take_notices(policy))

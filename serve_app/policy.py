@@ -89,6 +89,8 @@ class Step:
     """What the next step needs, `[batch, *shape]`; empty for a stateless policy."""
     batch: int | None
     """How many observations there were; None for one that came alone."""
+    fed: Mapping[str, NDArray[Any]]
+    """What the network was given, by tensor name."""
 
     @property
     def rows(self) -> int:
@@ -131,9 +133,7 @@ class Policy:
         self._reader = StructureReader(
             contract.name, contract.observation_space, options=options, notice=self._take_notice
         )
-        self._silent_reader = StructureReader(
-            contract.name, contract.observation_space, options=PolicyOptions(out_of_bounds="accept")
-        )
+        self._observed = list(leaf_specs(contract.observation_space, "obs"))
         actions = leaf_specs(contract.action_space, "action")
         self._guards = {name: ActionGuard(contract.name, name, leaf) for name, leaf in actions.items()}
         self._memory = Memory(contract)
@@ -280,13 +280,17 @@ class Policy:
                 guard.check(action[name])
         space = self._contract.action_space
         own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
-        return Step(build_action(space, own), action, after, rows if batch else None)
+        return Step(build_action(space, own), action, after, rows if batch else None, feed)
 
-    def fingerprint(self, obs: Observation) -> bytes:
-        """Return what tells an observation from others, in whatever form it comes. Raises ObservationError."""
+    def read(self, obs: Observation) -> Mapping[str, NDArray[Any]]:
+        """Return what the network would be given for an observation. Raises ObservationError."""
+        return self._reader.read(obs)[0]
+
+    def fingerprint(self, fed: Mapping[str, NDArray[Any]]) -> bytes:
+        """Return what tells the observation of a feed (`read`, `Step.fed`) from others."""
         digest = hashlib.blake2b(digest_size=16)
-        for array in self._silent_reader.read(obs)[0].values():
-            digest.update(array.tobytes())
+        for name in self._observed:
+            digest.update(fed[name].tobytes())
         return digest.digest()
 
     def twin(self) -> Policy:
