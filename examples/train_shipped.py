@@ -116,9 +116,11 @@ class Validation:
         self._next = row.env_steps + self.env_steps
         return True
 
-    def success(self, checkpoint: Path, settings: dict[str, Any]) -> float:
+    def success(self, algorithm: Algorithm, settings: dict[str, Any]) -> float:
         """Return the share of successes, over all that the settings evaluate."""
         with tempfile.TemporaryDirectory() as folder:
+            checkpoint = Path(folder) / "checkpoint"
+            algorithm.save_to_path(str(checkpoint))
             bundle = export_checkpoint(checkpoint, Path(folder), name="candidate", notify=lambda line: None)
             with Policy.load(bundle.path) as policy:
                 measured = evaluate_shipped.evaluate(policy, settings, self.episodes, self.seed)
@@ -204,9 +206,7 @@ def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
                     if not filled or not validation.is_due(row):
                         value = float("-inf")
                     else:
-                        candidate = folder / "candidate"
-                        algorithm.save_to_path(str(candidate.resolve()))
-                        value = validation.success(candidate, settings)
+                        value = validation.success(algorithm, settings)
                         print(f"{value:.1%} success of the exported policy over {validation.episodes} episodes")
                 if filled and value > best:
                     best = value

@@ -279,6 +279,23 @@ def test_robot_server_command_serves_and_ends_on_ctrl_c(command: Any) -> None:
     assert process.wait(20) == 0
 
 
+HAMMERED = """
+import os, subprocess, sys
+from rlservo.envs.robot_server.server import arrives, stop_signals
+signals = stop_signals()
+send = f"import os, time\\nfor _ in range(10_000): os.kill({os.getpid()}, 15); time.sleep(0.0001)"
+sender = subprocess.Popen([sys.executable, "-c", send])
+while sender.poll() is None:
+    arrives(signals, 1e-6)
+"""
+
+
+def test_a_signal_at_any_moment_of_the_wait_is_survived() -> None:
+    """With an Event that the handler sets, most runs end here in the lock that their own thread holds."""
+    done = subprocess.run([sys.executable, "-c", HAMMERED], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
