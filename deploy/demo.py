@@ -9,7 +9,6 @@ import ctypes
 import shlex
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -29,6 +28,7 @@ from rlservo.export.bundle import Contract
 from rlservo.export.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.acting import Observation
 from rlservo.serve_app.client import PolicyClient
+from rlservo.serve_app.processes import free_ports
 from rlservo.serve_app.rollout import rollout
 
 FIRST_SEED = 10_000  # not among the seeds the policies were trained with
@@ -145,7 +145,7 @@ def _show(console: Console, *words: str) -> None:
 @contextmanager
 def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
     """Run `rlservo serve` on a free port until the block ends; stop it as Ctrl-C would."""
-    port = _free_port()
+    (port,) = free_ports(1)
     words = ("serve", str(repository), "--port", str(port))
     _show(console, *words)
     url = f"http://127.0.0.1:{port}"
@@ -216,12 +216,6 @@ def _stop(server: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         server.send_signal(signal.SIGTERM)
         server.wait(STOP_TIMEOUT_S)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _table(runs: list[RobotRun]) -> Table:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import secrets
 import shutil
 import signal
 import socket
@@ -21,6 +22,9 @@ from rlservo.export.errors import UsageError
 
 MARK = "RLSERVO_LAUNCH"
 PROC = Path("/proc")
+# Where `free_ports` looks: above those Ray gives its workers, below those of replicas (`launcher.py`, 30000 and up)
+# and those of outgoing connections (Linux: 32768 and up).
+PORTS = range(20_000, 30_000)
 QUIET_S = 0.3  # without a sign of a marked process, before the last of them counts as gone
 
 
@@ -90,12 +94,19 @@ def port_holder(port: int) -> tuple[int, str] | None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Return ports free at the moment of asking, all different."""
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) for _ in range(count)]
-        for each in sockets:
-            each.bind(("", 0))
-        return [int(each.getsockname()[1]) for each in sockets]
+    """Return ports free at the moment of asking, all different.
+
+    The system's own choice (port 0) would be one of those it also gives to outgoing connections, of which Ray makes
+    hundreds before its last server listens.
+    """
+    found: list[int] = []
+    with contextlib.ExitStack() as held:
+        while len(found) < count:
+            port = PORTS[secrets.randbelow(len(PORTS))]
+            with contextlib.suppress(OSError):
+                held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM)).bind(("", port))
+                found.append(port)
+    return found
 
 
 def marked(mark: str, session: int | None = None) -> list[int]:

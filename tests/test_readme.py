@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,17 +12,13 @@ from pathlib import Path
 
 import pytest
 
+from rlservo.serve_app.processes import free_ports
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture
@@ -37,7 +32,7 @@ def checkout(tmp_path: Path) -> Path:
 @pytest.mark.serve
 @pytest.mark.slow
 def test_commands_run_as_written(checkout: Path) -> None:
-    port = free_port()
+    (port,) = free_ports(1)
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "HOME": str(checkout)}
     environment |= {"RLSERVO_URL": f"http://127.0.0.1:{port}", "XDG_RUNTIME_DIR": str(checkout)}
 

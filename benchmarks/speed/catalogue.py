@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from rlservo.export.bundle import ONNX_FILE, Bundle, load_bundle
 from rlservo.serve_app.arrays import pack
+from rlservo.serve_app.processes import free_ports
 from speed.environments import InstallError, python_of
-from speed.servers import Exchange, Server, free_ports
+from speed.servers import Exchange, Server
 
 PEERS = Path(__file__).resolve().parent.parent / "peers"
 BARE, RLSERVO, TWO = "uvicorn + FastAPI", "rlservo serve", "rlservo serve, 2 replicas"

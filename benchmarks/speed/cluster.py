@@ -19,8 +19,9 @@ from typing import Any
 import yaml
 
 from rlservo.serve_app.haproxy import find_binary, prepare
+from rlservo.serve_app.processes import free_ports
 from speed.catalogue import Case, asked
-from speed.servers import Server, environment, free_ports
+from speed.servers import Server, environment
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 HEAD = Path(__file__).with_name("head.py")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import secrets
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.client import HTTPConnection
 from pathlib import Path
@@ -19,7 +18,6 @@ from speed.machine import MARK, Process, family
 
 START_S = 180.0  # a cold Ray on a small machine needs most of a minute
 STOP_S = 30.0
-PORTS = range(20_000, 29_000)  # below Ray Serve's own (30000 and up) and those of outgoing connections (32768 and up)
 LINGER_S = 5.0  # what a server's other processes get after its first one has ended
 
 
@@ -154,19 +152,6 @@ def environment(mark: str, extra: dict[str, str]) -> dict[str, str]:
     """Return the environment of a server: the user's own RAY_* settings would not be Ray's defaults."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "RLSERVO_"))}
     return {**kept, "PYTHONDONTWRITEBYTECODE": "1", **extra, MARK: mark}
-
-
-def free_ports(count: int) -> list[int]:
-    """Return free ports that no outgoing connection takes meanwhile: a busy machine starts a server in a minute."""
-    with ExitStack() as held:
-        found: list[int] = []
-        while len(found) < count:
-            one = held.enter_context(socket.socket())
-            port = PORTS[secrets.randbelow(len(PORTS))]
-            with suppress(OSError):
-                one.bind(("127.0.0.1", port))
-                found.append(port)
-        return found
 
 
 def listening(port: int) -> bool:

@@ -23,6 +23,7 @@ from rich.console import Console
 import soak as soak_module
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.http import create_app
+from rlservo.serve_app.processes import free_ports
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
 from soak import Track, mix, soak
@@ -32,7 +33,7 @@ from speed.loads import HttpLine, Load, LoadError, WebSocketLine, infer_request,
 from speed.machine import OTHER, PROXY, REPLICA, processes
 from speed.report import Result, Verdict, verdicts
 from speed.rounds import JSON1, JSON16, Rounds, Sample, check_answers
-from speed.servers import Exchange, Server, free_ports, listening, running
+from speed.servers import Exchange, Server, listening, running
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 UR5 = ROOT / "examples" / "checkpoints" / "ur5_positioning"

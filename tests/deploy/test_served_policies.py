@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ import pytest
 from rlservo.export.exporter import export_checkpoint
 from rlservo.export.verify import verify_bundle
 from rlservo.serve_app.client import PolicyClient
+from rlservo.serve_app.processes import free_ports
 from rlservo.serve_app.rollout import rollout
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,9 +41,7 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def url(policies: Path, runtime: Path) -> Iterator[str]:
     """The two policies behind `rlservo serve`, as a user starts it."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    (port,) = free_ports(1)
     server = subprocess.Popen(
         [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(policies), "--port", str(port)],
         stdout=subprocess.DEVNULL,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ import pytest
 from rlservo.envs.robot_server.manager import RobotServers, ServerManager
 from rlservo.export.exporter import export_checkpoint
 from rlservo.serve_app.client import PolicyClient
+from rlservo.serve_app.processes import free_ports
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "robo_gym_client.py"
@@ -28,9 +28,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The shipped UR5 policy behind `rlservo serve`."""
     out = tmp_path_factory.mktemp("served")
     export_checkpoint(ROOT / "examples/checkpoints/ur5_positioning", out, name="ur5", notify=lambda line: None)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    (port,) = free_ports(1)
     server = subprocess.Popen(
         [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(out), "--port", str(port)],
         stdout=subprocess.DEVNULL,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import shutil
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from rlservo.serve_app.processes import free_ports
 
 TINY = ("--set", "train_batch_size_per_learner=400", "--hidden", "16")
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,12 +29,6 @@ exec "$@"
 SCONTROL = """#!/usr/bin/env bash
 [ "$1 $2 $3" = "show hostnames node[1-2]" ] && printf 'node1\nnode2\n'
 """
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("", 0))
-        return int(probe.getsockname()[1])
 
 
 def submit(script: str, *arguments: str, folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
@@ -86,7 +81,7 @@ def test_one_node_trains_with_all_cores_but_the_drivers(tmp_path: Path) -> None:
 def test_several_nodes_form_a_cluster_that_ends_with_the_job(tmp_path: Path) -> None:
     done = submit(
         "several_nodes.sh", *TINY, "--stop-iters", "1", "--episodes", "1", folder=tmp_path,
-        SLURM_JOB_NODELIST="node[1-2]", RLSERVO_RAY_PORT=str(free_port()),
+        SLURM_JOB_NODELIST="node[1-2]", RLSERVO_RAY_PORT=str(free_ports(1)[0]),
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     called = (tmp_path / "srun.log").read_text().splitlines()

@@ -26,6 +26,7 @@ from rlservo.export.errors import (
     UsageError,
 )
 from rlservo.serve_app.client import PolicyClient
+from rlservo.serve_app.processes import free_ports
 
 CONTRACT = Contract(
     name="arm",
@@ -149,19 +150,13 @@ def client(server: Scripted) -> Iterator[PolicyClient]:
         yield made
 
 
-def free_port() -> int:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        return int(taken.getsockname()[1])
-
-
 def test_the_action_has_the_contracts_dtype_and_shape(client: PolicyClient) -> None:
     action = client.act(OBS)
     assert (action.dtype, action.shape, action.tolist()) == (np.float32, (2,), GOOD)
 
 
 def test_a_refused_connection_is_unavailable_after_bounded_retries() -> None:
-    url = f"http://127.0.0.1:{free_port()}"
+    url = f"http://127.0.0.1:{free_ports(1)[0]}"
     with PolicyClient(url, "arm", retries=2) as client:
         began = time.monotonic()
         with pytest.raises(UnavailableError, match=f"{url} cannot be reached: .*refused"):
@@ -358,7 +353,7 @@ def test_without_a_name_the_only_policy_is_taken_and_several_are_listed(server: 
 
 
 def test_wait_until_ready_returns_when_the_server_comes_up() -> None:
-    port = free_port()
+    (port,) = free_ports(1)
     script = (
         "import sys, time; time.sleep(0.5); from http.server import *\n"
         "class H(BaseHTTPRequestHandler):\n"

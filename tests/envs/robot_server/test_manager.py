@@ -21,6 +21,7 @@ from rlservo.envs.robot_server.connections import count_connections
 from rlservo.envs.robot_server.manager import MANAGER_PORTS, RobotServers, ServerManager
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, SERVER_MANAGER, Empty, ManagerStatus, State
 from rlservo.envs.robot_server.server import PortInUseError
+from rlservo.serve_app.processes import check_port, free_ports
 
 UR = "roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur5"
 MIR = "roslaunch mir100_robot_server sim_robot_server.launch"
@@ -59,8 +60,7 @@ def test_server_starts_answers_and_is_gone_after_the_kill(manager: ServerManager
     assert get_state(started.port).success
     assert client.kill(started.port).success
     assert not is_alive(pid)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", started.port))  # the port is free again
+    check_port("127.0.0.1", started.port)  # it is free again
     with pytest.raises(grpc.RpcError):
         get_state(started.port)
 
@@ -83,10 +83,10 @@ def test_line_that_cannot_be_honoured_is_answered_with_the_reason(
 
 
 def test_fixed_server_port_that_is_taken_is_answered_with_the_reason(client: Any) -> None:
+    (port,) = free_ports(1)
     with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
+        taken.bind(("127.0.0.1", port))
         taken.listen()
-        port = taken.getsockname()[1]
         answer = client.start(f"{UR} server_port:={port}")
     assert not answer.success
     assert f"cannot listen on 127.0.0.1:{port}: the port is taken" in answer.info
@@ -221,7 +221,7 @@ def robot_servers_of(pid: int) -> list[int]:
 
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 def test_nothing_outlives_the_manager_however_it_ends(command: Any, end: signal.Signals) -> None:
-    process, port = command("server-manager", "--port", str(free_port()))
+    process, port = command("server-manager", "--port", str(free_ports(1)[0]))
     with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
         from rlservo.envs.robot_server.messages import ServerRequest
 
@@ -250,17 +250,13 @@ def test_manager_takes_the_first_free_port_of_robo_gyms_range(command: Any) -> N
             assert verify(Empty().SerializeToString(), timeout=5).alive
     first.terminate()
     first.wait(5)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", first_port))
+    check_port("127.0.0.1", first_port)  # it is free again
 
 
 def test_manager_says_so_when_every_port_is_taken() -> None:
     with contextlib.ExitStack() as stack:
         for port in MANAGER_PORTS:
-            taken = stack.enter_context(socket.socket())
-            with contextlib.suppress(OSError):  # somebody else's, which is as good
-                taken.bind(("127.0.0.1", port))
-                taken.listen()
+            stack.enter_context(hold(port))
         servers = RobotServers()
         stack.callback(servers.close)
         with pytest.raises(PortInUseError, match=r"every port from 50100 to 50199 on 127.0.0.1 is taken"):
@@ -334,7 +330,19 @@ def test_robot_server_without_a_client_ends_itself_and_one_with_a_client_stays()
         servers.close()
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def hold(port: int) -> contextlib.AbstractContextManager[object]:
+    """Listen on a port, whatever connections linger there; where somebody else listens, that will do."""
+    deadline = time.monotonic() + 30
+    while True:
+        taken = socket.socket()
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            taken.bind(("127.0.0.1", port))
+            taken.listen()
+            return taken
+        except OSError:  # it may be an outgoing connection's, which is soon gone
+            taken.close()
+            with contextlib.suppress(OSError):
+                return socket.create_connection(("127.0.0.1", port), timeout=1)
+            assert time.monotonic() < deadline, f"port {port} is neither free nor listened on"
+            time.sleep(0.1)
