@@ -18,7 +18,7 @@ from rlservo.export.errors import DeadlineError, RlservoError, TooLargeError, Un
 from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.control import Control
 from rlservo.serve_app.episodes import Episode, Episodes
-from rlservo.serve_app.gauges import drift, queue, sessions
+from rlservo.serve_app.gauges import batches, drift, queue, sessions
 from rlservo.serve_app.keys import Guard, Keys
 from rlservo.serve_app.logs import RequestLog
 from rlservo.serve_app.metrics import Metrics
@@ -57,6 +57,7 @@ class Core:
         self.metrics = Metrics(replica)
         self.metrics.sources += [
             partial(queue, self, replica),
+            partial(batches, self, replica),
             partial(drift, self, replica),
             partial(sessions, self, replica),
             partial(self.shadows.families, replica),
@@ -99,7 +100,7 @@ class Core:
         """
         return self.episodes.policy_of(self.store(), name, version, session_id, identity)
 
-    def act(
+    async def act(
         self,
         name: str,
         version: str | None,
@@ -135,7 +136,10 @@ class Core:
             if rows > self.settings.max_batch:
                 raise TooLargeError(f"a batch of {rows} observations is too large: at most {self.settings.max_batch}")
         if episode is None and stream is None:
-            decision = store.act(name, version, obs, explore=explore, seed=seed, session=session)
+            if store.batches and not explore:
+                decision = await store.act_together(name, version, obs, session)
+            else:
+                decision = store.act(name, version, obs, explore=explore, seed=seed, session=session)
         else:
             decision = self.episodes.act(
                 store,

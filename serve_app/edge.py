@@ -1,7 +1,8 @@
 """What the HTTP protocols share: a body within its limits, one answer for each error, and a route without machinery.
 
 `Endpoint` is the hot path: a plain ASGI callable, because FastAPI's dependency and response machinery costs more than
-the policy does. Everything runs in the event loop: a decision takes microseconds, a hop to a thread takes more.
+the policy does. Everything runs in the event loop: a decision takes microseconds, a hop to a thread takes more. It
+pauses nowhere, but for a policy that computes together what comes at the same time (`batching.py`).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import asyncio
 import logging
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from fastapi.routing import APIRoute
@@ -61,7 +62,7 @@ JSON = b"application/json"
 
 Headers = tuple[tuple[bytes, bytes], ...]
 Body = bytes | bytearray
-Handle = Callable[[Scope, Body, float], tuple[bytes, Headers, Decision]]
+Handle = Callable[[Scope, Body, float], Awaitable[tuple[bytes, Headers, Decision]]]
 CheckHeaders = Callable[[list[tuple[bytes, bytes]]], None]
 
 
@@ -88,7 +89,7 @@ class Endpoint:
             if body is None:  # the client has gone
                 return
             received = min(started, admission.enter())  # only now: a body that is slow to come waits for itself
-            content, headers, decision = self._handle(scope, body, received)
+            content, headers, decision = await self._handle(scope, body, received)
             status = 200
             taken, batch = time.perf_counter() - received, decision.batch or 1
             self._core.metrics.answered(self._protocol, decision, batch, taken)

@@ -39,6 +39,20 @@ def queue(core: Core, replica: str) -> Iterator[Metric]:
     yield turned_away
 
 
+def batches(core: Core, replica: str) -> Iterator[Metric]:
+    """Yield how many observations were computed together, of the policies whose options ask for it."""
+    labels = ["replica", "policy", "version"]
+    runs = CounterMetricFamily("rlservo_micro_batch_runs", "Runs of the network for single observations", labels=labels)
+    observations = CounterMetricFamily(
+        "rlservo_micro_batch_observations", "Single observations computed in those runs", labels=labels
+    )
+    for name, version, policy in core.policies():
+        if policy.batcher is not None:
+            runs.add_metric([replica, name, version], policy.batcher.runs)
+            observations.add_metric([replica, name, version], policy.batcher.observations)
+    yield from (runs, observations)
+
+
 def sessions(core: Core, replica: str) -> Iterator[Metric]:
     """Yield what is known of the memories that are kept here."""
     kept = core.episodes.sessions

@@ -125,14 +125,14 @@ class _Act:
     def __init__(self, core: Core) -> None:
         self._core = core
 
-    def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
+    async def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
         self._core.store()  # not ready comes before any fault of the request
         request = wire.read_request(body)
         if request.non_finite and request.episode is not None:
             wire.refuse_non_finite()  # before a session moves on
         params = scope["path_params"]
         try:
-            decision = self._core.act(
+            decision = await self._core.act(
                 params["name"],
                 params.get("version"),
                 request.obs,

@@ -152,7 +152,7 @@ class _Infer:
     def __init__(self, core: Core) -> None:
         self._core = core
 
-    def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
+    async def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
         params, encoding, accepted, length = scope["path_params"], b"", b"", None
         contract = self._core.store().get(params["name"], params.get("version")).contract
         for name, value in scope["headers"]:
@@ -172,7 +172,7 @@ class _Infer:
             document, inputs, non_finite = _read_request(view, length, params["name"])
         if non_finite and (document.get("parameters") or {}).get("sequence_id"):
             wire.refuse_non_finite()  # before the sequence moves on
-        answer = decide(
+        answer = await decide(
             self._core,
             params["name"],
             params.get("version"),
@@ -199,7 +199,7 @@ class Answer:
     binary: dict[str, bool]  # the same names: as bytes, or in the JSON
 
 
-def decide(
+async def decide(
     core: Core,
     name: str,
     version: str | None,
@@ -224,7 +224,7 @@ def decide(
     binary = _wanted_outputs(contract, document, parameters)
     obs = _observation(contract, inputs)
     episode = _episode(contract, inputs, parameters) if parameters or len(inputs) > 1 else None
-    decision = core.act(
+    decision = await core.act(
         name,
         version,
         obs,

@@ -87,25 +87,25 @@ class InferenceService:
         self._grpc = Grpc(core, local_only=local_only)
 
     async def ServerLive(self, request: Incoming, grpc_context: Any) -> Any:
-        return self._grpc.answer("ServerLive", request, grpc_context)
+        return await self._grpc.answer("ServerLive", request, grpc_context)
 
     async def ServerReady(self, request: Incoming, grpc_context: Any) -> Any:
-        return self._grpc.answer("ServerReady", request, grpc_context)
+        return await self._grpc.answer("ServerReady", request, grpc_context)
 
     async def ServerMetadata(self, request: Incoming, grpc_context: Any) -> Any:
-        return self._grpc.answer("ServerMetadata", request, grpc_context)
+        return await self._grpc.answer("ServerMetadata", request, grpc_context)
 
     async def ModelReady(self, request: Incoming, grpc_context: Any) -> Any:
-        return self._grpc.answer("ModelReady", request, grpc_context)
+        return await self._grpc.answer("ModelReady", request, grpc_context)
 
     async def ModelMetadata(self, request: Incoming, grpc_context: Any) -> Any:
-        return self._grpc.answer("ModelMetadata", request, grpc_context)
+        return await self._grpc.answer("ModelMetadata", request, grpc_context)
 
     async def ModelInfer(self, request: Incoming, grpc_context: Any) -> Any:
-        return self._grpc.answer("ModelInfer", request, grpc_context)
+        return await self._grpc.answer("ModelInfer", request, grpc_context)
 
     async def RepositoryIndex(self, request: Incoming, grpc_context: Any) -> Any:
-        return self._grpc.answer("RepositoryIndex", request, grpc_context)
+        return await self._grpc.answer("RepositoryIndex", request, grpc_context)
 
     async def ModelStreamInfer(self, requests: AsyncIterator[bytes], grpc_context: Any) -> AsyncIterator[Any]:
         async for reply in self._grpc.stream(requests, grpc_context):
@@ -128,14 +128,14 @@ class Grpc:
             "RepositoryIndex": self._index,
         }
 
-    def answer(self, method: str, request: Incoming, context: Any) -> Any:
+    async def answer(self, method: str, request: Incoming, context: Any) -> Any:
         """Return the reply to one call. An error sets the status, and the empty reply is not looked at."""
         try:
             request_id, session = self._check(method, context)
             if request_id is not None:
                 context.set_trailing_metadata([(REQUEST_ID, request_id)])  # in addition to Serve's own
             if method == "ModelInfer":
-                return self._infer(request, request_id, session)
+                return await self._infer(request, request_id, session)
             return self._methods[method](request)
         except Exception as error:
             _fail(context, error)
@@ -167,7 +167,7 @@ class Grpc:
                     return
                 try:
                     yield messages.ModelStreamInferResponse(
-                        infer_response=self._infer((content, None), request_id, session)
+                        infer_response=await self._infer((content, None), request_id, session)
                     )
                 except Exception as error:
                     sentence = _explain(error)[1]
@@ -206,7 +206,7 @@ class Grpc:
         asked = _parse(messages.RepositoryIndexRequest, request[0])
         return messages.RepositoryIndexResponse(models=oip.repository_index(self._core, ready=asked.ready))
 
-    def _infer(self, request: Incoming, request_id: str | None, session: str | None) -> Any:
+    async def _infer(self, request: Incoming, request_id: str | None, session: str | None) -> Any:
         content, remaining_s = request
         name, version = "", None
         try:
@@ -223,7 +223,7 @@ class Grpc:
                     {"name": output.name, "parameters": _parameters(output.parameters)} for output in asked.outputs
                 ],
             }
-            answer = oip.decide(
+            answer = await oip.decide(
                 self._core,
                 name,
                 version,

@@ -29,5 +29,11 @@ class PolicyOptions(BaseModel):
     beyond_action_step: Literal["limit", "refuse"] = "limit"
     """What happens to a larger step: made as large as is allowed, and said so, or refused."""
 
+    micro_batch: Annotated[int, Field(ge=0, le=1024)] = 0
+    """The most single observations that a server computes in one run of the network, of those that are there at the
+    same time; 0 and 1: each by itself. For large networks (`benchmarks/batching.py` tells which). A batch's sums are
+    formed in another order, so the last bits of an action may differ. Policies with a memory or a `max_action_step`,
+    and requests that explore, are computed one by one."""
+
 
 DEFAULT_OPTIONS = PolicyOptions()

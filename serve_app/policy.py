@@ -47,6 +47,7 @@ from rlservo.export.errors import (
 from rlservo.export.scores import split_scores
 from rlservo.export.session import open_session
 from rlservo.serve_app.acting import Observation
+from rlservo.serve_app.batching import Batcher, Tensors
 from rlservo.serve_app.drift import Drift
 from rlservo.serve_app.exploring import distribution_size, sample_leaves
 from rlservo.serve_app.guard import ActionGuard
@@ -158,6 +159,11 @@ class Policy:
         self._input = contract.inputs[0].name
         self._action_only = ["action"]
         self._dist_only = ["action_dist_inputs"]
+        self.batcher: Batcher | None = None
+        """Where it computes together with others what comes at the same time, if the options want that."""
+        if options.micro_batch > 1 and not self.episodic and len(contract.inputs) == len(self._observed):
+            # The session's own `run`: what is waiting is computed, also where the policy is closed meanwhile.
+            self.batcher = Batcher(_named(session.run, list(self._guards)), options.micro_batch)
 
     @classmethod
     def load(
@@ -282,9 +288,16 @@ class Policy:
         own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
         return Step(build_action(space, own), action, after, rows if batch else None, feed)
 
-    def read(self, obs: Observation) -> Mapping[str, NDArray[Any]]:
-        """Return what the network would be given for an observation. Raises ObservationError."""
-        return self._reader.read(obs)[0]
+    def read(self, obs: Observation) -> tuple[dict[str, NDArray[Any]], bool]:
+        """Return what the network would be given, and whether that is a batch. Raises ObservationError."""
+        return self._reader.read(obs)
+
+    def action(self, computed: Mapping[str, NDArray[Any]], *, batch: bool) -> Any:
+        """Return the action that the network's outputs are (`read`, `batcher`), checked. Raises ActionError."""
+        for name, guard in self._guards.items():
+            guard.check(computed[name])
+        own = {name: computed[name] if batch else computed[name][0, ...] for name in self._guards}
+        return build_action(self._contract.action_space, own)
 
     def fingerprint(self, fed: Mapping[str, NDArray[Any]]) -> bytes:
         """Return what tells the observation of a feed (`read`, `Step.fed`) from others."""
@@ -368,6 +381,10 @@ class Policy:
                 f"policy '{self._contract.name}' gave a non-finite action distribution for this observation"
             )
         return sample_leaves(inputs, self._check_explores(), self._contract.action_space, rng)
+
+
+def _named(run: _Run, names: list[str]) -> Callable[[Tensors], Tensors]:
+    return lambda feed: dict(zip(names, run(names, feed), strict=True))
 
 
 def _refuse_closed(_names: list[str], _feed: Mapping[str, Any]) -> NoReturn:

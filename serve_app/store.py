@@ -106,6 +106,8 @@ class PolicyStore:
         self._shadow: dict[str, Shadow] = {}
         for name, versions in self._policies.items():
             self._arrange(name, versions, (plans or {}).get(name) or PolicyPlan(versions=dict.fromkeys(versions, "")))
+        self.batches = any(policy.batcher for versions in self._policies.values() for policy in versions.values())
+        """Whether some policy computes together what comes at the same time."""
 
     @classmethod
     def load(
@@ -225,17 +227,27 @@ class PolicyStore:
 
         Raises UnknownPolicyError, UnknownVersionError and what `Policy.act` raises.
         """
-        policy = self.choose(name, version, session)
-        if policy.episodic:  # its memory belongs to one episode, and a server has many callers
-            raise RequestError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}", NEEDS)
-        if policy.notices:
-            policy.notices.clear()
+        return _act(self._stateless(name, version, session), obs, explore, seed)
+
+    async def act_together(self, name: str, version: str | None, obs: Observation, session: str | None) -> Decision:
+        """Decide as `act` does without exploring; with what else is there in one run where the policy's options say so.
+
+        Raises what `act` raises.
+        """
+        policy = self._stateless(name, version, session)
+        if policy.batcher is None:
+            return _act(policy, obs)
+        policy.notices.clear()
         started = time.perf_counter()
-        action = policy.act(obs, explore=explore, seed=seed)
-        infer_ms = (time.perf_counter() - started) * 1e3
-        contract = policy.contract
-        notices = take_notices(policy) if policy.notices else ()
-        return Decision(action, name, contract.version, infer_ms, batch_of(action, contract.action_space), notices)
+        feed, batch = policy.read(obs)
+        notices = take_notices(policy)
+        read_ms = (time.perf_counter() - started) * 1e3
+        single = len(next(iter(feed.values()))) == 1  # also a batch of one: the Open Inference Protocol has no other
+        computed = await policy.batcher.compute(feed) if single else policy.batcher.compute_now(feed)
+        action = policy.action(computed.outputs, batch=batch)
+        space = policy.contract.action_space
+        infer_ms = read_ms + computed.milliseconds
+        return Decision(action, name, policy.contract.version, infer_ms, batch_of(action, space), notices)
 
     def close(self) -> None:
         """Close every policy."""
@@ -254,6 +266,12 @@ class PolicyStore:
         if shadow is not None and shadow is not default:
             self._shadow[name] = Shadow(default.contract.version, shadow.contract.version, shadow.twin())
 
+    def _stateless(self, name: str, version: str | None, session: str | None) -> Policy:
+        policy = self.choose(name, version, session)
+        if policy.episodic:  # its memory belongs to one episode, and a server has many callers
+            raise RequestError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}", NEEDS)
+        return policy
+
     def _versions(self, name: str) -> Mapping[str, Policy]:
         versions = self._policies.get(name)
         if versions is None:
@@ -262,6 +280,18 @@ class PolicyStore:
                 {"policies": list(self.names)},
             )
         return versions
+
+
+def _act(policy: Policy, obs: Observation, explore: bool = False, seed: int | None = None) -> Decision:
+    if policy.notices:
+        policy.notices.clear()
+    started = time.perf_counter()
+    action = policy.act(obs, explore=explore, seed=seed)
+    infer_ms = (time.perf_counter() - started) * 1e3
+    contract = policy.contract
+    notices = take_notices(policy) if policy.notices else ()
+    batch = batch_of(action, contract.action_space)
+    return Decision(action, contract.name, contract.version, infer_ms, batch, notices)
 
 
 def _draw(name: str, session: str | None, needs_session: bool) -> float:

@@ -165,7 +165,7 @@ class Stream:
             try:
                 obs, options = self._read(message, asked)
                 asked.seq = options.get("seq")
-                reply, decision = self._decide(asked, obs, options, received)
+                reply, decision = await self._decide(asked, obs, options, received)
             except RlservoError as error:
                 if not asked.keep:
                     raise
@@ -189,7 +189,7 @@ class Stream:
                     seq=asked.seq,
                 )
 
-    def _decide(
+    async def _decide(
         self, asked: _Conversation, obs: Any, options: Mapping[str, Any], received: float
     ) -> tuple[dict[str, Any], Decision]:
         """Return (reply, decision) for one request."""
@@ -198,7 +198,7 @@ class Stream:
         episode = wire.read_episode(options) if options else None
         if asked.session is None and episode is not None and episode.reset and episode.session_id is None:
             episode = replace(episode, reset=False)  # nothing is remembered here
-        decision = self._core.act(
+        decision = await self._core.act(
             asked.name,
             asked.version,
             obs,

@@ -25,9 +25,14 @@ pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
 @pytest.fixture(scope="module")
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The shipped UR5 policy behind `rlservo serve`."""
+    """The shipped policies for robo-gym's tasks behind `rlservo serve`."""
     out = tmp_path_factory.mktemp("served")
-    export_checkpoint(ROOT / "examples/checkpoints/ur5_positioning", out, name="ur5", notify=lambda line: None)
+    for folder, name in (
+        ("ur5_positioning", "ur5"),
+        ("mir100_navigation", "mir100"),
+        ("mir100_obstacle_avoidance", "mir100_obstacle_avoidance"),
+    ):
+        export_checkpoint(ROOT / "examples/checkpoints" / folder, out, name=name, notify=lambda line: None)
     (port,) = free_ports(1)
     server = subprocess.Popen(
         [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(out), "--port", str(port)],
@@ -65,19 +70,28 @@ def run(python: Path, installed: Path, *arguments: str) -> subprocess.CompletedP
     )
 
 
-def test_served_ur5_policy_reaches_95_percent_in_robo_gyms_environment(
-    robo_gym_python: Path, light_client: Path, url: str
+@pytest.mark.parametrize(
+    ("task", "episodes", "expected"),
+    [
+        ("EndEffectorPositioningUR", 100, 95),
+        ("NoObstacleNavigationMir100", 20, 18),
+        # 93.8% over 500 episodes: fewer than 13 of 20 come once in fifty thousand times.
+        ("ObstacleAvoidanceMir100", 20, 13),
+    ],
+)
+def test_served_policies_arrive_in_robo_gyms_environments(
+    robo_gym_python: Path, light_client: Path, url: str, task: str, episodes: int, expected: int
 ) -> None:
     manager = ServerManager(port=0, servers=RobotServers())
     try:
-        line = ("--url", url, "--manager-port", str(manager.port), "--episodes", "100", "--json")
-        done = run(robo_gym_python, light_client, *line)
+        line = ("--url", url, "--manager-port", str(manager.port), "--episodes", str(episodes), "--json")
+        done = run(robo_gym_python, light_client, "--task", task, *line)
         assert done.returncode == 0, done.stderr
         report = json.loads(done.stdout[done.stdout.index("{") : done.stdout.rindex("}") + 1])
-        assert report["environment"] == "EndEffectorPositioningURSim-v0"
-        assert report["episodes"] == 100
-        assert report["successes"] >= 95, report["endings"]
-        assert sum(report["endings"].values()) == 100
+        assert report["environment"] == f"{task}Sim-v0"
+        assert report["episodes"] == episodes
+        assert report["successes"] >= expected, report["endings"]
+        assert sum(report["endings"].values()) == episodes
         assert 0.0 < report["latency_ms"]["p50"] <= report["latency_ms"]["p95"] <= report["latency_ms"]["p99"]
         assert manager.servers.running == {}
     finally:
@@ -93,6 +107,12 @@ def test_client_needs_neither_ray_nor_a_new_protobuf(robo_gym_python: Path, ligh
     done = subprocess.run([str(robo_gym_python), "-c", code], capture_output=True, text=True, env=environment)
     assert done.stdout.startswith("3.20."), done.stderr
     assert done.stdout.strip().endswith("[]")
+
+
+def test_an_arms_model_for_the_mobile_robot_is_refused(robo_gym_python: Path, light_client: Path) -> None:
+    done = run(robo_gym_python, light_client, "--task", "ObstacleAvoidanceMir100", "--ur-model", "ur10")
+    assert done.returncode == 2
+    assert done.stderr.strip().endswith("--ur-model is for UR tasks, and ObstacleAvoidanceMir100 has a MiR100")
 
 
 def test_missing_server_is_one_sentence(robo_gym_python: Path, light_client: Path) -> None:

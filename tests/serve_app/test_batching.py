@@ -1,0 +1,223 @@
+"""Micro-batching: what is there at the same time is computed in one run, and everybody gets their own action."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import re
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import websockets.asyncio.client
+from numpy.typing import NDArray
+
+from rlservo.export.errors import ActionError
+from rlservo.serve_app import oip_messages as messages
+from rlservo.serve_app.arrays import pack, unpack
+from rlservo.serve_app.batching import Batcher, Tensors
+from rlservo.serve_app.http import create_app
+from rlservo.serve_app.oip_grpc import Grpc
+from rlservo.serve_app.options import PolicyOptions
+from rlservo.serve_app.policy import Policy
+from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.store import PolicyStore
+
+pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+
+OBS = np.random.default_rng(3).standard_normal((256, 27)).astype(np.float32)
+TOGETHER = {"*": PolicyOptions(micro_batch=16)}
+
+
+def feed(number: float) -> Tensors:
+    return {"obs": np.full((1, 2), number, np.float32)}
+
+
+def doubled(tensors: Tensors) -> Tensors:
+    return {"action": tensors["obs"] * 2}
+
+
+def test_what_comes_in_one_turn_is_one_run_and_no_more_than_allowed() -> None:
+    sizes: list[int] = []
+
+    def run(tensors: Tensors) -> Tensors:
+        sizes.append(len(tensors["obs"]))
+        return doubled(tensors)
+
+    async def main() -> None:
+        batcher = Batcher(run, 4)
+        for number, expected in ((1, [1]), (4, [4]), (6, [4, 2])):
+            sizes.clear()
+            computed = await asyncio.gather(*(batcher.compute(feed(i)) for i in range(number)))
+            assert sizes == expected
+            for i, one in enumerate(computed):
+                np.testing.assert_array_equal(one.outputs["action"], np.full((1, 2), 2 * i, np.float32))
+        assert [one.together for one in computed] == [4, 4, 4, 4, 2, 2]
+        assert (batcher.runs, batcher.observations) == (4, 11)
+
+    asyncio.run(main())
+
+
+def test_who_has_gone_is_left_out_and_a_failed_run_fails_for_all_in_it() -> None:
+    sizes: list[int] = []
+
+    def run(tensors: Tensors) -> Tensors:
+        sizes.append(len(tensors["obs"]))
+        if np.isnan(tensors["obs"]).any():
+            raise ActionError("no")
+        return doubled(tensors)
+
+    async def main() -> None:
+        batcher = Batcher(run, 8)
+        tasks = [asyncio.ensure_future(batcher.compute(feed(i))) for i in range(3)]
+        asyncio.get_running_loop().call_soon(tasks[1].cancel)  # after all have joined, before they are computed
+        done = await asyncio.gather(*tasks, return_exceptions=True)
+        assert sizes == [2]
+        assert isinstance(done[1], asyncio.CancelledError)
+        done = await asyncio.gather(*(batcher.compute(feed(x)) for x in (1, np.nan)), return_exceptions=True)
+        assert [type(one) for one in done] == [ActionError, ActionError]
+        assert float((await batcher.compute(feed(3))).outputs["action"][0, 0]) == 6.0
+
+    asyncio.run(main())
+
+
+@pytest.fixture(scope="module")
+def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
+    unsafe = tmp_path_factory.mktemp("unsafe")
+    box_policy(unsafe, name="unsafe", action_scale=2.0)  # its actions can leave the space
+    return PolicyStore.load([policies, unsafe], options=TOGETHER)
+
+
+@pytest.fixture(scope="module")
+def port(store: PolicyStore, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[int]:
+    with served(create_app(lambda: store, ServerSettings())) as number:
+        yield number
+
+
+@contextlib.contextmanager
+def watched(policy: Policy) -> Iterator[list[int]]:
+    """Give the sizes of the policy's runs."""
+    assert policy.batcher is not None
+    run, sizes = policy.batcher._run, []
+
+    def counting(tensors: Tensors) -> Tensors:
+        sizes.append(len(next(iter(tensors.values()))))
+        return run(tensors)
+
+    policy.batcher._run = counting
+    yield sizes
+    policy.batcher._run = run
+
+
+def ask_all(port: int, path: str, documents: list[Any]) -> list[httpx.Response]:
+    """Send all at once, each on a connection of its own, while a large batch keeps the server busy."""
+
+    async def main() -> list[httpx.Response]:
+        async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
+            for _ in documents:  # the connections are there
+                await client.get("/healthz")
+            busy = client.post("/v1/policies/ur5/act", json={"obs": np.tile(OBS, (15, 1)).tolist()})
+            _, *answers = await asyncio.gather(busy, *(client.post(path, json=document) for document in documents))
+            return answers
+
+    return asyncio.run(main())
+
+
+def test_json_requests_are_computed_together_and_get_their_own_actions(
+    port: int, store: PolicyStore, ur5: Path
+) -> None:
+    with Policy.load(ur5) as alone, watched(store.get("ur5")) as sizes:
+        for _ in range(20):  # on a busy computer they may come one after the other
+            answers = ask_all(port, "/v1/policies/ur5/act", [{"obs": row.tolist()} for row in OBS[:40]])
+            for row, reply in zip(OBS, answers, strict=False):
+                assert reply.status_code == 200
+                np.testing.assert_allclose(reply.json()["action"], alone.act(row), rtol=1e-5, atol=1e-6)
+            together = [size for size in sizes if size <= 16]
+            if max(together) > 1:
+                break
+        assert max(together) > 1
+        assert 256 * 15 in sizes  # a batch that came as one is computed as one
+    told = httpx.get(f"http://127.0.0.1:{port}/metrics").text
+    runs, observations = (
+        sum(map(float, re.findall(rf'^rlservo_micro_batch_{what}_total{{.*policy="ur5".*}} (.*)$', told, re.MULTILINE)))
+        for what in ("runs", "observations")
+    )
+    assert 0 < runs < observations == sum(together)
+
+
+def test_a_bad_observation_and_a_bad_action_are_their_own_requests_faults(port: int, store: PolicyStore) -> None:
+    documents: list[Any] = [{"obs": (row * 0.02).tolist()} for row in OBS[:12]]
+    documents[3] = {"obs": [0.0] * 26}
+    documents[7] = {"obs": (OBS[7] * 1e4).tolist()}  # far outside: the action leaves its space
+    with watched(store.get("unsafe")) as sizes:
+        for _ in range(20):
+            sizes.clear()
+            answers = ask_all(port, "/v1/policies/unsafe/act", documents)
+            statuses = [reply.status_code for reply in answers]
+            assert statuses == [422 if i == 3 else 500 if i == 7 else 200 for i in range(12)]
+            assert answers[7].json()["code"] == "unsafe-action"
+            assert sum(sizes) == 11
+            if len(sizes) < 11:
+                break
+        assert len(sizes) < 11
+
+
+def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: PolicyStore, ur5: Path) -> None:
+    def infer(row: NDArray[Any]) -> Any:
+        return {"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": row.tolist()}]}
+
+    async def streams() -> list[Any]:
+        async with contextlib.AsyncExitStack() as stack:
+            url = f"ws://127.0.0.1:{port}/v1/policies/ur5/stream"
+            opened = [await stack.enter_async_context(websockets.asyncio.client.connect(url)) for _ in range(8)]
+            for one in opened:
+                await one.recv()
+            for one, row in zip(opened, OBS, strict=False):
+                await one.send(pack({"obs": row}))
+            return [unpack(await one.recv())["actions"] for one in opened]
+
+    async def calls() -> list[Any]:
+        service = Grpc(create_app(lambda: store, ServerSettings()).state.core)
+        asked = messages.ModelInferRequest(model_name="ur5")
+        asked.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
+        requests = []
+        for row in OBS[:8]:
+            del asked.raw_input_contents[:]
+            asked.raw_input_contents.append(row.tobytes())
+            requests.append((asked.SerializeToString(), None))
+        return await asyncio.gather(*(service._infer(request, None, None) for request in requests))
+
+    with Policy.load(ur5) as alone, watched(store.get("ur5")) as sizes:
+        expected = [alone.act(row) for row in OBS[:8]]
+        for row, reply in zip(
+            expected, ask_all(port, "/v2/models/ur5/infer", [infer(r) for r in OBS[:8]]), strict=True
+        ):
+            outputs = {output["name"]: output["data"] for output in reply.json()["outputs"]}
+            np.testing.assert_allclose(outputs["action"], row, rtol=1e-5, atol=1e-6)
+        for row, chunk in zip(expected, asyncio.run(streams()), strict=True):
+            np.testing.assert_allclose(chunk[0], row, rtol=1e-5, atol=1e-6)
+        sizes.clear()
+        for row, reply in zip(expected, asyncio.run(calls()), strict=True):
+            action = reply.raw_output_contents[[output.name for output in reply.outputs].index("action")]
+            np.testing.assert_allclose(np.frombuffer(action, np.float32), row, rtol=1e-5, atol=1e-6)
+        assert sizes == [8]
+
+
+def test_warnings_and_exploration_are_the_requests_own(policies: Path, served: Any) -> None:
+    strict = PolicyStore.load([policies], options={"*": PolicyOptions(micro_batch=16, out_of_bounds="warn")})
+    with served(create_app(lambda: strict, ServerSettings())) as port, watched(strict.get("ur5")) as sizes:
+        drawn = ask_all(port, "/v1/policies/ur5/act", [{"obs": OBS[0].tolist(), "explore": True, "seed": 5}] * 4)
+        assert len({json.dumps(reply.json()["action"]) for reply in drawn}) == 1
+        assert sizes == [256 * 15]
+
+
+def test_policies_with_a_memory_or_a_limit_are_computed_one_by_one(recurrent: Path, policies: Path) -> None:
+    store = PolicyStore.load([recurrent], options=TOGETHER)
+    assert not store.batches
+    limited = PolicyOptions(micro_batch=16, max_action_step=0.1)
+    assert PolicyStore.load([policies], options={"ur5": limited}).get("ur5").batcher is None
