@@ -269,6 +269,7 @@ def plot(rows: list[Row], env: str, path: Path) -> None:
         label = f"{runners} env runner{'s' if runners > 1 else ''}"
         axes.plot([row.envs for row in own], [row.steps_per_s for row in own], marker="o", label=label)
     axes.set_xscale("log", base=2)
+    axes.set_xticks(numbers := sorted({row.envs for row in rows}), [str(number) for number in numbers])
     axes.set(
         xlabel="environments per env runner", ylabel="environment steps/s, learner included", title=f"PPO on {env}"
     )
