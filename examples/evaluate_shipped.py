@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from help_text import DefaultsFormatter
 
 from rlservo.export.errors import RlservoError
 from rlservo.export.exporter import export_checkpoint
@@ -134,7 +135,7 @@ def write_card(name: str, measured: list[Measured]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Evaluate the policies that ship, from bundles exported now.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=DefaultsFormatter,
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"all by default: {', '.join(shipped_names())}")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="episodes of each evaluation")

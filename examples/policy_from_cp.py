@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
+from help_text import DefaultsFormatter
 from numpy.typing import NDArray
 
 from rlservo.export.errors import UsageError
@@ -37,7 +38,7 @@ class Count:
 
 def main(env_id: str, env_kwargs: Mapping[str, Any], description: str) -> None:
     """Parse the command line and run the episodes."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = argparse.ArgumentParser(description=description, formatter_class=DefaultsFormatter)
     parser.add_argument(
         "checkpoint", type=Path, nargs="?",
         help="algorithm checkpoint, policy (.../policies/default_policy) or RLModule checkpoint, or Tune trial",

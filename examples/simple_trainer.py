@@ -24,6 +24,7 @@ import numpy as np
 import search_space
 import training_run
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from help_text import DefaultsFormatter
 from ray import tune
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import FlattenObservations, MeanStdFilter
@@ -71,7 +72,7 @@ def argument_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description="Train any RLlib algorithm on any Gymnasium environment; end in a policy bundle.",
         usage="%(prog)s [--run PPO] [--name-env CartPole-v1] [--num-cpus N] ...  (--help lists all)",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=DefaultsFormatter,
         allow_abbrev=False,
     )
     what = parser.add_argument_group("what is trained")

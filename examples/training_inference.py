@@ -15,6 +15,7 @@ from typing import Any, cast
 
 import training_run  # before Ray  # isort: skip
 import yaml
+from help_text import DefaultsFormatter
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
@@ -61,7 +62,7 @@ def argument_parser(task: Task, description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=description,
         usage="%(prog)s [--run PPO] [--stop-timesteps N] ...  (--help lists all)",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=DefaultsFormatter,
     )
     parser.add_argument("--run", default="PPO", help=f"RLlib algorithm: {', '.join(SUPPORTED)}")
     parser.add_argument("--num-cpus", type=int, default=0, help="cores for Ray; 0 is all of the machine's")

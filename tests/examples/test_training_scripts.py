@@ -69,6 +69,7 @@ def test_help_lists_robo_gyms_arguments(script: str, run_script: Any, tmp_path: 
         "--explore-during-inference", "--num-episodes-during-inference",
     ):  # fmt: skip
         assert argument in done.out
+    assert "default: PPO" in done.out and "None" not in done.out
 
 
 @pytest.mark.parametrize(
