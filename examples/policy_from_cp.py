@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Space
 from help_text import DefaultsFormatter
 from numpy.typing import NDArray
 
@@ -100,8 +100,8 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
     ):
         if not isinstance(ours, Box) or ours.shape != theirs.shape:
             raise UsageError(
-                f"the policy in {path} has the {side} space {ours}, {env.spec.id} has {theirs}: it was trained for "
-                "another environment"
+                f"the policy in {path} has {_named(ours)} for its {side} space, {env.spec.id} has {_named(theirs)}: it "
+                "was trained for another environment"
             )
     loop = restored.loop()
     low, high = (np.asarray(side, np.float64) for side in (env.action_space.low, env.action_space.high))
@@ -117,6 +117,11 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
         return action, outside and recipe.distribution == "diag_gaussian"
 
     return act
+
+
+def _named(space: Space[Any]) -> str:
+    """Name a space without its bounds, which fill a screen."""
+    return f"a Box of shape {space.shape}" if isinstance(space, Box) else str(space)
 
 
 def run_episodes(env: Any, act: Act, episodes: int, seed: int) -> Count:
