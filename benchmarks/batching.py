@@ -1,6 +1,6 @@
 """For which networks micro-batching pays: 16 robots at once, each observation by itself against those there together.
 
-    python benchmarks/batching.py             # about five minutes; needs wrk
+    python benchmarks/batching.py             # about eight minutes; needs wrk
     python benchmarks/batching.py --no-serve  # the networks alone, half a minute
 
 Policies of growing size, made by RLlib (untrained: the numbers in the weights cost the same) and exported. First
@@ -16,6 +16,7 @@ import argparse
 import json
 import logging
 import os
+import re
 import secrets
 import statistics
 import sys
@@ -30,6 +31,7 @@ os.environ.setdefault("RAY_AUTH_MODE", "token")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 import gymnasium as gym
+import httpx
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
@@ -88,6 +90,7 @@ class Served:
 
     per_s: float  # requests per second, 16 connections
     one_ms: float  # median over one connection
+    together: float  # observations in a run, as the server counted them; 1 where it does not gather
 
 
 def main() -> None:
@@ -107,6 +110,7 @@ def main() -> None:
         "served singly",
         "together",
         "gain",
+        "in a run",
         "p50 of one",
     ):
         table.add_column(column, justify="right")
@@ -122,7 +126,7 @@ def main() -> None:
                 singly, together = measure_served(bundle, folder, args.rounds, args.seconds)
                 results[network] |= {"singly": asdict(singly), "together": asdict(together)}
                 cells += [f"{singly.per_s:,.0f}/s", f"{together.per_s:,.0f}/s", f"{together.per_s / singly.per_s:.2f}"]
-                cells += [f"{together.one_ms / singly.one_ms:.2f}"]
+                cells += [f"{together.together:.1f}", f"{together.one_ms / singly.one_ms:.2f}"]
             table.add_row(network, *cells)
             args.out.mkdir(parents=True, exist_ok=True)
             (args.out / "batching.json").write_text(json.dumps(results, indent=2) + "\n")
@@ -173,19 +177,29 @@ def measure_alone(bundle: Bundle) -> Alone:
 def measure_served(bundle: Bundle, folder: Path, rounds: int, seconds: int) -> tuple[Served, Served]:
     """Serve the policy without and with micro-batching, in turns."""
     exchange = asked(bundle)
-    loads: dict[int, tuple[list[float], list[float]]] = {0: ([], []), ROBOTS: ([], [])}
+    loads: dict[int, tuple[list[float], ...]] = {0: ([], [], []), ROBOTS: ([], [], [])}
     mark = secrets.token_hex(8)
-    for _ in range(rounds):
-        for most, (rates, medians) in loads.items():
+    for turn in range(rounds):
+        for most in sorted(loads, reverse=turn % 2 == 1):
+            rates, medians, sizes = loads[most]
             (port,) = free_ports(1)
             command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(bundle.path), "--port", str(port)]
             options = {"RLSERVO_POLICY_OPTIONS": json.dumps({"*": {"micro_batch": most}})}
             with running(Server(f"micro_batch {most}", command, port, exchange, options), folder, mark):
                 wrk(port, exchange, folder, connections=ROBOTS, seconds=1)
                 rates.append(wrk(port, exchange, folder, connections=ROBOTS, seconds=seconds).per_s)
+                sizes.append(gathered(port))
                 medians.append(wrk(port, exchange, folder, connections=1, seconds=seconds).p50_ms)
-    singly, together = (Served(statistics.median(a), statistics.median(b)) for a, b in loads.values())
+    singly, together = (Served(*map(statistics.median, measured)) for measured in loads.values())
     return singly, together
+
+
+def gathered(port: int) -> float:
+    """Return how many observations a run of the network had so far, on average."""
+    told = httpx.get(f"http://127.0.0.1:{port}/metrics").text
+    counts = re.findall(r"^rlservo_micro_batch_(runs|observations)_total{.*} (.*)$", told, re.MULTILINE)
+    sums = {what: sum(float(value) for name, value in counts if name == what) for what in ("runs", "observations")}
+    return sums["observations"] / sums["runs"] if sums["runs"] else 1.0
 
 
 def asked(bundle: Bundle) -> Exchange:

@@ -40,7 +40,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Drive one of robo-gym's own environments with a served policy.")
     parser.add_argument("--url", default="http://127.0.0.1:8000")
     parser.add_argument("--task", choices=POLICIES, default="EndEffectorPositioningUR", help="(default: %(default)s)")
-    parser.add_argument("--policy", help="its name on the server (default: ur5 or mir100, as the task wants)")
+    parser.add_argument(
+        "--policy", help="its name on the server (default: ur5, mir100 or mir100_obstacle_avoidance, by the task)"
+    )
     parser.add_argument("--ur-model", help="of a UR task (default: ur5)")
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--manager", default="127.0.0.1", help="where rlservo server-manager runs")

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Tensors = dict[str, NDArray[np.generic]]
+Check = Callable[[], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,25 @@ class Computed:
     together: int  # how many those were
 
 
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    feed: Mapping[str, NDArray[np.generic]]
+    check: Check | None
+    future: asyncio.Future[Computed]
+
+    def is_wanted(self) -> bool:
+        """Whether it is still to be computed; whose check says no is told so."""
+        if self.future.done():  # its caller has gone
+            return False
+        try:
+            if self.check is not None:
+                self.check()
+        except Exception as error:
+            self.future.set_exception(error)
+            return False
+        return True
+
+
 class Batcher:
     """Gathers single observations; one event loop's."""
 
@@ -35,15 +55,18 @@ class Batcher:
         """`run` computes a batch, `most` is the largest."""
         self._run = run
         self._most = most
-        self._waiting: list[tuple[Mapping[str, NDArray[np.generic]], asyncio.Future[Computed]]] = []
+        self._waiting: list[_Waiting] = []
         self.runs = 0  # since the start
         self.observations = 0
 
-    async def compute(self, feed: Mapping[str, NDArray[np.generic]]) -> Computed:
-        """Return what `feed`, a batch of one, comes to. Raises what `run` raises."""
+    async def compute(self, feed: Mapping[str, NDArray[np.generic]], check: Check | None = None) -> Computed:
+        """Return what `feed`, a batch of one, comes to; `check` is asked right before it is computed.
+
+        Raises what `run` and `check` raise.
+        """
         loop = asyncio.get_running_loop()
         mine: asyncio.Future[Computed] = loop.create_future()
-        self._waiting.append((feed, mine))
+        self._waiting.append(_Waiting(feed, check, mine))
         if len(self._waiting) == self._most:
             self._compute_all()
         elif len(self._waiting) == 1:
@@ -59,26 +82,31 @@ class Batcher:
         return Computed(outputs, (time.perf_counter() - started) * 1e3, rows)
 
     def _compute_all(self) -> None:
-        waiting = [(feed, future) for feed, future in self._waiting if not future.done()]  # some may have gone
+        waiting = [each for each in self._waiting if each.is_wanted()]
         self._waiting = []
         if not waiting:
             return
-        started = time.perf_counter()
         try:
-            first = waiting[0][0]
-            together = (
-                {name: np.concatenate([feed[name] for feed, _ in waiting]) for name in first}
-                if len(waiting) > 1
-                else dict(first)
-            )
-            outputs = self._run(together)
+            computed = self._compute(waiting)
         except Exception as error:
-            for _, future in waiting:
-                future.set_exception(error)
+            for each in waiting:
+                each.future.set_exception(error)
             return
-        milliseconds = (time.perf_counter() - started) * 1e3
         self.runs += 1
         self.observations += len(waiting)
-        for row, (_, future) in enumerate(waiting):
-            mine = {name: output[row : row + 1] for name, output in outputs.items()}
-            future.set_result(Computed(mine, milliseconds, len(waiting)))
+        for each, one in zip(waiting, computed, strict=True):
+            each.future.set_result(one)
+
+    def _compute(self, waiting: list[_Waiting]) -> list[Computed]:
+        rows = len(waiting)
+        started = time.perf_counter()
+        feed = {name: np.concatenate([each.feed[name] for each in waiting]) for name in waiting[0].feed}
+        outputs = self._run(feed)
+        milliseconds = (time.perf_counter() - started) * 1e3
+        for name, output in outputs.items():
+            if output.shape[:1] != (rows,):
+                raise ValueError(f"'{name}' came in shape {output.shape} for {rows} observations")
+        return [
+            Computed({name: output[row : row + 1] for name, output in outputs.items()}, milliseconds, rows)
+            for row in range(rows)
+        ]

@@ -123,13 +123,9 @@ class Core:
         Raises DeadlineError, TooLargeError, UnavailableError and what `PolicyStore.act` raises.
         """
         store = self.store()
-        if deadline_ms is not None:
-            late_ms = (time.perf_counter() - received) * 1e3
-            if late_ms >= deadline_ms:
-                raise DeadlineError(
-                    f"the deadline of {deadline_ms:g} ms passed before the policy was asked: nothing computed",
-                    {"deadline_ms": deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": seq},
-                )
+        in_time = None if deadline_ms is None else partial(_check_deadline, deadline_ms, received, seq)
+        if in_time is not None:
+            in_time()
         if _rows(obs) > self.settings.max_batch:
             space = store.get(name, version).contract.observation_space
             rows = _batch(space, obs)
@@ -137,7 +133,7 @@ class Core:
                 raise TooLargeError(f"a batch of {rows} observations is too large: at most {self.settings.max_batch}")
         if episode is None and stream is None:
             if store.batches and not explore:
-                decision = await store.act_together(name, version, obs, session)
+                decision = await store.act_together(name, version, obs, session=session, check=in_time)
             else:
                 decision = store.act(name, version, obs, explore=explore, seed=seed, session=session)
         else:
@@ -192,6 +188,15 @@ class Core:
 
 
 NO_EPISODE = Episode()
+
+
+def _check_deadline(deadline_ms: float, received: float, seq: int | None) -> None:
+    late_ms = (time.perf_counter() - received) * 1e3
+    if late_ms >= deadline_ms:
+        raise DeadlineError(
+            f"the deadline of {deadline_ms:g} ms passed before the policy was asked: nothing computed",
+            {"deadline_ms": deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": seq},
+        )
 
 
 def _batch(space: SpaceSpec, obs: Any) -> int:

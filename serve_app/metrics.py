@@ -103,7 +103,10 @@ class Metrics:
                 "rlservo_request_seconds", "From the first byte to the answer, of requests that got one", labels=names
             ),
             "inference": HistogramMetricFamily(
-                "rlservo_inference_seconds", "Checking the observation, the network, checking the action", labels=names
+                "rlservo_inference_seconds",
+                "Checking the observation, the network (where several requests share a run, the whole), checking the "
+                "action",
+                labels=names,
             ),
             "batch": HistogramMetricFamily("rlservo_batch_size", "Observations per request", labels=names),
         }

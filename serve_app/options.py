@@ -32,8 +32,8 @@ class PolicyOptions(BaseModel):
     micro_batch: Annotated[int, Field(ge=0, le=1024)] = 0
     """The most single observations that a server computes in one run of the network, of those that are there at the
     same time; 0 and 1: each by itself. For large networks (`benchmarks/batching.py` tells which). A batch's sums are
-    formed in another order, so the last bits of an action may differ. Policies with a memory or a `max_action_step`,
-    and requests that explore, are computed one by one."""
+    formed in another order, so the last bits of an action may differ. Computed one by one all the same: policies with a
+    memory or a `max_action_step`, and requests that explore or say anything of an episode."""
 
 
 DEFAULT_OPTIONS = PolicyOptions()

@@ -162,7 +162,7 @@ class Policy:
         self.batcher: Batcher | None = None
         """Where it computes together with others what comes at the same time, if the options want that."""
         if options.micro_batch > 1 and not self.episodic and len(contract.inputs) == len(self._observed):
-            # The session's own `run`: what is waiting is computed, also where the policy is closed meanwhile.
+            # The session's own `run`: what is waiting when the policy is closed is computed all the same.
             self.batcher = Batcher(_named(session.run, list(self._guards)), options.micro_batch)
 
     @classmethod
@@ -192,7 +192,10 @@ class Policy:
         _check_copy(bundle, session)
         if check_golden:
             check_golden_vectors(bundle, session.run)
-        return cls(bundle, session, options, graph_hash=hashlib.sha256(bundle.onnx.read_bytes()).hexdigest())
+        policy = cls(bundle, session, options, graph_hash=hashlib.sha256(bundle.onnx.read_bytes()).hexdigest())
+        if policy.batcher is not None:
+            _check_rows(bundle, session.run)
+        return policy
 
     @property
     def contract(self) -> Contract:
@@ -318,7 +321,7 @@ class Policy:
 
     def close(self) -> None:
         """Drop the session; `act` raises UsageError from now on."""
-        self._run, self._session = _refuse_closed, None
+        self._run, self._session, self.batcher = _refuse_closed, None, None
 
     def __enter__(self) -> Self:
         return self
@@ -540,6 +543,25 @@ def check_golden_vectors(bundle: Bundle, run: _Run) -> None:
     for name in names:
         _compare(bundle, name, computed, recorded, rtol, atol)
     logger.debug("%s: %d golden vectors reproduced", bundle.path, len(next(iter(recorded.values()))))
+
+
+def _check_rows(bundle: Bundle, run: _Run) -> None:
+    """Refuse to compute observations together where that is something else than one by one. Raises BundleError."""
+    inputs, _ = bundle.golden()
+    names = [tensor.name for tensor in bundle.contract.outputs]
+    rows = {tensor.name: np.resize(inputs[tensor.name], (3, *inputs[tensor.name].shape[1:]))
+            for tensor in bundle.contract.inputs}  # fmt: skip
+    one_by_one = [run(names, {name: array[row : row + 1] for name, array in rows.items()}) for row in range(3)]
+    try:
+        together = dict(zip(names, run(names, rows), strict=True))
+        singly = {name: np.concatenate([each[index] for each in one_by_one]) for index, name in enumerate(names)}
+        for name in names:
+            _compare(bundle, name, together, singly, GOLDEN_RTOL, GOLDEN_ATOL)
+    except Exception as error:  # onnxruntime's own exceptions share no base but Exception
+        raise BundleError(
+            f"{bundle.path}: the graph does not compute three observations as it computes each ({first_line(error)}): "
+            "leave micro_batch out of the policy's options"
+        ) from error
 
 
 def _compare(

@@ -18,7 +18,7 @@ import socket
 import time
 from pathlib import Path
 
-from rlservo.export.errors import UsageError
+from rlservo.export.errors import UnavailableError, UsageError
 
 MARK = "RLSERVO_LAUNCH"
 PROC = Path("/proc")
@@ -94,18 +94,26 @@ def port_holder(port: int) -> tuple[int, str] | None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Return ports free at the moment of asking, all different.
+    """Return ports free at the moment of asking, all different. Raises UnavailableError where there are too few.
 
     The system's own choice (port 0) would be one of those it also gives to outgoing connections, of which Ray makes
     hundreds before its last server listens.
     """
+    candidates = list(PORTS)
+    secrets.SystemRandom().shuffle(candidates)
     found: list[int] = []
-    with contextlib.ExitStack() as held:
-        while len(found) < count:
-            port = PORTS[secrets.randbelow(len(PORTS))]
-            with contextlib.suppress(OSError):
-                held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM)).bind(("", port))
+    for port in candidates:
+        if len(found) == count:
+            break
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+            try:
+                probe.bind(("", port))
                 found.append(port)
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE:
+                    raise
+    if len(found) < count:
+        raise UnavailableError(f"{len(found)} of the ports {PORTS[0]} to {PORTS[-1]} are free: {count} are needed")
     return found
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import random
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ class Decision:
     """An array, or dicts and tuples of arrays where the action space is nested."""
     name: str
     version: str
-    infer_ms: float  # [ms] checking the observation, the network, checking the action
+    infer_ms: float  # [ms] checking the observation, the network (for all that it ran for), checking the action
     batch: int | None = None  # how many observations there were; None for one that came alone
     notices: tuple[str, ...] = ()  # what was out of bounds or limited, and used all the same
     episode: EpisodeNote | None = None
@@ -229,13 +229,22 @@ class PolicyStore:
         """
         return _act(self._stateless(name, version, session), obs, explore, seed)
 
-    async def act_together(self, name: str, version: str | None, obs: Observation, session: str | None) -> Decision:
+    async def act_together(
+        self,
+        name: str,
+        version: str | None,
+        obs: Observation,
+        *,
+        session: str | None = None,
+        check: Callable[[], None] | None = None,
+    ) -> Decision:
         """Decide as `act` does without exploring; with what else is there in one run where the policy's options say so.
 
-        Raises what `act` raises.
+        `check` is asked again right before the network runs. Raises what it and `act` raise.
         """
         policy = self._stateless(name, version, session)
-        if policy.batcher is None:
+        batcher = policy.batcher
+        if batcher is None:
             return _act(policy, obs)
         policy.notices.clear()
         started = time.perf_counter()
@@ -243,10 +252,11 @@ class PolicyStore:
         notices = take_notices(policy)
         read_ms = (time.perf_counter() - started) * 1e3
         single = len(next(iter(feed.values()))) == 1  # also a batch of one: the Open Inference Protocol has no other
-        computed = await policy.batcher.compute(feed) if single else policy.batcher.compute_now(feed)
+        computed = await batcher.compute(feed, check) if single else batcher.compute_now(feed)
+        started = time.perf_counter()
         action = policy.action(computed.outputs, batch=batch)
+        infer_ms = read_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
         space = policy.contract.action_space
-        infer_ms = read_ms + computed.milliseconds
         return Decision(action, name, policy.contract.version, infer_ms, batch_of(action, space), notices)
 
     def close(self) -> None:

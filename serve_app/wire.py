@@ -77,7 +77,10 @@ class ActReply(BaseModel):
     policy: str
     version: str
     seq: int | None = Field(None, description="As sent.")
-    infer_ms: float = Field(description="Milliseconds spent on checking the observation, the network and the action.")
+    infer_ms: float = Field(
+        description="Milliseconds spent on checking the observation, the network (where it ran for several requests at "
+        "once, the whole run) and checking the action."
+    )
     state: dict[str, Any] | None = Field(None, description="For the next request, where you carry the state.")
     session_id: str | None = Field(None, description="As sent.")
     session_step: int | None = Field(None, description="Which action of the session's episode this is, from 1.")

@@ -75,7 +75,7 @@ def run(python: Path, installed: Path, *arguments: str) -> subprocess.CompletedP
     [
         ("EndEffectorPositioningUR", 100, 95),
         ("NoObstacleNavigationMir100", 20, 18),
-        # 93.8% over 500 episodes: fewer than 13 of 20 come once in fifty thousand times.
+        # 93.8% over 500 episodes: fewer than 13 of 20 come once in seventy thousand times.
         ("ObstacleAvoidanceMir100", 20, 13),
     ],
 )

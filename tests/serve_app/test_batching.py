@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import json
 import re
+import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -13,11 +15,13 @@ from typing import Any
 
 import httpx
 import numpy as np
+import onnx
 import pytest
 import websockets.asyncio.client
 from numpy.typing import NDArray
 
-from rlservo.export.errors import ActionError
+from rlservo.export.bundle import BoxSpec, load_bundle, write_contract, write_golden
+from rlservo.export.errors import ActionError, BundleError, DeadlineError, UsageError
 from rlservo.serve_app import oip_messages as messages
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.batching import Batcher, Tensors
@@ -26,7 +30,7 @@ from rlservo.serve_app.oip_grpc import Grpc
 from rlservo.serve_app.options import PolicyOptions
 from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.settings import ServerSettings
-from rlservo.serve_app.store import PolicyStore
+from rlservo.serve_app.store import Decision, PolicyStore
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -99,19 +103,32 @@ def port(store: PolicyStore, served: Callable[[Any], AbstractContextManager[int]
         yield number
 
 
+@pytest.fixture(scope="module")
+def bounded(box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy whose observations have bounds."""
+    folder = box_policy(tmp_path_factory.mktemp("bounded"), name="bounded", named=False)
+    contract = load_bundle(folder).contract
+    space = BoxSpec(shape=(27,), dtype="float32", low=-8.0, high=8.0)
+    write_contract(folder, contract.model_copy(update={"observation_space": space}))
+    return folder
+
+
 @contextlib.contextmanager
 def watched(policy: Policy) -> Iterator[list[int]]:
     """Give the sizes of the policy's runs."""
     assert policy.batcher is not None
-    run, sizes = policy.batcher._run, []
+    batcher = policy.batcher
+    run, sizes = batcher._run, []
 
     def counting(tensors: Tensors) -> Tensors:
         sizes.append(len(next(iter(tensors.values()))))
         return run(tensors)
 
-    policy.batcher._run = counting
-    yield sizes
-    policy.batcher._run = run
+    batcher._run = counting
+    try:
+        yield sizes
+    finally:
+        batcher._run = run
 
 
 def ask_all(port: int, path: str, documents: list[Any]) -> list[httpx.Response]:
@@ -119,8 +136,7 @@ def ask_all(port: int, path: str, documents: list[Any]) -> list[httpx.Response]:
 
     async def main() -> list[httpx.Response]:
         async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
-            for _ in documents:  # the connections are there
-                await client.get("/healthz")
+            await asyncio.gather(*(client.get("/healthz") for _ in range(len(documents) + 1)))  # opens the connections
             busy = client.post("/v1/policies/ur5/act", json={"obs": np.tile(OBS, (15, 1)).tolist()})
             _, *answers = await asyncio.gather(busy, *(client.post(path, json=document) for document in documents))
             return answers
@@ -128,9 +144,19 @@ def ask_all(port: int, path: str, documents: list[Any]) -> list[httpx.Response]:
     return asyncio.run(main())
 
 
+def counted(port: int) -> tuple[float, ...]:
+    """Return (runs, observations) of all versions of the policy, from the metrics."""
+    told = httpx.get(f"http://127.0.0.1:{port}/metrics").text
+    return tuple(
+        sum(map(float, re.findall(rf'^rlservo_micro_batch_{what}_total{{.*policy="ur5".*}} (.*)$', told, re.MULTILINE)))
+        for what in ("runs", "observations")
+    )
+
+
 def test_json_requests_are_computed_together_and_get_their_own_actions(
     port: int, store: PolicyStore, ur5: Path
 ) -> None:
+    before = counted(port)
     with Policy.load(ur5) as alone, watched(store.get("ur5")) as sizes:
         for _ in range(20):  # on a busy computer they may come one after the other
             answers = ask_all(port, "/v1/policies/ur5/act", [{"obs": row.tolist()} for row in OBS[:40]])
@@ -142,12 +168,8 @@ def test_json_requests_are_computed_together_and_get_their_own_actions(
                 break
         assert max(together) > 1
         assert 256 * 15 in sizes  # a batch that came as one is computed as one
-    told = httpx.get(f"http://127.0.0.1:{port}/metrics").text
-    runs, observations = (
-        sum(map(float, re.findall(rf'^rlservo_micro_batch_{what}_total{{.*policy="ur5".*}} (.*)$', told, re.MULTILINE)))
-        for what in ("runs", "observations")
-    )
-    assert 0 < runs < observations == sum(together)
+    assert counted(port)[0] - before[0] == len(together)
+    assert counted(port)[1] - before[1] == sum(together)
 
 
 def test_a_bad_observation_and_a_bad_action_are_their_own_requests_faults(port: int, store: PolicyStore) -> None:
@@ -174,9 +196,11 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
     async def streams() -> list[Any]:
         async with contextlib.AsyncExitStack() as stack:
             url = f"ws://127.0.0.1:{port}/v1/policies/ur5/stream"
-            opened = [await stack.enter_async_context(websockets.asyncio.client.connect(url)) for _ in range(8)]
+            opened = [await stack.enter_async_context(websockets.asyncio.client.connect(url)) for _ in range(9)]
             for one in opened:
                 await one.recv()
+            busy = opened.pop()
+            await busy.send(pack({"obs": np.tile(OBS, (15, 1))}))
             for one, row in zip(opened, OBS, strict=False):
                 await one.send(pack({"obs": row}))
             return [unpack(await one.recv())["actions"] for one in opened]
@@ -194,26 +218,98 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
 
     with Policy.load(ur5) as alone, watched(store.get("ur5")) as sizes:
         expected = [alone.act(row) for row in OBS[:8]]
-        for row, reply in zip(
-            expected, ask_all(port, "/v2/models/ur5/infer", [infer(r) for r in OBS[:8]]), strict=True
-        ):
-            outputs = {output["name"]: output["data"] for output in reply.json()["outputs"]}
-            np.testing.assert_allclose(outputs["action"], row, rtol=1e-5, atol=1e-6)
-        for row, chunk in zip(expected, asyncio.run(streams()), strict=True):
-            np.testing.assert_allclose(chunk[0], row, rtol=1e-5, atol=1e-6)
+
+        def check(actions: list[Any]) -> None:
+            for row, action in zip(expected, actions, strict=True):
+                np.testing.assert_allclose(np.ravel(action), row, rtol=1e-5, atol=1e-6)
+
+        for _ in range(20):  # on a busy computer they may come one after the other
+            sizes.clear()
+            replies = ask_all(port, "/v2/models/ur5/infer", [infer(row) for row in OBS[:8]])
+            check([{out["name"]: out["data"] for out in reply.json()["outputs"]}["action"] for reply in replies])
+            if sum(size <= 16 for size in sizes) < 8:
+                break
+        assert sum(size <= 16 for size in sizes) < 8
+        for _ in range(20):
+            sizes.clear()
+            check(asyncio.run(streams()))
+            if sum(size <= 16 for size in sizes) < 8:
+                break
+        assert sum(size <= 16 for size in sizes) < 8
         sizes.clear()
-        for row, reply in zip(expected, asyncio.run(calls()), strict=True):
-            action = reply.raw_output_contents[[output.name for output in reply.outputs].index("action")]
-            np.testing.assert_allclose(np.frombuffer(action, np.float32), row, rtol=1e-5, atol=1e-6)
+        called = asyncio.run(calls())
+        names = [output.name for output in called[0].outputs]
+        check([np.frombuffer(reply.raw_output_contents[names.index("action")], np.float32) for reply in called])
         assert sizes == [8]
 
 
-def test_warnings_and_exploration_are_the_requests_own(policies: Path, served: Any) -> None:
-    strict = PolicyStore.load([policies], options={"*": PolicyOptions(micro_batch=16, out_of_bounds="warn")})
-    with served(create_app(lambda: strict, ServerSettings())) as port, watched(strict.get("ur5")) as sizes:
+def test_exploring_requests_draw_for_themselves(port: int, store: PolicyStore) -> None:
+    with watched(store.get("ur5")) as sizes:
         drawn = ask_all(port, "/v1/policies/ur5/act", [{"obs": OBS[0].tolist(), "explore": True, "seed": 5}] * 4)
         assert len({json.dumps(reply.json()["action"]) for reply in drawn}) == 1
         assert sizes == [256 * 15]
+
+
+def test_a_warning_is_in_the_reply_to_what_it_is_about(bounded: Path) -> None:
+    async def main() -> list[Decision]:
+        store = PolicyStore.load([bounded], options=TOGETHER)
+        rows = OBS[:4].copy()
+        rows[1, 5], rows[3, 6] = 9.0, -10.0
+        return await asyncio.gather(*(store.act_together("bounded", None, row) for row in rows))
+
+    decisions = asyncio.run(main())
+    assert [len(decision.notices) for decision in decisions] == [0, 1, 0, 1]
+    assert "element 5 outside" in decisions[1].notices[0] and "element 6 outside" in decisions[3].notices[0]
+
+
+def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(store: PolicyStore) -> None:
+    core = create_app(lambda: store, ServerSettings()).state.core
+
+    async def slow() -> None:
+        time.sleep(0.05)  # another request of the same turn
+
+    async def main() -> list[Any]:
+        now = time.perf_counter()
+        hurried = core.act("ur5", None, OBS[0], received=now, deadline_ms=30.0)
+        patient = core.act("ur5", None, OBS[1], received=now, deadline_ms=30_000.0)
+        return await asyncio.gather(hurried, patient, slow(), return_exceptions=True)
+
+    with watched(store.get("ur5")) as sizes:
+        late, done, _ = asyncio.run(main())
+    assert isinstance(late, DeadlineError) and "nothing computed" in late.message
+    assert done.action.shape == (6,) and sizes == [1]
+
+
+def test_a_closed_policy_computes_what_was_waiting_and_nothing_else(policies: Path) -> None:
+    store = PolicyStore.load([policies], options=TOGETHER)
+
+    async def main() -> list[Any]:
+        async def close() -> None:
+            store.close()
+
+        asked = store.act_together("ur5", None, OBS[0])
+        return await asyncio.gather(asked, close(), store.act_together("ur5", None, OBS[1]), return_exceptions=True)
+
+    done, _, refused = asyncio.run(main())
+    assert done.action.shape == (6,)
+    assert isinstance(refused, UsageError)
+
+
+def test_a_graph_that_takes_one_observation_at_a_time_is_refused(bounded: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "bounded" / "1"
+    shutil.copytree(bounded, folder)
+    model = onnx.load(folder / "policy.onnx")
+    for tensor in (*model.graph.input, *model.graph.output):
+        tensor.type.tensor_type.shape.dim[0].dim_value = 1
+    onnx.save(model, folder / "policy.onnx")
+    inputs, outputs = load_bundle(bounded).golden()
+    write_golden(folder, {k: v[:1] for k, v in inputs.items()}, {k: v[:1] for k, v in outputs.items()})
+    write_contract(folder, load_bundle(bounded).contract)  # the hashes, anew
+    assert Policy.load(folder).act(OBS[0]).shape == (6,)
+    with pytest.raises(
+        BundleError, match=r"does not compute three observations as it computes each .*leave micro_batch"
+    ):
+        Policy.load(folder, options=PolicyOptions(micro_batch=16))
 
 
 def test_policies_with_a_memory_or_a_limit_are_computed_one_by_one(recurrent: Path, policies: Path) -> None:
