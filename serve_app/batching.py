@@ -1,16 +1,17 @@
 """One run of a network for all the observations that are waiting for it: micro-batching, where a policy asks for it.
 
 Nobody waits for others to come. What arrived while the event loop was busy is read in one turn of it, and what has been
-read by the end of the turn is run together. For a small network a batch saves less than gathering it costs; for a large
-one, whose weights are read from memory once instead of once per observation, it carries more (`micro_batch` in
-`options.py`; `benchmarks/batching.py` measures it). It knows nothing of policies.
+read by the end of the turn is run together. A single caller does not even wait for the end of the turn: observations
+are gathered only when there were several in the turn before. What that saves grows with the network, whose weights are
+read from memory once instead of once per observation (`micro_batch` in `options.py`; `benchmarks/batching.py` measures
+it). It knows nothing of policies.
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +57,8 @@ class Batcher:
         self._run = run
         self._most = most
         self._waiting: list[_Waiting] = []
+        self._arrived = 0  # in this turn
+        self._several = False  # in the turn before
         self.runs = 0  # since the start
         self.observations = 0
 
@@ -65,13 +68,17 @@ class Batcher:
         Raises what `run` and `check` raise.
         """
         loop = asyncio.get_running_loop()
+        if self._arrived == 0:
+            # The tasks of this turn are before it in the loop's queue.
+            loop.call_soon(self._end_turn)
+        self._arrived += 1
+        if not self._several:
+            (alone,) = self._compute([feed])
+            return alone
         mine: asyncio.Future[Computed] = loop.create_future()
         self._waiting.append(_Waiting(feed, check, mine))
         if len(self._waiting) == self._most:
             self._compute_all()
-        elif len(self._waiting) == 1:
-            # The tasks of this turn are before it in the loop's queue.
-            loop.call_soon(self._compute_all)
         return await mine
 
     def compute_now(self, feed: Tensors) -> Computed:
@@ -81,31 +88,35 @@ class Batcher:
         rows = len(next(iter(feed.values())))
         return Computed(outputs, (time.perf_counter() - started) * 1e3, rows)
 
+    def _end_turn(self) -> None:
+        self._compute_all()
+        self._several = self._arrived > 1
+        self._arrived = 0
+
     def _compute_all(self) -> None:
         waiting = [each for each in self._waiting if each.is_wanted()]
         self._waiting = []
         if not waiting:
             return
         try:
-            computed = self._compute(waiting)
+            computed = self._compute([each.feed for each in waiting])
         except Exception as error:
             for each in waiting:
                 each.future.set_exception(error)
             return
-        self.runs += 1
-        self.observations += len(waiting)
         for each, one in zip(waiting, computed, strict=True):
             each.future.set_result(one)
 
-    def _compute(self, waiting: list[_Waiting]) -> list[Computed]:
-        rows = len(waiting)
+    def _compute(self, feeds: Sequence[Mapping[str, NDArray[np.generic]]]) -> list[Computed]:
+        rows = len(feeds)
         started = time.perf_counter()
-        feed = {name: np.concatenate([each.feed[name] for each in waiting]) for name in waiting[0].feed}
-        outputs = self._run(feed)
+        outputs = self._run({name: np.concatenate([feed[name] for feed in feeds]) for name in feeds[0]})
         milliseconds = (time.perf_counter() - started) * 1e3
         for name, output in outputs.items():
             if output.shape[:1] != (rows,):
                 raise ValueError(f"'{name}' came in shape {output.shape} for {rows} observations")
+        self.runs += 1
+        self.observations += rows
         return [
             Computed({name: output[row : row + 1] for name, output in outputs.items()}, milliseconds, rows)
             for row in range(rows)

@@ -1,15 +1,22 @@
-"""One write for a reply's head and body.
+"""One write for a reply's head and body, and under load one moment for the replies of a turn of the event loop.
 
 uvicorn writes the two one after the other, so the proxy, and then the client, may wake up and read twice for a reply of
-300 bytes. It knows uvicorn's own object for a request (0.54); where it finds another, replies are written as before.
+300 bytes. When many ask at the same time, a reply that is written wakes the proxy while the next one is computed, and
+it sleeps again: written one after the other at the end of the turn, they are one wake-up. A single caller does not wait
+for that: replies are held back only when the turn before had several.
+
+It knows uvicorn's own object for a request (0.54); where it finds another, replies are written as before.
 """
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from typing import Any
 
 from starlette.types import Send
 
+MOST_HELD = 16  # replies: the first of them waits for the last
 INFORMATIONAL = b"HTTP/1.1 1"  # 100 Continue: the client waits for it before it sends the body
 
 
@@ -19,6 +26,46 @@ def join_writes(send: Send) -> None:
     transport = getattr(cycle, "transport", None)
     if transport is not None:
         cycle.transport = JoinedWrites(transport)  # type: ignore[union-attr]  # it has the attribute
+
+
+class Turn(threading.local):
+    """The replies of one turn of this thread's event loop."""
+
+    def __init__(self) -> None:
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._replies = 0
+        self._several = False  # in the turn before
+        self._held: list[tuple[Any, bytes]] = []
+
+    def write(self, transport: Any, reply: bytes) -> None:
+        """Write a reply, now or at the end of the turn."""
+        loop = asyncio.get_running_loop()
+        if self._loop is not loop:  # the first, or the one before has ended and taken its connections with it
+            self._loop, self._replies, self._several, self._held = loop, 0, False, []
+        if self._replies == 0:
+            loop.call_soon(self._end)
+        self._replies += 1
+        if not self._several:
+            transport.write(reply)
+            return
+        self._held.append((transport, reply))
+        if len(self._held) == MOST_HELD:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is held."""
+        held, self._held = self._held, []
+        for transport, reply in held:
+            if not transport.is_closing():
+                transport.write(reply)
+
+    def _end(self) -> None:
+        self.flush()
+        self._several = self._replies > 1
+        self._replies = 0
+
+
+turn = Turn()
 
 
 class JoinedWrites:
@@ -35,14 +82,17 @@ class JoinedWrites:
         head = self._head
         if head:
             self._head = b""
-            self._transport.write(head + data)
+            turn.write(self._transport, head + data)
         elif head is None and not data.startswith(INFORMATIONAL):
             self._head = data
         else:
+            if data:
+                turn.flush()  # what comes before this may be held
             self._transport.write(data)
 
     def close(self) -> None:
-        """Write what is held and close: the application failed between head and body."""
+        """Write what is held and close."""
+        turn.flush()
         if self._head:
             self._transport.write(self._head)
             self._head = b""

@@ -55,14 +55,15 @@ def test_what_comes_in_one_turn_is_one_run_and_no_more_than_allowed() -> None:
 
     async def main() -> None:
         batcher = Batcher(run, 4)
-        for number, expected in ((1, [1]), (4, [4]), (6, [4, 2])):
+        # The first turn with several, and one that follows a turn with one, are computed as they come.
+        for number, expected in ((1, [1]), (2, [1, 1]), (4, [4]), (6, [4, 2]), (1, [1]), (3, [1, 1, 1]), (6, [4, 2])):
             sizes.clear()
             computed = await asyncio.gather(*(batcher.compute(feed(i)) for i in range(number)))
             assert sizes == expected
             for i, one in enumerate(computed):
                 np.testing.assert_array_equal(one.outputs["action"], np.full((1, 2), 2 * i, np.float32))
         assert [one.together for one in computed] == [4, 4, 4, 4, 2, 2]
-        assert (batcher.runs, batcher.observations) == (4, 11)
+        assert (batcher.runs, batcher.observations) == (12, 23)
 
     asyncio.run(main())
 
@@ -78,6 +79,8 @@ def test_who_has_gone_is_left_out_and_a_failed_run_fails_for_all_in_it() -> None
 
     async def main() -> None:
         batcher = Batcher(run, 8)
+        await asyncio.gather(*(batcher.compute(feed(i)) for i in range(2)))
+        sizes.clear()
         tasks = [asyncio.ensure_future(batcher.compute(feed(i))) for i in range(3)]
         asyncio.get_running_loop().call_soon(tasks[1].cancel)  # after all have joined, before they are computed
         done = await asyncio.gather(*tasks, return_exceptions=True)
@@ -131,6 +134,14 @@ def watched(policy: Policy) -> Iterator[list[int]]:
         batcher._run = run
 
 
+def in_a_crowd(store: PolicyStore) -> None:
+    """As if several had come in the turn before."""
+    for name in store.names:
+        batcher = store.get(name).batcher
+        assert batcher is not None
+        batcher._several = True
+
+
 def ask_all(port: int, path: str, documents: list[Any]) -> list[httpx.Response]:
     """Send all at once, each on a connection of its own, while a large batch keeps the server busy."""
 
@@ -159,6 +170,7 @@ def test_json_requests_are_computed_together_and_get_their_own_actions(
     before = counted(port)
     with Policy.load(ur5) as alone, watched(store.get("ur5")) as sizes:
         for _ in range(20):  # on a busy computer they may come one after the other
+            in_a_crowd(store)
             answers = ask_all(port, "/v1/policies/ur5/act", [{"obs": row.tolist()} for row in OBS[:40]])
             for row, reply in zip(OBS, answers, strict=False):
                 assert reply.status_code == 200
@@ -179,6 +191,7 @@ def test_a_bad_observation_and_a_bad_action_are_their_own_requests_faults(port: 
     with watched(store.get("unsafe")) as sizes:
         for _ in range(20):
             sizes.clear()
+            in_a_crowd(store)
             answers = ask_all(port, "/v1/policies/unsafe/act", documents)
             statuses = [reply.status_code for reply in answers]
             assert statuses == [422 if i == 3 else 500 if i == 7 else 200 for i in range(12)]
@@ -225,6 +238,7 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
 
         for _ in range(20):  # on a busy computer they may come one after the other
             sizes.clear()
+            in_a_crowd(store)
             replies = ask_all(port, "/v2/models/ur5/infer", [infer(row) for row in OBS[:8]])
             check([{out["name"]: out["data"] for out in reply.json()["outputs"]}["action"] for reply in replies])
             if sum(size <= 16 for size in sizes) < 8:
@@ -232,11 +246,13 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
         assert sum(size <= 16 for size in sizes) < 8
         for _ in range(20):
             sizes.clear()
+            in_a_crowd(store)
             check(asyncio.run(streams()))
             if sum(size <= 16 for size in sizes) < 8:
                 break
         assert sum(size <= 16 for size in sizes) < 8
         sizes.clear()
+        in_a_crowd(store)
         called = asyncio.run(calls())
         names = [output.name for output in called[0].outputs]
         check([np.frombuffer(reply.raw_output_contents[names.index("action")], np.float32) for reply in called])
@@ -253,6 +269,7 @@ def test_exploring_requests_draw_for_themselves(port: int, store: PolicyStore) -
 def test_a_warning_is_in_the_reply_to_what_it_is_about(bounded: Path) -> None:
     async def main() -> list[Decision]:
         store = PolicyStore.load([bounded], options=TOGETHER)
+        in_a_crowd(store)
         rows = OBS[:4].copy()
         rows[1, 5], rows[3, 6] = 9.0, -10.0
         return await asyncio.gather(*(store.act_together("bounded", None, row) for row in rows))
@@ -275,6 +292,7 @@ def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(s
         return await asyncio.gather(hurried, patient, slow(), return_exceptions=True)
 
     with watched(store.get("ur5")) as sizes:
+        in_a_crowd(store)
         late, done, _ = asyncio.run(main())
     assert isinstance(late, DeadlineError) and "nothing computed" in late.message
     assert done.action.shape == (6,) and sizes == [1]
@@ -287,6 +305,7 @@ def test_a_closed_policy_computes_what_was_waiting_and_nothing_else(policies: Pa
         async def close() -> None:
             store.close()
 
+        in_a_crowd(store)
         asked = store.act_together("ur5", None, OBS[0])
         return await asyncio.gather(asked, close(), store.act_together("ur5", None, OBS[1]), return_exceptions=True)
 

@@ -22,13 +22,17 @@ PROTOCOLS = [HttpToolsProtocol, H11Protocol]
 class Recorder(asyncio.Transport):
     """A transport that keeps what is written, write by write."""
 
-    def __init__(self) -> None:
+    def __init__(self, events: list[str] | None = None) -> None:
         super().__init__()
         self.writes: list[bytes] = []
         self.closed = False
+        self._events = [] if events is None else events
 
     def write(self, data: Any) -> None:
+        assert not self.closed
         self.writes.append(bytes(data))
+        if data:
+            self._events.append("written")
 
     def close(self) -> None:
         self.closed = True
@@ -131,6 +135,74 @@ def test_head_requests_and_streamed_replies_arrive_whole(protocol: Any) -> None:
     assert b"".join(head).startswith(b"HTTP/1.1 200")
     streamed = b"".join(exchange(protocol, streams, post(b"x")).writes)
     assert all(part in streamed for part in (b"HTTP/1.1 200", b"one", b"two", b"three", b"0\r\n\r\n"))
+
+
+def crowd(protocol: Any, app: Any, rounds: int, number: int = 4) -> tuple[list[str], list[Recorder]]:
+    """Ask over so many connections at the same time, again and again; return what happened in the last round."""
+
+    async def run() -> tuple[list[str], list[Recorder]]:
+        events: list[str] = []
+
+        async def noted(scope: Scope, receive: Receive, send: Send) -> None:
+            events.append("asked")
+            await app(scope, receive, send)
+
+        config = uvicorn.Config(Ingress(noted), lifespan="off", log_level="critical", access_log=False)
+        config.load()
+        state = ServerState()
+        connections = [protocol(config=config, server_state=state, app_state={}) for _ in range(number)]
+        recorders = [Recorder(events) for _ in connections]
+        for connection, recorder in zip(connections, recorders, strict=True):
+            connection.connection_made(recorder)
+        for turn in range(rounds):
+            events.clear()
+            for number_, connection in enumerate(connections):
+                connection.data_received(post(b"%d/%d" % (number_, turn)))
+            for _ in range(6):
+                await asyncio.sleep(0)
+        for connection in connections:
+            connection.connection_lost(None)
+        return events, recorders
+
+    return asyncio.run(run())
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_in_a_crowd_the_replies_of_a_turn_are_written_after_all_were_computed(protocol: Any) -> None:
+    events, _ = crowd(protocol, echo, rounds=1)
+    assert events == ["asked", "written"] * 4
+    events, recorders = crowd(protocol, echo, rounds=2)
+    assert events == ["asked"] * 4 + ["written"] * 4
+    for number, recorder in enumerate(recorders):
+        bodies = [write.rpartition(b"\r\n\r\n")[2] for write in recorder.writes if write]
+        assert bodies == [b"%d/0" % number, b"%d/1" % number]
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_no_more_than_sixteen_replies_are_held(protocol: Any) -> None:
+    events, _ = crowd(protocol, echo, rounds=2, number=20)
+    assert events == ["asked"] * 16 + ["written"] * 16 + ["asked"] * 4 + ["written"] * 4
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_in_a_crowd_a_stream_keeps_its_order_and_a_failure_its_head(protocol: Any) -> None:
+    for recorder in crowd(protocol, streams, rounds=3)[1]:
+        assert b"".join(recorder.writes).count(b"3\r\none\r\n3\r\ntwo\r\n5\r\nthree\r\n0\r\n\r\n") == 3
+    for recorder in crowd(protocol, fails_after_the_head, rounds=1)[1]:
+        assert b"".join(recorder.writes).startswith(b"HTTP/1.1 200") and recorder.closed
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_what_is_held_is_written_before_its_connection_closes(protocol: Any) -> None:
+    async def last(scope: Scope, receive: Receive, send: Send) -> None:
+        body = (await receive())["body"]
+        length = (b"content-length", b"%d" % len(body))
+        headers = [length, (b"connection", b"close")] if body.endswith(b"/1") else [length]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": body})
+
+    for number, recorder in enumerate(crowd(protocol, last, rounds=2)[1]):
+        assert b"".join(recorder.writes).endswith(b"%d/1" % number) and recorder.closed
 
 
 def test_serve_is_told_not_to_watch_for_disconnects_and_websockets_pass_untouched() -> None:
