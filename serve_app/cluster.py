@@ -75,10 +75,11 @@ def _leave_out_extras() -> None:
 
     The autoscaler's monitor and the log forwarder are 165 MB and a second; `ray start` has flags for both, `ray.init`
     none. The node waits 3 s for the ports of its agent's HTTP and gRPC servers, which are for the dashboard; Ray leaves
-    them out where the dashboard's packages are missing, so here it is told that they are. Where these private names
-    have moved, everything starts.
+    them out where the dashboard's packages are missing, so here it is told that they are. Without a dashboard its
+    process starts all the same, to send usage statistics that are off, and `ray.init` waits until it is up. Where these
+    private names have moved, everything starts.
     """
-    from ray._private import parameter, utils
+    from ray._private import parameter, services, utils
 
     with contextlib.suppress(AttributeError):
         parameter.RayParams = functools.partial(  # type: ignore[misc, assignment]
@@ -88,6 +89,13 @@ def _leave_out_extras() -> None:
         )
     if hasattr(utils, "get_dashboard_dependency_error"):
         utils.get_dashboard_dependency_error = lambda: ImportError("left out")
+    if hasattr(services, "start_api_server"):
+        services.start_api_server = _no_api_server
+
+
+def _no_api_server(*_: Any, **__: Any) -> tuple[str, None]:
+    """Return the address and the process of a dashboard that is not there."""
+    return "", None
 
 
 def _watch_input(stop: threading.Event, started: threading.Event, plan: dict[str, Any]) -> None:
