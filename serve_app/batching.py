@@ -27,7 +27,6 @@ class Computed:
 
     outputs: Tensors  # `[1, ...]`
     milliseconds: float  # that the run took, for all that were in it
-    together: int  # how many those were
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +84,7 @@ class Batcher:
         """Return what a batch that came as one comes to: it waits for nobody. Raises what `run` raises."""
         started = time.perf_counter()
         outputs = self._run(feed)
-        rows = len(next(iter(feed.values())))
-        return Computed(outputs, (time.perf_counter() - started) * 1e3, rows)
+        return Computed(outputs, (time.perf_counter() - started) * 1e3)
 
     def _end_turn(self) -> None:
         self._compute_all()
@@ -118,6 +116,6 @@ class Batcher:
         self.runs += 1
         self.observations += rows
         return [
-            Computed({name: output[row : row + 1] for name, output in outputs.items()}, milliseconds, rows)
+            Computed({name: output[row : row + 1] for name, output in outputs.items()}, milliseconds)
             for row in range(rows)
         ]

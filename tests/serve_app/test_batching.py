@@ -62,7 +62,6 @@ def test_what_comes_in_one_turn_is_one_run_and_no_more_than_allowed() -> None:
             assert sizes == expected
             for i, one in enumerate(computed):
                 np.testing.assert_array_equal(one.outputs["action"], np.full((1, 2), 2 * i, np.float32))
-        assert [one.together for one in computed] == [4, 4, 4, 4, 2, 2]
         assert (batcher.runs, batcher.observations) == (12, 23)
 
     asyncio.run(main())
