@@ -125,8 +125,12 @@ class ServerSettings(BaseModel):
             first = error.errors(include_url=False)[0]
             name = str(first["loc"][0]) if first["loc"] else "settings"
             source = PREFIX + name.upper() if name in values and name not in given else f"the setting '{name}'"
-            known = ", ".join(cls.model_fields)
+            path = ".".join(map(str, first["loc"][1:]))
+            inside = f" at '{path}'" if path else ""
+            known = ", ".join(PolicyOptions.model_fields if inside else cls.model_fields)
             hint = f"; known: {known}" if first["type"] == "extra_forbidden" else ""
             field = cls.model_fields.get(name)
             given_text = "" if field is not None and not field.repr else f" (given: {first['input']!r:.80})"
-            raise UsageError(f"{source} is not usable: {first['msg']}{given_text}{hint}") from None  # it may be a key
+            raise UsageError(
+                f"{source} is not usable{inside}: {first['msg']}{given_text}{hint}"
+            ) from None  # it may be a key

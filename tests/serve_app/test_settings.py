@@ -20,6 +20,11 @@ def test_arguments_win_over_the_environment_over_the_defaults() -> None:
     [
         ({}, {"RLSERVO_THREADS": "many"}, "RLSERVO_THREADS is not usable"),
         ({"threads": 0}, {}, "the setting 'threads' is not usable"),
+        (
+            {},
+            {"RLSERVO_POLICY_OPTIONS": '{"ur5": {"micro_bach": 16}}'},
+            r"RLSERVO_POLICY_OPTIONS is not usable at 'ur5.micro_bach': .*known: out_of_bounds, .*, micro_batch$",
+        ),
         ({"colour": 1}, {}, "known: threads"),
     ],
 )
