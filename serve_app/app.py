@@ -24,11 +24,10 @@ from ray.serve.config import HTTPOptions, gRPCOptions
 from ray.serve.context import _get_global_client
 
 from rlservo.export.errors import PartlyAppliedError, RlservoError
-from rlservo.serve_app import listing
+from rlservo.serve_app import ingress, listing
 from rlservo.serve_app.control import Control, Following
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.http import create_app
-from rlservo.serve_app.ingress import gate
 from rlservo.serve_app.keys import check_exposure, is_loopback
 from rlservo.serve_app.ledger import GcsLedger
 from rlservo.serve_app.library import Library, Repository
@@ -143,7 +142,8 @@ class PolicyServer(InferenceService):
         )
         core: Core = app.state.core
         self._core = core
-        gate.is_open = core.admission.is_open
+        # By way of the module: Serve pickles this class with copies of the objects that it names.
+        ingress.door.open(app if self._settings.ahead_of_serve and _can_be_left_out() else None, core.admission.is_open)
         self.serve_grpc(core, local_only=is_loopback(self._host))
         return app
 
@@ -235,6 +235,19 @@ def _controller() -> Any:
     """Return Serve's controller, which knows more than Serve's interface tells (ray 2.60): hence the private client."""
     client: Any = _get_global_client()
     return client._controller
+
+
+def _can_be_left_out() -> bool:
+    """Whether Serve's handling of a request can be: a replica that stops then waits for its HTTP server (ray 2.60).
+
+    Older ones wait only for the requests that Serve has counted. Where Serve traces, it is to see every request.
+    """
+    try:
+        from ray.serve._private.replica import Replica
+        from ray.serve._private.tracing_utils import is_tracing_enabled
+    except ImportError:  # another Ray, which has moved its private names
+        return False
+    return hasattr(Replica, "_stop_accepting_direct_ingress") and not is_tracing_enabled()
 
 
 def _alone() -> bool:

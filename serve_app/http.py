@@ -27,7 +27,7 @@ from rlservo.serve_app.docs import add_docs
 from rlservo.serve_app.edge import JSON, JSON_HEADERS, BareRoute, Body, Endpoint, Headers
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import Decision
-from rlservo.serve_app.stream import Stream, refuse
+from rlservo.serve_app.stream import STREAM_PATTERN, Stream, refuse
 
 CODES = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "wrong-media-type"}
 ACT_PATH = "/v1/policies/{name}/act"
@@ -83,7 +83,8 @@ class PolicyApp(FastAPI):
     """A FastAPI application that answers requests for actions before its middleware and router see them.
 
     Those cost as much again as the request does (measured: a sixth of the round trip). The routes are still there: for
-    the documentation, and for whatever is not a POST.
+    the documentation, and for whatever is not a POST. What it `takes` needs nothing that Serve does, either
+    (`ingress.py`).
     """
 
     def __init__(
@@ -93,13 +94,29 @@ class PolicyApp(FastAPI):
         self._direct = direct
         self._stream = stream
         self._core = core
+        self._mount: str | None = None  # the paths' prefix, which the first request that Serve brings tells
+
+    def takes(self, scope: Scope) -> bool:
+        """Whether this is a request for actions, or a stream; it is then put under this application's prefix."""
+        mount, path = self._mount, scope["path"]
+        if mount is None or not path.startswith(mount):
+            return False
+        path = path[len(mount) :]
+        if scope["type"] == "http":
+            found = scope["method"] == "POST" and any(pattern.fullmatch(path) for pattern, _ in self._direct)
+        else:
+            found = scope["type"] == "websocket" and STREAM_PATTERN.fullmatch(path) is not None
+        if found:
+            scope["root_path"] = mount
+        return found
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Dispatch one ASGI connection."""
         if scope["type"] == "lifespan":
             await super().__call__(scope, receive, send)
             return
-        path = scope["path"].removeprefix(scope.get("root_path", ""))
+        self._mount = scope.get("root_path", "")
+        path = scope["path"].removeprefix(self._mount)
         try:
             self._core.guard.check(scope, path)
         except RlservoError as error:

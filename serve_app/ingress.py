@@ -1,11 +1,17 @@
-"""What stands before Ray Serve's own request handling in a replica: a gate, and one header.
+"""What stands before Ray Serve's own request handling in a replica: the door, which answers what a policy is asked.
 
-The gate turns requests away while the replica has more than it takes on (`admission.py`), before Serve spends on them
-what an answer costs; it is open in Serve's proxies, which take nothing on.
+Serve spends more on a request than a policy does: contexts, tasks, a request object, statistics, a line for its log. A
+request for actions needs none of it. How much a replica takes on is decided by `admission.py`, who may ask by
+`keys.py`, metrics and the log are ours, and a replica that is told to stop waits for its HTTP server, which waits for
+whoever is still being answered (ray 2.60). So the door passes such requests straight to the application, and
+everything else to Serve. Streams gain as well: Serve reads a WebSocket in a task of its own.
 
-Serve watches every HTTP request for the client hanging up, so that long work can be cancelled. A policy answers before
-anything could be cancelled. The header `x-request-disconnect-disabled` is Serve's switch for that (ray 2.60), worth two
-asyncio tasks a request. Replies leave in one write (`joined.py`).
+It turns requests away, too, while the replica has more than it takes on. In Serve's proxies, and in a replica whose
+application runs in another event loop than its HTTP server, the door lets everybody through to Serve.
+
+Serve watches every HTTP request for the client hanging up, so that long work can be cancelled. The header
+`x-request-disconnect-disabled` is its switch for that (ray 2.60), worth two asyncio tasks a request. Replies leave in
+one write (`joined.py`).
 
 `RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH=rlservo.serve_app.ingress:middlewares` puts it in place. It is imported by
 Serve's proxies as well, so it needs nothing but starlette.
@@ -13,53 +19,113 @@ Serve's proxies as well, so it needs nothing but starlette.
 
 from __future__ import annotations
 
+import asyncio
+import itertools
+import secrets
 from collections.abc import Callable
+from typing import Protocol
 
 from starlette.middleware import Middleware
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rlservo.serve_app.joined import join_writes
 
 FULL = b'{"error":"this replica has as many requests as it takes on: try again shortly","code":"over-capacity"}'
-TURNED_AWAY = [
+TURNED_AWAY = (
     (b"content-type", b"application/json"),
     (b"content-length", b"%d" % len(FULL)),
     (b"retry-after", b"1"),
-]
-HEADER = (b"x-request-disconnect-disabled", b"?1")
+)
+NO_WATCH = (b"x-request-disconnect-disabled", b"?1")
+REQUEST_ID = b"x-request-id"
 
 
-class Gate:
-    """Tells whether a request may come in; the replica puts its own rule here."""
+class Application(Protocol):
+    """An ASGI application that knows which requests it can answer without Serve."""
+
+    def takes(self, scope: Scope) -> bool:
+        """Whether it answers this one."""
+        ...
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer."""
+        ...
+
+
+class Door:
+    """What this process puts before Serve's handling; the replica sets it up, in a proxy it stays as it is here."""
 
     def __init__(self) -> None:
-        self.is_open: Callable[[], bool] = _always
+        self.close()
+
+    def open(self, app: Application | None, has_room: Callable[[], bool]) -> None:
+        """From now on turn away whom there is no room for, and let `app` answer what it takes, in this event loop."""
+        self.app, self.has_room, self._loop = app, has_room, asyncio.get_running_loop()
+
+    def close(self) -> None:
+        """Leave everything to Serve."""
+        self.app: Application | None = None
+        self.has_room: Callable[[], bool] = _always
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def takes(self, scope: Scope) -> bool:
+        """Whether the application answers without Serve."""
+        return self.app is not None and asyncio.get_running_loop() is self._loop and self.app.takes(scope)
 
 
 def _always() -> bool:
     return True
 
 
-gate = Gate()
+door = Door()
 
 
 class Ingress:
-    """Looks at every HTTP request; WebSockets pass untouched, they need their disconnects."""
+    """Looks at every HTTP request and every WebSocket."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http":
-            scope["headers"] = [*scope["headers"], HEADER]
-            if scope["method"] == "POST":
-                # Everything else is cheap, and health has to be told under load, too.
-                if not gate.is_open():
-                    await send({"type": "http.response.start", "status": 503, "headers": TURNED_AWAY})
-                    await send({"type": "http.response.body", "body": FULL})
-                    return
-                join_writes(send)
+        http = scope["type"] == "http"
+        if http and scope["method"] == "POST":
+            # Everything else is cheap, and health has to be told under load, too.
+            if not door.has_room():
+                await send({"type": "http.response.start", "status": 503, "headers": list(TURNED_AWAY)})
+                await send({"type": "http.response.body", "body": FULL})
+                return
+            join_writes(send)
+        if door.takes(scope):
+            assert door.app is not None
+            request_id = _identify(scope)
+            await door.app(scope, receive, _with_id(request_id, send) if http else send)
+            return
+        if http:
+            scope["headers"] = [*scope["headers"], NO_WATCH]
         await self._app(scope, receive, send)
+
+
+def _identify(scope: Scope) -> bytes:
+    """Return the request's id, the client's or a new one, which the request then has: what Serve would have done."""
+    for name, value in scope["headers"]:
+        if name == REQUEST_ID:
+            return bytes(value)
+    request_id = b"%s-%x" % (PROCESS, next(numbers))
+    scope["headers"] = [*scope["headers"], (REQUEST_ID, request_id)]
+    return request_id
+
+
+def _with_id(request_id: bytes, send: Send) -> Send:
+    async def send_with_id(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            message = {**message, "headers": [*message.get("headers", ()), (REQUEST_ID, request_id)]}
+        await send(message)
+
+    return send_with_id
+
+
+PROCESS = secrets.token_hex(8).encode()
+numbers = itertools.count(1)
 
 
 def middlewares() -> list[Middleware]:

@@ -89,6 +89,10 @@ class ServerSettings(BaseModel):
     policy_options: dict[str, PolicyOptions] = {}
     """How strict each policy is at its edges, by policy name; '*' is for the others. As a variable: a JSON object."""
 
+    ahead_of_serve: bool = True
+    """Answer requests for actions, and streams, before Ray Serve's own handling, which takes as long as the rest of a
+    replica does. Off, Serve counts them in its own metrics; where its tracing is on, it handles them in any case."""
+
     docs: bool = True
     """Serve the interactive API documentation at /docs, from files that come with the server."""
 

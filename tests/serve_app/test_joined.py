@@ -1,9 +1,8 @@
-"""What stands before Serve's handling in a replica, on uvicorn's own protocols with a transport that records writes."""
+"""The writes of replies, on uvicorn's own protocols with a transport that records them."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.server import ServerState
 
-from rlservo.serve_app.ingress import HEADER, Ingress
+from rlservo.serve_app.ingress import Ingress
 
 PROTOCOLS = [HttpToolsProtocol, H11Protocol]
 
@@ -203,17 +202,3 @@ def test_what_is_held_is_written_before_its_connection_closes(protocol: Any) -> 
 
     for number, recorder in enumerate(crowd(protocol, last, rounds=2)[1]):
         assert b"".join(recorder.writes).endswith(b"%d/1" % number) and recorder.closed
-
-
-def test_serve_is_told_not_to_watch_for_disconnects_and_websockets_pass_untouched() -> None:
-    seen: list[Scope] = []
-
-    async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        seen.append(scope)
-
-    async def nothing(*_: object) -> Any: ...
-
-    call: Callable[..., Any] = Ingress(app)
-    asyncio.run(call({"type": "http", "method": "POST", "headers": []}, nothing, nothing))
-    asyncio.run(call({"type": "websocket", "headers": []}, nothing, nothing))
-    assert HEADER in seen[0]["headers"] and seen[1]["headers"] == []

@@ -1,0 +1,202 @@
+"""The door before Ray Serve's handling: what it lets the application answer, and what it leaves to Serve."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.types import Message, Receive, Scope, Send
+
+from rlservo.serve_app.http import create_app
+from rlservo.serve_app.ingress import NO_WATCH, REQUEST_ID, Door, Ingress, door
+from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.store import PolicyStore, load_policy
+
+ACT = "/v1/policies/ur5/act"
+OBS = json.dumps({"obs": [0.0] * 27}).encode()
+
+
+@pytest.fixture(autouse=True)
+def _closed_door() -> Iterator[None]:
+    yield
+    door.close()
+
+
+class Serve:
+    """Stands for Ray Serve: notes what reaches it, and calls the application under a prefix, as Serve does."""
+
+    def __init__(self, app: Any, prefix: str = "") -> None:
+        self.seen: list[Scope] = []
+        self._app = app
+        self._prefix = prefix
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self.seen.append(dict(scope))
+        scope["root_path"] = scope.get("root_path", "") + self._prefix
+        await self._app(scope, receive, send)
+
+
+@pytest.fixture
+def app(ur5: Path) -> Any:
+    store = PolicyStore([load_policy(ur5)])
+    return create_app(lambda: store, ServerSettings())
+
+
+async def ask(
+    ingress: Any,
+    path: str = ACT,
+    *,
+    method: str = "POST",
+    headers: tuple[tuple[bytes, bytes], ...] = (),
+    body: bytes = OBS,
+    root_path: str = "",
+) -> tuple[int, dict[bytes, bytes], bytes]:
+    """Return (status, headers, body) of one HTTP request through the ingress."""
+    sent: list[Message] = []
+
+    async def receive() -> Message:
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    async def send(message: Message) -> None:
+        sent.append(message)
+
+    scope = {
+        "type": "http",
+        "method": method,
+        "path": root_path + path,
+        "root_path": root_path,
+        "query_string": b"",
+        "headers": [(b"content-type", b"application/json"), *headers],
+    }
+    await ingress(scope, receive, send)
+    assert [message["type"] for message in sent] == ["http.response.start", "http.response.body"]
+    return sent[0]["status"], dict(sent[0]["headers"]), sent[1].get("body", b"")
+
+
+def run(scenario: Callable[[], Any]) -> Any:
+    return asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("prefix", ["", "/robots"])
+@pytest.mark.parametrize("root_path", ["", "/behind/a/proxy"])
+def test_requests_for_actions_do_not_reach_serve_once_it_has_told_the_prefix(
+    app: Any, prefix: str, root_path: str
+) -> None:
+    async def scenario() -> None:
+        serve = Serve(app, prefix)
+        ingress: Any = Ingress(serve)
+        door.open(app, lambda: True)
+        for path in (ACT, "/v2/models/ur5/infer", "/v1/policies/ur5/versions/10/act"):
+            first = await ask(ingress, prefix + ACT, root_path=root_path)
+            assert first[0] == 200
+            serve.seen.clear()
+            body = OBS
+            if "infer" in path:
+                tensor = {"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [0.0] * 27}
+                body = json.dumps({"inputs": [tensor]}).encode()
+            status, _, answer = await ask(ingress, prefix + path, body=body, root_path=root_path)
+            assert status == 200 and not serve.seen, answer
+
+    run(scenario)
+
+
+def test_everything_else_is_left_to_serve_and_marked_as_not_to_be_watched(app: Any) -> None:
+    async def scenario() -> None:
+        serve = Serve(app)
+        ingress: Any = Ingress(serve)
+        door.open(app, lambda: True)
+        await ask(ingress)
+        serve.seen.clear()
+        for method, path, status in (
+            ("GET", "/healthz", 200),
+            ("GET", "/v1/policies", 200),
+            ("GET", ACT, 405),
+            ("POST", "/v1/policies/ur5/act/", 307),
+            ("POST", "/robots" + ACT, 404),
+            ("POST", "/v1/policies/a/b/act", 404),
+        ):
+            assert (await ask(ingress, path, method=method))[0] == status
+        assert len(serve.seen) == 6
+        assert all(NO_WATCH in scope["headers"] for scope in serve.seen)
+
+    run(scenario)
+
+
+def test_an_answer_carries_the_clients_request_id_or_a_new_one(app: Any) -> None:
+    async def scenario() -> None:
+        ingress: Any = Ingress(Serve(app))
+        door.open(app, lambda: True)
+        await ask(ingress)
+        made = {(await ask(ingress))[1][REQUEST_ID] for _ in range(5)}
+        assert len(made) == 5 and all(made)
+        given = await ask(ingress, headers=((REQUEST_ID, b"mine"),))
+        assert given[1][REQUEST_ID] == b"mine"
+        refused = await ask(ingress, body=b"{}", headers=((REQUEST_ID, b"yours"),))
+        assert refused[0] == 422 and refused[1][REQUEST_ID] == b"yours"
+
+    run(scenario)
+
+
+def test_a_stream_reaches_the_application_untouched_but_for_its_id(app: Any) -> None:
+    async def scenario() -> None:
+        serve = Serve(app)
+        ingress: Any = Ingress(serve)
+        door.open(app, lambda: True)
+        await ask(ingress)
+        serve.seen.clear()
+        for path, directly in (("/v1/policies/ur5/stream", True), ("/", True), ("/elsewhere", False)):
+            sent: list[Message] = []
+            messages = iter([{"type": "websocket.connect"}, {"type": "websocket.disconnect", "code": 1000}])
+
+            async def receive(messages: Any = messages) -> Message:
+                return dict(next(messages))
+
+            async def send(message: Message, sent: list[Message] = sent) -> None:
+                sent.append(message)
+
+            scope = {"type": "websocket", "path": path, "headers": [], "query_string": b""}
+            await ingress(scope, receive, send)
+            assert bool(serve.seen) is not directly
+            assert [name for name, _ in scope["headers"]] == ([REQUEST_ID] if directly else [])
+            assert sent[0]["type"] == "websocket.accept"
+
+    run(scenario)
+
+
+def test_nobody_comes_in_while_there_is_no_room(app: Any) -> None:
+    async def scenario() -> None:
+        serve = Serve(app)
+        ingress: Any = Ingress(serve)
+        room = [True]
+        door.open(app, lambda: room[0])
+        await ask(ingress)
+        room[0] = False
+        status, headers, body = await ask(ingress)
+        assert (status, headers[b"retry-after"], json.loads(body)["code"]) == (503, b"1", "over-capacity")
+        assert (await ask(ingress, "/healthz", method="GET"))[0] == 200
+
+    run(scenario)
+
+
+def test_another_event_loop_a_closed_door_and_a_prefix_not_yet_told_leave_it_to_serve(app: Any) -> None:
+    serve = Serve(app)
+    ingress: Any = Ingress(serve)
+
+    async def opens() -> None:
+        door.open(app, lambda: True)
+        assert (await ask(ingress))[0] == 200  # Serve tells the prefix
+        assert (await ask(ingress))[0] == 200
+        assert len(serve.seen) == 1
+
+    async def elsewhere() -> None:
+        assert (await ask(ingress))[0] == 200
+        assert len(serve.seen) == 2
+
+    run(opens)
+    run(elsewhere)  # another loop
+    fresh = Door()
+    assert fresh.has_room() and not fresh.takes({"type": "http", "method": "POST", "path": ACT})
