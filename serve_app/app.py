@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import ray
-from fastapi import FastAPI
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from ray import serve
 from ray.exceptions import ActorDiedError, RayError
@@ -27,7 +26,7 @@ from rlservo.export.errors import PartlyAppliedError, RlservoError
 from rlservo.serve_app import ingress, listing
 from rlservo.serve_app.control import Control, Following
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.http import create_app
+from rlservo.serve_app.http import PolicyApp, create_app
 from rlservo.serve_app.keys import check_exposure, is_loopback
 from rlservo.serve_app.ledger import GcsLedger
 from rlservo.serve_app.library import Library, Repository
@@ -136,7 +135,7 @@ class PolicyServer(InferenceService):
             is_current=self._is_current,
         )
 
-    def __serve_build_asgi_app__(self) -> FastAPI:  # Serve's hook: the app is built in the replica
+    def __serve_build_asgi_app__(self) -> PolicyApp:  # Serve's hook: the app is built in the replica
         app = create_app(
             lambda: self._control.store, self._settings, replica=self._replica, control=self._control, alone=_alone
         )

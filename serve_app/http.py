@@ -42,7 +42,7 @@ def create_app(
     replica: str = "",
     control: Control | None = None,
     alone: Callable[[], bool] = lambda: True,
-) -> FastAPI:
+) -> PolicyApp:
     """Return the application; `store_provider` gives None for as long as the policies are being loaded.
 
     With a `control` what is served can be administered. `replica` and `alone` are the `Core`'s, which is the

@@ -56,17 +56,18 @@ class Door:
     """What this process puts before Serve's handling; the replica sets it up, in a proxy it stays as it is here."""
 
     def __init__(self) -> None:
-        self.close()
+        """Leave everything to Serve."""
+        self.app: Application | None = None
+        self.has_room: Callable[[], bool] = _always
+        self._loop: asyncio.AbstractEventLoop | None = None
 
     def open(self, app: Application | None, has_room: Callable[[], bool]) -> None:
         """From now on turn away whom there is no room for, and let `app` answer what it takes, in this event loop."""
         self.app, self.has_room, self._loop = app, has_room, asyncio.get_running_loop()
 
     def close(self) -> None:
-        """Leave everything to Serve."""
-        self.app: Application | None = None
-        self.has_room: Callable[[], bool] = _always
-        self._loop: asyncio.AbstractEventLoop | None = None
+        """Leave everything to Serve again."""
+        self.app, self.has_room, self._loop = None, _always, None
 
     def takes(self, scope: Scope) -> bool:
         """Whether the application answers without Serve."""
