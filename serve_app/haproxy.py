@@ -4,6 +4,11 @@ Ray (2.60) starts HAProxy from an actor, anew for every change of replicas (`hap
 
 - Its statistics and metrics listen on every interface, whatever host is asked for; a client gets an hour to send a
   request's headers; where no replica can be reached it answers 500 in HTML, and 404 until it knows of any.
+- A replica that is killed still takes connections while the kernel ends it, and resets them. What was sent to it is
+  tried again elsewhere (`RAY_SERVE_HAPROXY_RETRY_ON`), but only what HAProxy had seen whole before it passed it on:
+  a client that sends head and body apart got nothing. So it waits for a body, or for what fits its buffer. Where a
+  connection is refused it waits a second, the time it gives a connection, before it tries another replica; a tenth
+  is enough.
 - When HAProxy or its actor is killed, Serve looks three times before it starts another one, which takes seconds, and
   nobody listens meanwhile. Here a process waits for HAProxy's end and at once starts it again, with the last
   configuration, until Serve's next one knows its replicas.
@@ -29,9 +34,11 @@ import time
 from pathlib import Path
 from typing import NoReturn
 
-HEADERS_TIMEOUT_S = 5
-SCRIPT, ERROR_FILE, BRIDGE = "haproxy", "503.http", "bridge.cfg"
+REQUEST_TIMEOUT_S = 5  # for a request's head, and a body that fits the proxy's buffer
+CONNECT_TIMEOUT_MS = 100
+SCRIPT, ERROR_FILE, LATE_FILE, BRIDGE = "haproxy", "503.http", "408.http", "bridge.cfg"
 UNREACHABLE = b'{"error":"no replica of the policy server can be reached: try again shortly","code":"unavailable"}'
+LATE = b'{"error":"the request did not arrive within %d s","code":"deadline-passed"}' % REQUEST_TIMEOUT_S
 LOOK_S = 0.1  # between a bridge's looks at whether it is still needed
 ORPHAN_S = 8.0  # without Serve's controller, which comes back within a few seconds or not at all
 KNOWS_REPLICAS = re.compile(r"^ *server SERVE_REPLICA", re.MULTILINE)
@@ -42,11 +49,12 @@ PROC = Path("/proc")
 
 
 def prepare(folder: Path, binary: str) -> Path:
-    """Write the script that Ray starts as HAProxy, and the answer for when no replica is there; return the script."""
+    """Write the script that Ray starts as HAProxy, and the answers that HAProxy gives itself; return the script."""
+    head = b"content-type: application/json\r\nconnection: close\r\n\r\n"
     (folder / ERROR_FILE).write_bytes(
-        b"HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/json\r\nretry-after: 1\r\n"
-        b"connection: close\r\n\r\n" + UNREACHABLE
+        b"HTTP/1.1 503 Service Unavailable\r\nretry-after: 1\r\n" + head + UNREACHABLE
     )
+    (folder / LATE_FILE).write_bytes(b"HTTP/1.1 408 Request Timeout\r\n" + head + LATE)
     script = folder / SCRIPT
     program = shlex.join([sys.executable, "-IS", str(Path(__file__).resolve()), str(folder), binary])
     script.write_text(f'#!/bin/sh\nexec {program} "$@"\n')
@@ -72,7 +80,11 @@ def mend(text: str, error_file: Path, *, bridged: bool = False) -> str:
     text = re.sub(r"^(frontend prometheus\n +bind )(:\d+)$", r"\g<1>127.0.0.1\2", text, flags=re.MULTILINE)
     text = re.sub(r"^(listen stats\n +bind )\*(:\d+)$", r"\g<1>127.0.0.1\2", text, flags=re.MULTILINE)
     text = re.sub(r"^( *errorfile 50[234]) .*$", rf"\1 {error_file}", text, flags=re.MULTILINE)
-    text = re.sub(r"^defaults$", rf"\g<0>\n    timeout http-request {HEADERS_TIMEOUT_S}s", text, flags=re.MULTILINE)
+    more = f"    timeout http-request {REQUEST_TIMEOUT_S}s\n    errorfile 408 {error_file.with_name(LATE_FILE)}"
+    text = re.sub(r"^defaults$", rf"\g<0>\n{more}", text, flags=re.MULTILINE)
+    text = re.sub(r"^( *timeout connect) .*$", rf"\1 {CONNECT_TIMEOUT_MS}ms", text, flags=re.MULTILINE)
+    # Not for gRPC, whose streams are requests that go on.
+    text = re.sub(r"^frontend http_frontend$", r"\g<0>\n    option http-buffer-request", text, flags=re.MULTILINE)
     if KNOWS_REPLICAS.search(text):
         return text
     # Not yet, or no more: 404 would say that there is no such policy.

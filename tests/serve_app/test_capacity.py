@@ -192,6 +192,7 @@ def test_the_proxys_configuration_is_mended_before_it_starts(tmp_path: Path) -> 
         "    maxconn 4096",
         "defaults",
         "    timeout http-request 5s",
+        f"    errorfile 408 {tmp_path / '408.http'}",
         "    mode http",
         f"    errorfile 502 {answer_file}",
         f"    errorfile 503 {answer_file}",

@@ -8,6 +8,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -45,6 +46,15 @@ backend default_backend
 """
 FULL = """    default_backend http-rlservo
 backend http-rlservo
+    server SERVE_REPLICA_rlservo-PolicyServer-a 127.0.0.1:{replica}
+"""
+TWO = """    default_backend http-rlservo
+backend http-rlservo
+    balance leastconn
+    option redispatch 1
+    retry-on conn-failure empty-response
+    retries 5
+    server SERVE_REPLICA_rlservo-PolicyServer-dying 127.0.0.1:{stats}
     server SERVE_REPLICA_rlservo-PolicyServer-a 127.0.0.1:{replica}
 """
 STATISTICS = """listen stats
@@ -126,6 +136,13 @@ class Replica(BaseHTTPRequestHandler):
         self.send_header("content-length", "2")
         self.end_headers()
         self.wfile.write(b"[]")
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["content-length"]))
+        self.send_response(200)
+        self.send_header("content-length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
 
     def log_message(self, *_: object) -> None:
         pass
@@ -227,6 +244,78 @@ def test_a_bridge_ends_with_serve(node: Node, monkeypatch: pytest.MonkeyPatch) -
     until(node.bridges)
     node.raylet.kill()
     until(lambda: not node.bridges())
+
+
+@contextlib.contextmanager
+def dying(port: int) -> Iterator[None]:
+    """A replica that is being ended: it takes connections and what comes on them, and hangs up."""
+    with socket.create_server(("127.0.0.1", port)) as listener:
+
+        def hang_up() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    connection, _ = listener.accept()
+                    connection.recv(65536)
+                    connection.close()
+
+        thread = threading.Thread(target=hang_up)
+        thread.start()
+        try:
+            yield
+        finally:
+            listener.shutdown(socket.SHUT_RDWR)
+            thread.join()
+
+
+def apart(port: int, head: bytes, body: bytes, pause_s: float) -> tuple[bytes, float]:
+    """Send head and body in two pieces; return the answer and how long it took after them."""
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.sendall(head)
+        time.sleep(pause_s)
+        connection.sendall(body)
+        started = time.monotonic()
+        answer = b""
+        while piece := connection.recv(65536):
+            answer += piece
+        return answer, time.monotonic() - started
+
+
+def test_a_request_to_a_dying_replica_is_answered_by_another_one_whatever_pieces_it_came_in(node: Node) -> None:
+    node.proxy(TWO)
+    head = b"POST /act HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-length: 5\r\n\r\n"
+    with dying(node.stats):
+        until(lambda: node.ask()[0] == 200)
+        for pause_s in (0.0, 0.05, 0.05, 0.05, 0.05, 0.05):
+            answer, _ = apart(node.port, head, b"hello", pause_s)
+            assert answer.split()[1] == b"200" and answer.endswith(b"hello")
+
+
+def test_a_replica_that_takes_no_connections_costs_tenths_of_a_second(node: Node) -> None:
+    node.proxy(TWO)
+    until(lambda: node.ask()[0] == 200)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(socket.create_server(("127.0.0.1", node.stats), backlog=0))
+        for _ in range(3):  # more than it keeps for later: the kernel ignores further ones
+            waiting = stack.enter_context(socket.socket())
+            waiting.setblocking(False)
+            waiting.connect_ex(("127.0.0.1", node.stats))
+        slow = stack.enter_context(socket.create_connection(("127.0.0.1", node.port), timeout=20))
+        slow.sendall(b"GET /slow HTTP/1.1\r\nhost: x\r\n\r\n")  # so the other replica has the fewest connections
+        time.sleep(0.5)
+        head = b"POST /act HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-length: 5\r\n\r\n"
+        answers = [apart(node.port, head, b"hello", 0.0) for _ in range(3)]
+    assert all(answer.split()[1] == b"200" for answer, _ in answers)
+    assert 0.09 < max(seconds for _, seconds in answers) < 0.9  # HAProxy's own are five seconds, and one before a retry
+
+
+def test_a_request_that_does_not_come_is_told_so(node: Node) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    head = b"POST /act HTTP/1.1\r\nhost: x\r\ncontent-length: 5\r\n\r\n"
+    answer, seconds = apart(node.port, head, b"hel", 0.0)
+    assert answer.startswith(b"HTTP/1.1 408") and seconds < 10
+    assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "deadline-passed"
 
 
 def test_a_bridge_has_none_of_what_is_rays_own(tmp_path: Path) -> None:
