@@ -234,7 +234,7 @@ class _BodyTimer:
 
 
 def request_id(scope: Scope) -> str | None:
-    """Return the request's id: the client's, or the one that Ray Serve made; Serve puts it on the answer."""
+    """Return the request's id: the client's, or the one that Ray Serve or `ingress.py` made, which is on the answer."""
     for name, value in scope["headers"]:
         if name == b"x-request-id":
             return str(value.decode("latin-1"))

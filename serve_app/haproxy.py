@@ -7,8 +7,8 @@ Ray (2.60) starts HAProxy from an actor, anew for every change of replicas (`hap
 - A replica that is killed still takes connections while the kernel ends it, and resets them. What was sent to it is
   tried again elsewhere (`RAY_SERVE_HAPROXY_RETRY_ON`), but only what HAProxy had seen whole before it passed it on:
   a client that sends head and body apart got nothing. So it waits for a body, or for what fits its buffer. Where a
-  connection is refused it waits a second, the time it gives a connection, before it tries another replica; a tenth
-  is enough.
+  connection breaks it waits a second, or the time it gives a connection, before it tries another replica: a quarter
+  is enough, with four times the retries.
 - When HAProxy or its actor is killed, Serve looks three times before it starts another one, which takes seconds, and
   nobody listens meanwhile. Here a process waits for HAProxy's end and at once starts it again, with the last
   configuration, until Serve's next one knows its replicas.
@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import NoReturn
 
 REQUEST_TIMEOUT_S = 5  # for a request's head, and a body that fits the proxy's buffer
-CONNECT_TIMEOUT_MS = 100
+CONNECT_TIMEOUT_MS = 250
 SCRIPT, ERROR_FILE, LATE_FILE, BRIDGE = "haproxy", "503.http", "408.http", "bridge.cfg"
 UNREACHABLE = b'{"error":"no replica of the policy server can be reached: try again shortly","code":"unavailable"}'
 LATE = b'{"error":"the request did not arrive within %d s","code":"deadline-passed"}' % REQUEST_TIMEOUT_S
@@ -50,16 +50,19 @@ PROC = Path("/proc")
 
 def prepare(folder: Path, binary: str) -> Path:
     """Write the script that Ray starts as HAProxy, and the answers that HAProxy gives itself; return the script."""
-    head = b"content-type: application/json\r\nconnection: close\r\n\r\n"
-    (folder / ERROR_FILE).write_bytes(
-        b"HTTP/1.1 503 Service Unavailable\r\nretry-after: 1\r\n" + head + UNREACHABLE
-    )
-    (folder / LATE_FILE).write_bytes(b"HTTP/1.1 408 Request Timeout\r\n" + head + LATE)
+    _write_answers(folder)
     script = folder / SCRIPT
     program = shlex.join([sys.executable, "-IS", str(Path(__file__).resolve()), str(folder), binary])
     script.write_text(f'#!/bin/sh\nexec {program} "$@"\n')
     script.chmod(0o700)
     return script
+
+
+def _write_answers(folder: Path) -> None:
+    """Write them: without the files that its configuration names, HAProxy does not start."""
+    head = b"content-type: application/json\r\nconnection: close\r\n\r\n"
+    (folder / ERROR_FILE).write_bytes(b"HTTP/1.1 503 Service Unavailable\r\nretry-after: 1\r\n" + head + UNREACHABLE)
+    (folder / LATE_FILE).write_bytes(b"HTTP/1.1 408 Request Timeout\r\n" + head + LATE)
 
 
 def find_binary() -> str | None:
@@ -82,9 +85,11 @@ def mend(text: str, error_file: Path, *, bridged: bool = False) -> str:
     text = re.sub(r"^( *errorfile 50[234]) .*$", rf"\1 {error_file}", text, flags=re.MULTILINE)
     more = f"    timeout http-request {REQUEST_TIMEOUT_S}s\n    errorfile 408 {error_file.with_name(LATE_FILE)}"
     text = re.sub(r"^defaults$", rf"\g<0>\n{more}", text, flags=re.MULTILINE)
-    text = re.sub(r"^( *timeout connect) .*$", rf"\1 {CONNECT_TIMEOUT_MS}ms", text, flags=re.MULTILINE)
-    # Not for gRPC, whose streams are requests that go on.
-    text = re.sub(r"^frontend http_frontend$", r"\g<0>\n    option http-buffer-request", text, flags=re.MULTILINE)
+    if "RAY_SERVE_HAPROXY_TIMEOUT_CONNECT_S" not in os.environ:
+        text = re.sub(r"^( *timeout connect) .*$", rf"\1 {CONNECT_TIMEOUT_MS}ms", text, flags=re.MULTILINE)
+    # Not for gRPC, whose streams are requests that go on. A connection on which nothing came gets no 408.
+    more = "    option http-buffer-request\n    option http-ignore-probes"
+    text = re.sub(r"^frontend http_frontend$", rf"\g<0>\n{more}", text, flags=re.MULTILINE)
     if KNOWS_REPLICAS.search(text):
         return text
     # Not yet, or no more: 404 would say that there is no such policy.
@@ -106,6 +111,7 @@ def main(folder: str, binary: str, *arguments: str) -> NoReturn:
     if "-f" in arguments:
         file = Path(arguments[arguments.index("-f") + 1])
         note = file.with_name("bridge.pid")
+        _write_answers(Path(folder))  # it may have been prepared by an earlier version
         file.write_text(mend(file.read_text(), Path(folder) / ERROR_FILE, bridged=_is_running(note, binary)))
         _watch(binary, file, note)
     os.execv(binary, [binary, *arguments])

@@ -14,13 +14,14 @@ Serve watches every HTTP request for the client hanging up, so that long work ca
 one write (`joined.py`).
 
 `RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH=rlservo.serve_app.ingress:middlewares` puts it in place. It is imported by
-Serve's proxies as well, so it needs nothing but starlette.
+Serve's proxies as well, so it imports little.
 """
 
 from __future__ import annotations
 
 import asyncio
 import itertools
+import logging
 import secrets
 from collections.abc import Callable
 from typing import Protocol
@@ -29,6 +30,9 @@ from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rlservo.serve_app.joined import join_writes
+from rlservo.serve_app.logs import FIELDS
+
+logger = logging.getLogger(__name__)
 
 FULL = b'{"error":"this replica has as many requests as it takes on: try again shortly","code":"over-capacity"}'
 TURNED_AWAY = (
@@ -99,7 +103,11 @@ class Ingress:
         if door.takes(scope):
             assert door.app is not None
             request_id = _identify(scope)
-            await door.app(scope, receive, _with_id(request_id, send) if http else send)
+            try:
+                await door.app(scope, receive, _with_id(request_id, send) if http else send)
+            except Exception:  # a bug outside what the application guards; Serve keeps uvicorn from logging it
+                logger.exception("a request failed", extra={FIELDS: {"request_id": request_id.decode("latin-1")}})
+                raise
             return
         if http:
             scope["headers"] = [*scope["headers"], NO_WATCH]

@@ -315,9 +315,9 @@ def ray_environment(
             "RAY_SERVE_HAPROXY_NBTHREAD": "1",
             "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
             # A replica that dies leaves requests unanswered: another one answers them, since acting changes nothing.
-            # Six tries are more than the errors after which HAProxy gives up on a replica (3, Ray's default).
+            # More tries than errors after which HAProxy gives up on a replica (3, Ray's default), for about 5 s.
             "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
-            "RAY_SERVE_HAPROXY_RETRIES": "5",
+            "RAY_SERVE_HAPROXY_RETRIES": "20",
             # Whenever a replica comes or goes, Serve replaces HAProxy. The old one keeps the WebSockets that it carries
             # for as long, not for Ray's two minutes; ports of replicas that are gone are used again after those.
             "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",

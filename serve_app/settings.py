@@ -35,7 +35,8 @@ class ServerSettings(BaseModel):
     """More observations in one request are refused with 413: the event loop computes a batch in one go."""
 
     body_timeout_s: float = Field(2.0, gt=0, allow_inf_nan=False)
-    """[s] A client that takes longer to send its body is answered 408."""
+    """[s] A client that takes longer to send its body is answered 408. HAProxy passes on what fits its buffer of 16 KB,
+    head included, only when it is complete, and gives it 5 s."""
 
     max_ongoing_requests: int = Field(128, ge=1)
     """Requests that may wait for one replica's processor at once; further ones are answered 503 immediately."""
@@ -91,7 +92,8 @@ class ServerSettings(BaseModel):
 
     ahead_of_serve: bool = True
     """Answer requests for actions, and streams, before Ray Serve's own handling, which takes as long as the rest of a
-    replica does. Off, Serve counts them in its own metrics; where its tracing is on, it handles them in any case."""
+    replica does. Off, Serve counts them in its own metrics and holds them to its `request_timeout_s`; where its tracing
+    is on, it handles them in any case."""
 
     docs: bool = True
     """Serve the interactive API documentation at /docs, from files that come with the server."""

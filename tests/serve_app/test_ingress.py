@@ -13,6 +13,7 @@ from starlette.types import Message, Receive, Scope, Send
 
 from rlservo.serve_app.http import create_app
 from rlservo.serve_app.ingress import NO_WATCH, REQUEST_ID, Door, Ingress, door
+from rlservo.serve_app.keys import new_key
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore, load_policy
 
@@ -64,7 +65,7 @@ async def ask(
     async def send(message: Message) -> None:
         sent.append(message)
 
-    scope = {
+    scope: dict[str, Any] = {
         "type": "http",
         "method": method,
         "path": root_path + path,
@@ -74,6 +75,7 @@ async def ask(
     }
     await ingress(scope, receive, send)
     assert [message["type"] for message in sent] == ["http.response.start", "http.response.body"]
+    assert [name for name, _ in sent[0]["headers"]].count(REQUEST_ID) <= 1
     return sent[0]["status"], dict(sent[0]["headers"]), sent[1].get("body", b"")
 
 
@@ -118,9 +120,10 @@ def test_everything_else_is_left_to_serve_and_marked_as_not_to_be_watched(app: A
             ("POST", "/v1/policies/ur5/act/", 307),
             ("POST", "/robots" + ACT, 404),
             ("POST", "/v1/policies/a/b/act", 404),
+            ("POST", "//v1/policies/ur5/act", 404),
         ):
             assert (await ask(ingress, path, method=method))[0] == status
-        assert len(serve.seen) == 6
+        assert len(serve.seen) == 7
         assert all(NO_WATCH in scope["headers"] for scope in serve.seen)
 
     run(scenario)
@@ -165,6 +168,56 @@ def test_a_stream_reaches_the_application_untouched_but_for_its_id(app: Any) -> 
             assert sent[0]["type"] == "websocket.accept"
 
     run(scenario)
+
+
+def test_keys_are_asked_for_without_serve_as_well(ur5: Path) -> None:
+    key, line = new_key("robot")
+    store = PolicyStore([load_policy(ur5)])
+    app = create_app(lambda: store, ServerSettings(api_keys=line))
+
+    async def scenario() -> None:
+        serve = Serve(app)
+        ingress: Any = Ingress(serve)
+        door.open(app, lambda: True)
+        await ask(ingress)
+        serve.seen.clear()
+        assert (await ask(ingress))[0] == 401
+        assert (await ask(ingress, headers=((b"authorization", b"Bearer " + key.encode()),)))[0] == 200
+        sent: list[Message] = []
+
+        async def receive() -> Message:
+            return {"type": "websocket.connect"}
+
+        async def send(message: Message) -> None:
+            sent.append(message)
+
+        extensions = {"websocket.http.response": {}}
+        scope = {"type": "websocket", "path": "/", "headers": [], "query_string": b"", "extensions": extensions}
+        await ingress(scope, receive, send)
+        assert sent[0]["type"] == "websocket.http.response.start" and sent[0]["status"] == 401
+        assert not serve.seen
+
+    run(scenario)
+
+
+def test_a_bug_outside_what_the_application_guards_is_logged_with_the_requests_id(
+    app: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Broken:
+        def takes(self, scope: Scope) -> bool:
+            return True
+
+        async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+            raise ValueError("the application's own fault")
+
+    async def scenario() -> None:
+        door.open(Broken(), lambda: True)
+        with pytest.raises(ValueError, match="own fault"):
+            await ask(Ingress(app), headers=((REQUEST_ID, b"mine"),))
+
+    run(scenario)
+    (record,) = (record for record in caplog.records if record.name == "rlservo.serve_app.ingress")
+    assert record.exc_info and "mine" in str(vars(record))
 
 
 def test_nobody_comes_in_while_there_is_no_room(app: Any) -> None:

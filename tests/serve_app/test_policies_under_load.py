@@ -9,8 +9,10 @@ import contextlib
 import http.client
 import json
 import os
+import re
 import secrets
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -273,7 +275,7 @@ def cluster(repository: Path) -> Iterator[Cluster]:
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
         "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
         "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
-        "RAY_SERVE_HAPROXY_RETRIES": "5",
+        "RAY_SERVE_HAPROXY_RETRIES": "20",
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "rlservo.serve_app.ingress:middlewares",
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
@@ -370,16 +372,43 @@ def test_a_changed_configuration_wins_over_earlier_commands_without_a_failed_req
         admin.alias("ur5", "production", "3")
 
 
+@contextlib.contextmanager
+def half_sent(cluster: Cluster) -> Iterator[Callable[[], list[int]]]:
+    """A request that each replica has the first half of; yields what sends the rest and returns the statuses.
+
+    Straight to the replicas: the proxy would keep a small one until it has all of it.
+    """
+    configuration = (cluster.folder / "haproxy.cfg").read_text()
+    ports = {int(port) for port in re.findall(r"server SERVE_REPLICA\S+ [\d.]+:(\d+)", configuration)}
+    body = json.dumps({"obs": OBS}).encode()
+    head = (
+        f"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {KEY}\r\n"
+        f"content-type: application/json\r\ncontent-length: {len(body)}\r\n\r\n"
+    ).encode()
+    with contextlib.ExitStack() as stack:
+        lines = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=20)) for port in ports]
+        for line in lines:
+            line.sendall(head + body[:10])
+
+        def finish() -> list[int]:
+            for line in lines:
+                line.sendall(body[10:])
+            return [int((line.recv(65536).split() or [b"", b"0"])[1]) for line in lines]
+
+        yield finish
+
+
 def test_a_rolling_update_of_settings_costs_no_request_and_keeps_the_commands(cluster: Cluster) -> None:
     with cluster.admin() as admin:
         admin.alias("ur5", "candidate", "1")
     old = {each["replica"] for each in cluster.replicas()}
-    with loaded(cluster) as load:
+    with loaded(cluster) as load, half_sent(cluster) as finish:
         cluster.deploy(settings={"max_batch": 2048})
         seen = cluster.wait_for(
             lambda replicas: len(replicas) == 2 and not old & {each["replica"] for each in replicas}, timeout_s=90
         )
-        time.sleep(2)  # the old ones drain
+        time.sleep(2)  # the old ones drain: a second, then they wait for who is being answered
+        assert finish() == [200, 200]
     assert load.first_failures == [], Counter(load.first_failures)
     assert set(load.versions) == {"3"}
     for replica in seen:
