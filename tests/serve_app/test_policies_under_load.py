@@ -378,8 +378,9 @@ def half_sent(cluster: Cluster) -> Iterator[Callable[[], list[int]]]:
 
     Straight to the replicas: the proxy would keep a small one until it has all of it.
     """
-    configuration = (cluster.folder / "haproxy.cfg").read_text()
-    ports = {int(port) for port in re.findall(r"server SERVE_REPLICA\S+ [\d.]+:(\d+)", configuration)}
+    configuration = next(cluster.folder.rglob("haproxy.cfg")).read_text()
+    (backend,) = re.findall(r"^backend http-\S+\n(?: .*\n|\n)*", configuration, re.MULTILINE)
+    ports = {int(port) for port in re.findall(r"server SERVE_REPLICA\S+ [\d.]+:(\d+)", backend)}
     body = json.dumps({"obs": OBS}).encode()
     head = (
         f"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {KEY}\r\n"
@@ -393,7 +394,7 @@ def half_sent(cluster: Cluster) -> Iterator[Callable[[], list[int]]]:
         def finish() -> list[int]:
             for line in lines:
                 line.sendall(body[10:])
-            return [int((line.recv(65536).split() or [b"", b"0"])[1]) for line in lines]
+            return [int(line.recv(65536)[9:12] or 0) for line in lines]
 
         yield finish
 
