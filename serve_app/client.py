@@ -90,6 +90,7 @@ class PolicyClient:
         self._carries = False  # whether a policy without a state of its own needs one: a limit is set on its steps
         self._last: Any = None  # the last action of the episode, as the server sent it
         self._unsure = False  # whether the session may have gone on to an action that never came here
+        self._instead = False  # whether the robot was commanded something else since the last answer
         self._session = uuid.uuid4().hex if server_state else None
         self._steps = 0  # of the session's episode
 
@@ -135,6 +136,10 @@ class PolicyClient:
                 request["last_action"] = self._last  # what the robot was last commanded
         elif contract.state or self._carries:
             request["state"] = self._state
+            if self._instead:
+                request["last_action"] = self._last  # wins over the one in the state
+        if "last_action" in request and not is_action(self._last, batch, contract):
+            del request["last_action"]
         try:
             reply = self._ask(request, contract)
         except RequestError as error:
@@ -152,12 +157,20 @@ class PolicyClient:
             self._steps = check_step(reply, self._steps)
         elif "state" in request:
             self._state = carried(reply, contract)
-        self._last, self._unsure = reply["action"], False
+        self._last, self._unsure, self._instead = reply["action"], False, False
         return action
+
+    def commanded(self, action: Any) -> None:
+        """Tell what the robot was commanded instead of an answer that did not come. Sends nothing.
+
+        The next request says so, and a limit on the step from one action to the next (`max_action_step`) counts from
+        there. `action` is as `act` returns it.
+        """
+        self._last, self._unsure, self._instead = action, True, True
 
     def reset(self) -> None:
         """Start an episode: the next request begins with the state of an episode's start. Sends nothing."""
-        self._state, self._steps, self._last = {}, 0, None
+        self._state, self._steps, self._last, self._instead = {}, 0, None, False
 
     def _ask(self, request: dict[str, Any], contract: Contract) -> Any:
         """Send a request under a number of its own and return the reply to it. Raises DeadlineError."""
@@ -326,6 +339,15 @@ def restored(action: Any, batch: tuple[int, ...], contract: Contract) -> Any:
             for name, leaf in leaf_specs(contract.action_space, "action").items()
         },
     )
+
+
+def is_action(action: Any, batch: tuple[int, ...], contract: Contract) -> bool:
+    """Whether this is an action of the policy for so many observations."""
+    try:
+        restored(action, batch, contract)
+    except ActionError:
+        return False
+    return True
 
 
 def _part(action: Any, name: str, contract: Contract) -> Any:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -156,6 +156,8 @@ class WithFallback:
         if now - self._said_at >= LOG_EVERY_S:
             self._said_at = now
             logger.warning("fallback (%s), %d times so far: %s", self.name, self.counts.fallback, error.message)
+        if isinstance(self._policy, _Told):  # a limit on the step counts from what the robot really does
+            self._policy.commanded(_copy(action))
         return _copy(action)
 
     def _fallback_is(self, word: str) -> bool:
@@ -170,6 +172,13 @@ class WithFallback:
             self.counts.unavailable += 1
         if self._on_fallback is not None:
             self._on_fallback(error)
+
+
+@runtime_checkable
+class _Told(Protocol):
+    """A client whose server may remember the last action."""
+
+    def commanded(self, action: Any) -> None: ...
 
 
 def _zero(contract: Contract) -> Any:

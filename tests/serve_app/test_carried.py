@@ -315,6 +315,32 @@ def test_an_action_that_came_too_late_is_not_what_the_next_one_is_measured_from(
             np.testing.assert_allclose(client.act(down), unseen, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["ur5", "leaky"])
+@pytest.mark.parametrize("kind", [PolicyClient, StreamClient])
+@pytest.mark.parametrize("server_state", [False, True])
+def test_what_the_robot_was_commanded_instead_is_what_the_next_step_is_measured_from(
+    limited: Server, name: str, kind: type[PolicyClient | StreamClient], server_state: bool
+) -> None:
+    policy = limited.store.get(name)
+    size = policy.contract.observation_space.shape[0]  # type: ignore[union-attr]
+    with kind(limited.url, name, server_state=server_state) as client:
+        for _ in range(2):
+            client.reset()
+            used = client.act(np.ones(size, np.float32))
+            instead = np.where(used > 0, -1.0, 1.0).astype(np.float32)
+            client.commanded(instead)
+            after = client.act(np.ones(size, np.float32))
+            assert np.abs(after - instead).max() == pytest.approx(LIMIT, rel=1e-3)
+            again = client.act(np.ones(size, np.float32))  # said once: from here the server knows
+            assert np.abs(again - after).max() == pytest.approx(LIMIT, rel=1e-3)
+            # Two observations have no last action of this shape: it is not sent, and nothing else is in its way.
+            client.reset()
+            client.commanded(instead)
+            assert client.act(np.ones((2, size), np.float32)).shape[0] == 2
+            if server_state:
+                client.reset()
+
+
 def test_a_reward_is_seen_where_nothing_else_is_remembered(versions: dict[str, Policy]) -> None:
     contract = versions["1"].contract
     reward = TensorSpec(name="reward", dtype="float32", shape=(-1,))

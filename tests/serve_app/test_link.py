@@ -404,6 +404,19 @@ def test_each_fallback_is_what_it_says(line: FaultyLine) -> None:
             policy.act(seen[0][:3])
 
 
+def test_the_client_is_told_what_was_commanded_instead(line: FaultyLine) -> None:
+    seen = ur5_observations(2)
+    for fallback in ("hold", "zero", [0.1, 0.2, 0.3, 0.4, 0.5]):
+        inner = connected(StreamClient, line, deadline_ms=150.0)
+        told: list[Any] = []
+        inner.commanded = told.append  # type: ignore[method-assign, assignment]
+        with WithFallback(inner, fallback) as policy:  # type: ignore[arg-type]
+            policy.act(seen[0])
+            assert told == []
+            line.faults.append(("delay", 0.2))
+            np.testing.assert_array_equal(policy.act(seen[1]), told.pop())
+
+
 @pytest.mark.parametrize(
     ("name", "fallback", "sentence"),
     [
