@@ -15,6 +15,7 @@ import os
 import queue
 import secrets
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -343,15 +344,35 @@ def _replica_ports(port: int) -> dict[str, str]:
     """Return where replicas listen: below the ports of outgoing connections, and not where another server's do.
 
     Ray's own range is the same for every cluster of a machine: a proxy that has not yet been told that a replica is
-    gone would ask the other server's that took its port.
+    gone would ask the other server's that took its port. And gRPC servers of two clusters share a port without a word
+    (ray 2.60 means to forbid it, in a form that gRPC does not read), so that each gets some of the other's requests.
     """
-    window = PORTS_PER_SERVER * (port % SERVERS)
-    ranges = {"HTTP": FIRST_PORT + window, "GRPC": FIRST_PORT + SERVERS * PORTS_PER_SERVER + window}
+    first = port % SERVERS
+    ranges = _ranges(next((n % SERVERS for n in range(first, first + SERVERS) if _is_unused(n % SERVERS)), first))
     return {
         f"RAY_SERVE_DIRECT_INGRESS_{bound}_{protocol}_PORT": str(first + more)
         for protocol, first in ranges.items()
         for bound, more in (("MIN", 0), ("MAX", PORTS_PER_SERVER - 1))
     }
+
+
+def _ranges(number: int) -> dict[str, int]:
+    """Return the first port by protocol of one of the servers that fit beside each other."""
+    window = FIRST_PORT + PORTS_PER_SERVER * number
+    return {"HTTP": window, "GRPC": window + SERVERS * PORTS_PER_SERVER}
+
+
+def _is_unused(number: int) -> bool:
+    """Whether nobody listens on any of a server's ports."""
+    for first in _ranges(number).values():
+        for port in range(first, first + PORTS_PER_SERVER):
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections that end are nobody's
+                try:
+                    probe.bind(("", port))
+                except OSError:
+                    return False
+    return True
 
 
 def _check_ray() -> None:

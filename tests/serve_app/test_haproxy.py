@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pytest
 
-from rlservo.serve_app import haproxy
+from rlservo.serve_app import haproxy, launcher
 from rlservo.serve_app.launcher import ray_environment
 from rlservo.serve_app.processes import free_ports
 
@@ -338,7 +338,22 @@ def test_the_cluster_gets_the_variables_that_the_launcher_sets(tmp_path: Path) -
     assert {name: ours.get(name) for name in told.keys() - own} == {name: told[name] for name in told.keys() - own}
 
 
-def test_servers_on_ports_next_to_each_other_have_replicas_on_others(tmp_path: Path) -> None:
+def test_a_server_whose_replicas_ports_are_in_use_gets_others(tmp_path: Path) -> None:
+    def first(port: int, protocol: str) -> int:
+        environment = ray_environment(tmp_path, haproxy=None, mark="test", port=port)
+        return int(environment[f"RAY_SERVE_DIRECT_INGRESS_MIN_{protocol}_PORT"])
+
+    for protocol in ("HTTP", "GRPC"):
+        port = first(8000, protocol)
+        with socket.create_server(("127.0.0.1", port + 3), reuse_port=True):  # as gRPC listens
+            assert first(8000, protocol) != port
+        assert first(8000, protocol) == port
+
+
+def test_servers_on_ports_next_to_each_other_have_replicas_on_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launcher, "_is_unused", lambda number: True)  # other tests' servers may run
     taken: set[int] = set()
     for port in range(8000, 8021):
         environment = ray_environment(tmp_path, haproxy=None, mark="test", port=port)
