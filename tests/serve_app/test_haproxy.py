@@ -77,6 +77,7 @@ class Node:
         self.port, self.replica, self.stats = free_ports(3)
         self.script = haproxy.prepare(folder, BINARY)
         self.raylet = subprocess.Popen([sys.executable, "-c", RAYLET], stdin=subprocess.PIPE, text=True)
+        self.first_controller = 0
         self.start("bash", "-c", "exec -a ray::ServeController sleep 300")
 
     def start(self, *command: str) -> None:
@@ -116,8 +117,9 @@ class Node:
             connection.close()
 
     def end(self) -> None:
-        with contextlib.suppress(ValueError):
-            os.kill(self.controller(), signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):
+            if self.first_controller:
+                os.kill(self.first_controller, signal.SIGKILL)  # a killed raylet's is nobody's child
         self.raylet.kill()
         self.raylet.communicate()
         for _ in range(2):  # the bridges of what is killed here see that the raylet is gone
@@ -163,6 +165,7 @@ def node(tmp_path: Path) -> Iterator[Node]:
     thread.start()
     try:
         until(lambda: _has_controller(made))
+        made.first_controller = made.controller()
         yield made
     finally:
         made.end()
