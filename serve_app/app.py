@@ -142,7 +142,8 @@ class PolicyServer(InferenceService):
         core: Core = app.state.core
         self._core = core
         # By way of the module: Serve pickles this class with copies of the objects that it names.
-        ingress.door.open(app if self._settings.ahead_of_serve and _can_be_left_out() else None, core.admission.is_open)
+        ahead = self._settings.ahead_of_serve and _can_be_left_out()
+        ingress.door.open(app, core.admission.is_open, ahead=ahead)
         self.serve_grpc(core, local_only=is_loopback(self._host))
         return app
 

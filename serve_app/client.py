@@ -89,8 +89,7 @@ class PolicyClient:
         self._state: dict[str, Any] = {}  # empty at an episode's start
         self._carries = False  # whether a policy without a state of its own needs one: a limit is set on its steps
         self._last: Any = None  # the last action of the episode, as the server sent it
-        self._unsure = False  # whether the session may have gone on to an action that never came here
-        self._instead = False  # whether the robot was commanded something else since the last answer
+        self._unsure = False  # whether the last action may be another one to the server than to the robot
         self._session = uuid.uuid4().hex if server_state else None
         self._steps = 0  # of the session's episode
 
@@ -132,14 +131,11 @@ class PolicyClient:
             request["reward"] = np.asarray(reward)
         if self._session is not None:
             request.update(session_id=self._session, reset=self._steps == 0)
-            if self._unsure and self._last is not None:
-                request["last_action"] = self._last  # what the robot was last commanded
         elif contract.state or self._carries:
             request["state"] = self._state
-            if self._instead:
-                request["last_action"] = self._last  # wins over the one in the state
-        if "last_action" in request and not is_action(self._last, batch, contract):
-            del request["last_action"]
+        in_episode = self._session is not None or "state" in request
+        if in_episode and self._unsure and is_action(self._last, batch, contract):
+            request["last_action"] = self._last  # what the robot was last commanded
         try:
             reply = self._ask(request, contract)
         except RequestError as error:
@@ -157,7 +153,7 @@ class PolicyClient:
             self._steps = check_step(reply, self._steps)
         elif "state" in request:
             self._state = carried(reply, contract)
-        self._last, self._unsure, self._instead = reply["action"], False, False
+        self._last, self._unsure = reply["action"], False
         return action
 
     def commanded(self, action: Any) -> None:
@@ -166,11 +162,11 @@ class PolicyClient:
         The next request says so, and a limit on the step from one action to the next (`max_action_step`) counts from
         there. `action` is as `act` returns it.
         """
-        self._last, self._unsure, self._instead = action, True, True
+        self._last, self._unsure = action, True
 
     def reset(self) -> None:
         """Start an episode: the next request begins with the state of an episode's start. Sends nothing."""
-        self._state, self._steps, self._last, self._instead = {}, 0, None, False
+        self._state, self._steps, self._last = {}, 0, None
 
     def _ask(self, request: dict[str, Any], contract: Contract) -> Any:
         """Send a request under a number of its own and return the reply to it. Raises DeadlineError."""

@@ -97,18 +97,19 @@ class PolicyApp(FastAPI):
         self._mount: str | None = None  # the paths' prefix, which the first request that Serve brings tells
 
     def takes(self, scope: Scope) -> bool:
-        """Whether this is a request for actions, or a stream; it is then put under this application's prefix."""
+        """Whether this is a request for actions, or a stream, that Serve has not handled yet."""
         mount, path = self._mount, scope["path"]
         if mount is None or not path.startswith(mount):
             return False
         path = path[len(mount) :]
         if scope["type"] == "http":
-            found = scope["method"] == "POST" and any(pattern.fullmatch(path) for pattern, _ in self._direct)
-        else:
-            found = scope["type"] == "websocket" and STREAM_PATTERN.fullmatch(path) is not None
-        if found:
-            scope["root_path"] = mount
-        return found
+            return scope["method"] == "POST" and any(pattern.fullmatch(path) for pattern, _ in self._direct)
+        return scope["type"] == "websocket" and STREAM_PATTERN.fullmatch(path) is not None
+
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer what it takes, under the prefix that Serve would have put it."""
+        scope["root_path"] = self._mount
+        await self(scope, receive, send)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Dispatch one ASGI connection."""

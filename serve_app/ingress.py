@@ -6,8 +6,8 @@ request for actions needs none of it. How much a replica takes on is decided by 
 whoever is still being answered (ray 2.60). So the door passes such requests straight to the application, and
 everything else to Serve. Streams gain as well: Serve reads a WebSocket in a task of its own.
 
-It turns requests away, too, while the replica has more than it takes on. In Serve's proxies, and in a replica whose
-application runs in another event loop than its HTTP server, the door lets everybody through to Serve.
+It turns such requests away, too, while the replica has more than it takes on. In Serve's proxies, and in a replica
+whose application runs in another event loop than its HTTP server, the door lets everybody through to Serve.
 
 Serve watches every HTTP request for the client hanging up, so that long work can be cancelled. The header
 `x-request-disconnect-disabled` is its switch for that (ray 2.60), worth two asyncio tasks a request. Replies leave in
@@ -45,14 +45,14 @@ REQUEST_ID = b"x-request-id"
 
 
 class Application(Protocol):
-    """An ASGI application that knows which requests it can answer without Serve."""
+    """Answers the requests that need nothing of what Serve does."""
 
     def takes(self, scope: Scope) -> bool:
-        """Whether it answers this one."""
+        """Whether this is one of them."""
         ...
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer."""
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer it."""
         ...
 
 
@@ -62,24 +62,20 @@ class Door:
     def __init__(self) -> None:
         """Leave everything to Serve."""
         self.app: Application | None = None
-        self.has_room: Callable[[], bool] = _always
+        self.ahead = False
+        self.has_room: Callable[[], bool] = lambda: True
         self._loop: asyncio.AbstractEventLoop | None = None
 
-    def open(self, app: Application | None, has_room: Callable[[], bool]) -> None:
-        """From now on turn away whom there is no room for, and let `app` answer what it takes, in this event loop."""
-        self.app, self.has_room, self._loop = app, has_room, asyncio.get_running_loop()
+    def open(self, app: Application, has_room: Callable[[], bool], *, ahead: bool = True) -> None:
+        """From now on turn away, of what `app` takes, what there is no room for; let it answer the rest, if `ahead`.
 
-    def close(self) -> None:
-        """Leave everything to Serve again."""
-        self.app, self.has_room, self._loop = None, _always, None
+        In this event loop.
+        """
+        self.app, self.ahead, self.has_room, self._loop = app, ahead, has_room, asyncio.get_running_loop()
 
     def takes(self, scope: Scope) -> bool:
-        """Whether the application answers without Serve."""
+        """Whether this is for the application to answer."""
         return self.app is not None and asyncio.get_running_loop() is self._loop and self.app.takes(scope)
-
-
-def _always() -> bool:
-    return True
 
 
 door = Door()
@@ -93,18 +89,18 @@ class Ingress:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         http = scope["type"] == "http"
+        taken = door.takes(scope)
+        if taken and http and not door.has_room():
+            await send({"type": "http.response.start", "status": 503, "headers": list(TURNED_AWAY)})
+            await send({"type": "http.response.body", "body": FULL})
+            return
         if http and scope["method"] == "POST":
-            # Everything else is cheap, and health has to be told under load, too.
-            if not door.has_room():
-                await send({"type": "http.response.start", "status": 503, "headers": list(TURNED_AWAY)})
-                await send({"type": "http.response.body", "body": FULL})
-                return
             join_writes(send)
-        if door.takes(scope):
+        if taken and door.ahead:
             assert door.app is not None
             request_id = _identify(scope)
             try:
-                await door.app(scope, receive, _with_id(request_id, send) if http else send)
+                await door.app.answer(scope, receive, _with_id(request_id, send) if http else send)
             except Exception:  # a bug outside what the application guards; Serve keeps uvicorn from logging it
                 logger.exception("a request failed", extra={FIELDS: {"request_id": request_id.decode("latin-1")}})
                 raise
@@ -127,7 +123,7 @@ def _identify(scope: Scope) -> bytes:
 def _with_id(request_id: bytes, send: Send) -> Send:
     async def send_with_id(message: Message) -> None:
         if message["type"] == "http.response.start":
-            message = {**message, "headers": [*message.get("headers", ()), (REQUEST_ID, request_id)]}
+            message["headers"] = [*message["headers"], (REQUEST_ID, request_id)]
         await send(message)
 
     return send_with_id

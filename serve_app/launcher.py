@@ -15,7 +15,6 @@ import os
 import queue
 import secrets
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -31,7 +30,7 @@ from rlservo.serve_app.keys import Role, check_exposure, is_loopback
 from rlservo.serve_app.library import load_served
 from rlservo.serve_app.operator_key import operator_key
 from rlservo.serve_app.plan import ServedConfig
-from rlservo.serve_app.processes import MARK, check_port, end_marked, free_ports, remove_folder
+from rlservo.serve_app.processes import MARK, check_port, end_marked, free_ports, is_free, remove_folder
 from rlservo.serve_app.settings import ServerSettings
 
 logger = logging.getLogger(__name__)
@@ -364,15 +363,7 @@ def _ranges(number: int) -> dict[str, int]:
 
 def _is_unused(number: int) -> bool:
     """Whether nobody listens on any of a server's ports."""
-    for first in _ranges(number).values():
-        for port in range(first, first + PORTS_PER_SERVER):
-            with socket.socket() as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections that end are nobody's
-                try:
-                    probe.bind(("", port))
-                except OSError:
-                    return False
-    return True
+    return all(is_free(first + more) for first in _ranges(number).values() for more in range(PORTS_PER_SERVER))
 
 
 def _check_ray() -> None:

@@ -105,16 +105,23 @@ def free_ports(count: int) -> list[int]:
     for port in candidates:
         if len(found) == count:
             break
-        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-            try:
-                probe.bind(("", port))
-                found.append(port)
-            except OSError as error:
-                if error.errno != errno.EADDRINUSE:
-                    raise
+        if is_free(port):
+            found.append(port)
     if len(found) < count:
         raise UnavailableError(f"{len(found)} of the ports {PORTS[0]} to {PORTS[-1]} are free: {count} are needed")
     return found
+
+
+def is_free(port: int) -> bool:
+    """Whether nobody has this TCP port at the moment, on any address of this machine."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        try:
+            probe.bind(("", port))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            return False
+    return True
 
 
 def marked(mark: str, session: int | None = None) -> list[int]:

@@ -90,7 +90,6 @@ class StreamClient:
         self._begins = False  # an episode, with the next request; the first one begins with the connection
         self._connections = 0
         self._unsure = True  # whether the connection knows the last action that was used: a new one does not
-        self._instead = False  # whether the robot was commanded something else since the last answer
         self.stale = 0
         """Answers that came after their deadline, and were dropped."""
 
@@ -135,8 +134,7 @@ class StreamClient:
             elif self._begins:  # where the server limits the step, the connection holds the last action
                 request["reset"] = True
             request.pop("last_action", None)
-            carries = bool(contract.state) and not held  # then the state has it
-            if self._unsure and (self._instead or not carries) and is_action(self._last, batch, contract):
+            if self._unsure and is_action(self._last, batch, contract):
                 request["last_action"] = self._last  # where the server limits the step from it
             request["deadline_ms"] = max(0.0, 1e3 * (deadline - time.monotonic()))
             try:
@@ -167,16 +165,16 @@ class StreamClient:
                 self._steps = check_step(reply, self._steps)
             elif contract.state:
                 self._state = carried(reply, contract)
-            self._last, self._unsure, self._begins, self._instead = sent, False, False, False
+            self._last, self._unsure, self._begins = sent, False, False
             return action
 
     def commanded(self, action: Any) -> None:
         """Tell what the robot was commanded instead of an answer that did not come, as `PolicyClient` does."""
-        self._last, self._unsure, self._instead = action, True, True
+        self._last, self._unsure = action, True
 
     def reset(self) -> None:
         """Start an episode: the next request says so. Sends nothing."""
-        self._state, self._steps, self._lost, self._last, self._instead = {}, 0, False, None, False
+        self._state, self._steps, self._lost, self._last = {}, 0, False, None
         self._begins = True
 
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:

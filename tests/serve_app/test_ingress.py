@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from starlette.types import Message, Receive, Scope, Send
 
+from rlservo.serve_app import ingress as ingress_module
 from rlservo.serve_app.http import create_app
-from rlservo.serve_app.ingress import NO_WATCH, REQUEST_ID, Door, Ingress, door
+from rlservo.serve_app.ingress import NO_WATCH, REQUEST_ID, Door, Ingress
 from rlservo.serve_app.keys import new_key
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore, load_policy
@@ -22,9 +23,10 @@ OBS = json.dumps({"obs": [0.0] * 27}).encode()
 
 
 @pytest.fixture(autouse=True)
-def _closed_door() -> Iterator[None]:
-    yield
-    door.close()
+def door(monkeypatch: pytest.MonkeyPatch) -> Door:
+    """The process's door, for one test."""
+    monkeypatch.setattr(ingress_module, "door", Door())
+    return ingress_module.door
 
 
 class Serve:
@@ -79,6 +81,17 @@ async def ask(
     return sent[0]["status"], dict(sent[0]["headers"]), sent[1].get("body", b"")
 
 
+async def opened(app: Any, *, prefix: str = "", root_path: str = "", **options: Any) -> tuple[Serve, Any]:
+    """Return (Serve, the ingress before it), with the door open and the prefix told."""
+    serve = Serve(app, prefix)
+    ingress = Ingress(serve)
+    ingress_module.door.open(app, options.pop("has_room", lambda: True), **options)
+    await ask(ingress, prefix + ACT, root_path=root_path)
+    assert len(serve.seen) == 1
+    serve.seen.clear()
+    return serve, ingress
+
+
 def run(scenario: Callable[[], Any]) -> Any:
     return asyncio.run(scenario())
 
@@ -89,13 +102,8 @@ def test_requests_for_actions_do_not_reach_serve_once_it_has_told_the_prefix(
     app: Any, prefix: str, root_path: str
 ) -> None:
     async def scenario() -> None:
-        serve = Serve(app, prefix)
-        ingress: Any = Ingress(serve)
-        door.open(app, lambda: True)
+        serve, ingress = await opened(app, prefix=prefix, root_path=root_path)
         for path in (ACT, "/v2/models/ur5/infer", "/v1/policies/ur5/versions/10/act"):
-            first = await ask(ingress, prefix + ACT, root_path=root_path)
-            assert first[0] == 200
-            serve.seen.clear()
             body = OBS
             if "infer" in path:
                 tensor = {"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [0.0] * 27}
@@ -108,11 +116,7 @@ def test_requests_for_actions_do_not_reach_serve_once_it_has_told_the_prefix(
 
 def test_everything_else_is_left_to_serve_and_marked_as_not_to_be_watched(app: Any) -> None:
     async def scenario() -> None:
-        serve = Serve(app)
-        ingress: Any = Ingress(serve)
-        door.open(app, lambda: True)
-        await ask(ingress)
-        serve.seen.clear()
+        serve, ingress = await opened(app)
         for method, path, status in (
             ("GET", "/healthz", 200),
             ("GET", "/v1/policies", 200),
@@ -131,9 +135,7 @@ def test_everything_else_is_left_to_serve_and_marked_as_not_to_be_watched(app: A
 
 def test_an_answer_carries_the_clients_request_id_or_a_new_one(app: Any) -> None:
     async def scenario() -> None:
-        ingress: Any = Ingress(Serve(app))
-        door.open(app, lambda: True)
-        await ask(ingress)
+        _, ingress = await opened(app)
         made = {(await ask(ingress))[1][REQUEST_ID] for _ in range(5)}
         assert len(made) == 5 and all(made)
         given = await ask(ingress, headers=((REQUEST_ID, b"mine"),))
@@ -146,11 +148,7 @@ def test_an_answer_carries_the_clients_request_id_or_a_new_one(app: Any) -> None
 
 def test_a_stream_reaches_the_application_untouched_but_for_its_id(app: Any) -> None:
     async def scenario() -> None:
-        serve = Serve(app)
-        ingress: Any = Ingress(serve)
-        door.open(app, lambda: True)
-        await ask(ingress)
-        serve.seen.clear()
+        serve, ingress = await opened(app)
         for path, directly in (("/v1/policies/ur5/stream", True), ("/", True), ("/elsewhere", False)):
             sent: list[Message] = []
             messages = iter([{"type": "websocket.connect"}, {"type": "websocket.disconnect", "code": 1000}])
@@ -176,11 +174,7 @@ def test_keys_are_asked_for_without_serve_as_well(ur5: Path) -> None:
     app = create_app(lambda: store, ServerSettings(api_keys=line))
 
     async def scenario() -> None:
-        serve = Serve(app)
-        ingress: Any = Ingress(serve)
-        door.open(app, lambda: True)
-        await ask(ingress)
-        serve.seen.clear()
+        serve, ingress = await opened(app)
         assert (await ask(ingress))[0] == 401
         assert (await ask(ingress, headers=((b"authorization", b"Bearer " + key.encode()),)))[0] == 200
         sent: list[Message] = []
@@ -201,13 +195,13 @@ def test_keys_are_asked_for_without_serve_as_well(ur5: Path) -> None:
 
 
 def test_a_bug_outside_what_the_application_guards_is_logged_with_the_requests_id(
-    app: Any, caplog: pytest.LogCaptureFixture
+    app: Any, door: Door, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Broken:
         def takes(self, scope: Scope) -> bool:
             return True
 
-        async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
             raise ValueError("the application's own fault")
 
     async def scenario() -> None:
@@ -220,36 +214,52 @@ def test_a_bug_outside_what_the_application_guards_is_logged_with_the_requests_i
     assert record.exc_info and "mine" in str(vars(record))
 
 
-def test_nobody_comes_in_while_there_is_no_room(app: Any) -> None:
+@pytest.mark.parametrize("ahead", [True, False])
+def test_actions_are_refused_while_there_is_no_room_and_the_operator_is_not(app: Any, ahead: bool) -> None:
     async def scenario() -> None:
-        serve = Serve(app)
-        ingress: Any = Ingress(serve)
         room = [True]
-        door.open(app, lambda: room[0])
-        await ask(ingress)
+        serve, ingress = await opened(app, has_room=lambda: room[0], ahead=ahead)
         room[0] = False
         status, headers, body = await ask(ingress)
         assert (status, headers[b"retry-after"], json.loads(body)["code"]) == (503, b"1", "over-capacity")
+        assert not serve.seen
         assert (await ask(ingress, "/healthz", method="GET"))[0] == 200
+        assert (await ask(ingress, "/v1/admin/alias"))[0] != 503
+        assert len(serve.seen) == 2
 
     run(scenario)
 
 
-def test_another_event_loop_a_closed_door_and_a_prefix_not_yet_told_leave_it_to_serve(app: Any) -> None:
-    serve = Serve(app)
-    ingress: Any = Ingress(serve)
+@pytest.mark.parametrize("prefix", ["", "/robots"])
+def test_where_it_is_not_to_answer_ahead_serve_gets_the_request_as_it_came(app: Any, prefix: str) -> None:
+    async def scenario() -> None:
+        serve, ingress = await opened(app, prefix=prefix, ahead=False)
+        assert (await ask(ingress, prefix + ACT))[0] == 200
+        (scope,) = serve.seen
+        assert scope["root_path"] == "" and NO_WATCH in scope["headers"]
 
-    async def opens() -> None:
-        door.open(app, lambda: True)
-        assert (await ask(ingress))[0] == 200  # Serve tells the prefix
-        assert (await ask(ingress))[0] == 200
-        assert len(serve.seen) == 1
+    run(scenario)
+
+
+def test_another_event_loop_and_a_prefix_not_yet_told_leave_it_to_serve(app: Any) -> None:
+    async def here() -> tuple[Serve, Any]:
+        serve, ingress = await opened(app)
+        assert (await ask(ingress))[0] == 200 and not serve.seen
+        return serve, ingress
+
+    serve, ingress = run(here)
 
     async def elsewhere() -> None:
         assert (await ask(ingress))[0] == 200
-        assert len(serve.seen) == 2
+        assert len(serve.seen) == 1
 
-    run(opens)
-    run(elsewhere)  # another loop
-    fresh = Door()
-    assert fresh.has_room() and not fresh.takes({"type": "http", "method": "POST", "path": ACT})
+    run(elsewhere)
+
+
+def test_a_proxys_door_lets_everybody_through(app: Any) -> None:
+    async def scenario() -> None:
+        serve = Serve(app)
+        assert (await ask(Ingress(serve)))[0] == 200
+        assert len(serve.seen) == 1
+
+    run(scenario)
