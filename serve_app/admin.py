@@ -10,15 +10,16 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import orjson
-from fastapi import Body, FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from rlservo.export.errors import RequestError
-from rlservo.serve_app import listing, plan, wire
+from rlservo.serve_app import listing, oip, plan, wire
 from rlservo.serve_app.control import Change, Control
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.edge import error_models
+from rlservo.serve_app.edge import error_models, json_only
+from rlservo.serve_app.keys import Access, grant
 from rlservo.serve_app.library import digest_of
 from rlservo.serve_app.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
 
@@ -58,12 +59,6 @@ class ShadowCommand(_Command):
     version: Reference | None = Field(description="A loaded version or an alias; null ends the shadow.")
 
 
-class RepositoryCommand(BaseModel):
-    """Triton's clients send parameters of their own, which mean nothing here."""
-
-    parameters: dict[str, Any] | None = None
-
-
 class Changed(BaseModel):
     """A change that every replica serves."""
 
@@ -78,7 +73,7 @@ class Changed(BaseModel):
 
 def add_admin(app: FastAPI, core: Core, control: Control) -> None:
     """Add /v1/admin and the repository extension's load and unload to the application."""
-    errors = error_models(400, 401, 403, 404, 409, 503)
+    errors = error_models(404, 409, 415, 503)
 
     def command(path: str, summary: str) -> Callable[[Route], Route]:
         return app.post(
@@ -87,6 +82,7 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             summary=summary,
             response_model=Changed,
             responses=errors,
+            dependencies=[Depends(json_only)],
         )
 
     async def changed(name: str, what: str, change: Change) -> Response:
@@ -99,25 +95,30 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
         response_model=list[listing.PolicyList],
         responses=errors,
     )
+    @grant(Access.admin)
     async def status() -> Response:
         replies = [listing.describe(core)] if control.gather is None else await control.gather()
         return Response(orjson.dumps(replies), media_type="application/json")
 
     @command("load", "Load a version, prove it, and keep it ready")
+    @grant(Access.admin)
     async def load(name: str, given: LoadCommand) -> Response:
         return await changed(name, f"load {name} {given.version or 'newest'}", _load(control, name, given.version))
 
     @command("unload", "Drop a version, or the policy")
+    @grant(Access.admin)
     async def unload(name: str, given: UnloadCommand) -> Response:
         version = given.version
         return await changed(name, f"unload {name} {version or ''}", lambda p: plan.unload(p, name, version))
 
     @command("alias", "Let an alias lead to a loaded version")
+    @grant(Access.admin)
     async def alias(name: str, given: AliasCommand) -> Response:
         what = f"alias {name} {given.alias}={given.version or ''}"
         return await changed(name, what, lambda p: plan.set_alias(p, name, given.alias, given.version))
 
     @command("rollback", "Let an alias lead where it led before")
+    @grant(Access.admin)
     async def rollback(name: str, given: RollbackCommand) -> Response:
         def change(before: Plan) -> dict[str, PolicyPlan]:
             return plan.roll_back(
@@ -131,6 +132,7 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
         return await changed(name, f"rollback {name} {given.alias}", change)
 
     @command("canary", "Send a share of the sessions to another version")
+    @grant(Access.admin)
     async def canary(name: str, given: CanaryCommand) -> Response:
         if given.version is not None and given.share is None:
             raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
@@ -140,10 +142,12 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
         return await changed(name, what, lambda p: plan.set_canary(p, name, chosen))
 
     @command("shadow", "Let another version compute along")
+    @grant(Access.admin)
     async def shadow(name: str, given: ShadowCommand) -> Response:
         what = f"shadow {name} {given.version or 'off'}"
         return await changed(name, what, lambda p: plan.set_shadow(p, name, given.version))
 
+    # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: nobody reads it.
     def repository(path: str, summary: str) -> Callable[[Route], Route]:
         return app.post(
             f"/v2/repository/models/{{name}}/{path}",
@@ -151,15 +155,18 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             summary=summary,
             response_class=Response,
             responses=errors,
+            dependencies=[Depends(oip.media_type)],
         )
 
     @repository("load", "Load a model's newest version")
-    async def load_model(name: str, _given: RepositoryCommand | None = Body(None)) -> Response:  # noqa: B008  # FastAPI's way
+    @grant(Access.admin)
+    async def load_model(name: str) -> Response:
         await control.change(_load(control, name, None), what=f"load {name} newest")
         return Response(b"{}", media_type="application/json")
 
     @repository("unload", "Unload a model, all its versions")
-    async def unload_model(name: str, _given: RepositoryCommand | None = Body(None)) -> Response:  # noqa: B008
+    @grant(Access.admin)
+    async def unload_model(name: str) -> Response:
         await control.change(lambda p: plan.unload(p, name, None), what=f"unload {name}")
         return Response(b"{}", media_type="application/json")
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
+from fastapi import Request
 from fastapi.routing import APIRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -35,6 +36,7 @@ from rlservo.export.errors import (
 )
 from rlservo.serve_app import wire
 from rlservo.serve_app.core import Core
+from rlservo.serve_app.keys import Access
 from rlservo.serve_app.logs import FIELDS
 from rlservo.serve_app.store import Decision
 
@@ -55,6 +57,7 @@ STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; w
     (ForbiddenError, 403),
     (ActionError, 500),
 )
+ANY_ROUTE = (400, 401, 403, 408, 413)  # its path, key, host, page and body
 RETRY_AFTER_S = 1
 TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been read
 BUG = "the server failed on this request; its log says how"
@@ -127,6 +130,8 @@ JSON_HEADERS: Headers = ((b"content-type", JSON),)
 
 class BareRoute(APIRoute):
     """A route FastAPI documents and routes to, and otherwise leaves alone: `app` is a bare ASGI callable."""
+
+    access = Access.act
 
     def __init__(
         self,
@@ -248,6 +253,35 @@ def check_length(headers: list[tuple[bytes, bytes]], max_bytes: int) -> None:
             raise too_large(max_bytes)
 
 
+def check_media_type(headers: list[tuple[bytes, bytes]], *accepted: bytes, optional: bool = False) -> None:
+    """Raise MediaTypeError unless the body is of an accepted content type.
+
+    A web page can send forms, plain text and bodies of no type to any server; for another type a browser asks the
+    server first. Triton's client names no type: `optional` lets through who does not, unless it is a browser.
+    """
+    named = page = False
+    for name, value in headers:
+        if name == b"content-type":
+            named = True
+            if value not in accepted and value.split(b";", 1)[0].strip().lower() not in accepted:
+                raise MediaTypeError(
+                    f"the content type is '{value[:64].decode('latin-1')}': send {accepted[0].decode()} "
+                    f"(curl: -H 'content-type: {accepted[0].decode()}')"
+                )
+        elif name in (b"origin", b"sec-fetch-site"):
+            page = True
+    if not named and (page or not optional):
+        raise MediaTypeError(
+            f"the request has no content type: send {accepted[0].decode()} "
+            f"(curl: -H 'content-type: {accepted[0].decode()}')"
+        )
+
+
+async def json_only(request: Request) -> None:
+    """Raise MediaTypeError for what is not JSON: a dependency of the routes that FastAPI runs."""
+    check_media_type(request.scope["headers"], JSON)
+
+
 def too_large(limit: int) -> TooLargeError:
     return TooLargeError(f"the request body is larger than {limit} bytes", {"max_body_bytes": limit})
 
@@ -297,5 +331,5 @@ def encode_bug() -> bytes:
 
 
 def error_models(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return FastAPI's `responses` for these error statuses."""
-    return {status: {"model": wire.ErrorReply} for status in statuses}
+    """Return FastAPI's `responses` for these error statuses, and for those that every route may answer with."""
+    return {status: {"model": wire.ErrorReply} for status in sorted({*ANY_ROUTE, *statuses})}
