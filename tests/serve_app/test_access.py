@@ -223,6 +223,7 @@ def attempts(app: PolicyApp, kind: str) -> Iterator[tuple[bytes, bytes, str | No
 def test_no_spelling_of_a_path_gets_around_the_keys(server: Served, request: pytest.FixtureRequest) -> None:
     kind = request.node.callspec.params["server"]
     before, asked = server.plan, 0
+    opened = {path for _, path, access in paths(server.app) if access is Access.open}
     with Wire(server.port) as wire:
         for verb, target, key, path, access in attempts(server.app, kind):
             status, answer = wire.ask(verb, target, *(() if key is None else bearer(key)))
@@ -233,7 +234,7 @@ def test_no_spelling_of_a_path_gets_around_the_keys(server: Served, request: pyt
                 assert status in (0, 400, 401, 403, 404, 405), shown
                 assert status != 404 or key == ROBOT or kind != "keys", shown
             elif 200 <= status < 300:
-                assert plain_of(target).rstrip("/") == path, shown
+                assert plain_of(target).rstrip("/") in opened, shown
     assert asked > 1000
     assert server.plan == before and server.control.store is not None
     assert server.control.store.names == ("gridworld", "ur5")
