@@ -7,20 +7,22 @@ without an admin key. The Open Inference Protocol's `load` and `unload` are two 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import orjson
-from fastapi import Depends, FastAPI
+from fastapi import Depends, FastAPI, Request
 from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from rlservo.export.errors import RequestError
+from rlservo.export.errors import RequestError, RlservoError
 from rlservo.serve_app import listing, oip, plan, wire
 from rlservo.serve_app.control import Change, Control
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.edge import error_models, json_only
+from rlservo.serve_app.edge import KEY, error_models, json_only, peer_of, request_id
 from rlservo.serve_app.keys import Access, grant
 from rlservo.serve_app.library import digest_of
+from rlservo.serve_app.logs import administered
 from rlservo.serve_app.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
 
 Route = TypeVar("Route", bound=Callable[..., Any])
@@ -85,8 +87,25 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             dependencies=[Depends(json_only)],
         )
 
-    async def changed(name: str, what: str, change: Change) -> Response:
-        return _answer(name, await control.change(change, what=what))
+    async def apply(request: Request, what: str, change: Change) -> Plan:
+        key = request.scope.get(KEY)
+        log = partial(
+            administered,
+            what,
+            key="" if key is None else key.label,
+            peer=peer_of(request.scope),
+            request_id=request_id(request.scope),
+        )
+        try:
+            after = await control.change(change, what=what)
+        except RlservoError as error:
+            log(error.code)
+            raise
+        log("ok", generation=after.generation)
+        return after
+
+    async def changed(request: Request, name: str, what: str, change: Change) -> Response:
+        return _answer(name, await apply(request, what, change))
 
     @app.get(
         "/v1/admin/policies",
@@ -102,24 +121,26 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
 
     @command("load", "Load a version, prove it, and keep it ready")
     @grant(Access.admin)
-    async def load(name: str, given: LoadCommand) -> Response:
-        return await changed(name, f"load {name} {given.version or 'newest'}", _load(control, name, given.version))
+    async def load(request: Request, name: str, given: LoadCommand) -> Response:
+        return await changed(
+            request, name, f"load {name} {given.version or 'newest'}", _load(control, name, given.version)
+        )
 
     @command("unload", "Drop a version, or the policy")
     @grant(Access.admin)
-    async def unload(name: str, given: UnloadCommand) -> Response:
+    async def unload(request: Request, name: str, given: UnloadCommand) -> Response:
         version = given.version
-        return await changed(name, f"unload {name} {version or ''}", lambda p: plan.unload(p, name, version))
+        return await changed(request, name, f"unload {name} {version or ''}", lambda p: plan.unload(p, name, version))
 
     @command("alias", "Let an alias lead to a loaded version")
     @grant(Access.admin)
-    async def alias(name: str, given: AliasCommand) -> Response:
+    async def alias(request: Request, name: str, given: AliasCommand) -> Response:
         what = f"alias {name} {given.alias}={given.version or ''}"
-        return await changed(name, what, lambda p: plan.set_alias(p, name, given.alias, given.version))
+        return await changed(request, name, what, lambda p: plan.set_alias(p, name, given.alias, given.version))
 
     @command("rollback", "Let an alias lead where it led before")
     @grant(Access.admin)
-    async def rollback(name: str, given: RollbackCommand) -> Response:
+    async def rollback(request: Request, name: str, given: RollbackCommand) -> Response:
         def change(before: Plan) -> dict[str, PolicyPlan]:
             return plan.roll_back(
                 before,
@@ -129,23 +150,23 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
                 expected=given.expected,
             )
 
-        return await changed(name, f"rollback {name} {given.alias}", change)
+        return await changed(request, name, f"rollback {name} {given.alias}", change)
 
     @command("canary", "Send a share of the sessions to another version")
     @grant(Access.admin)
-    async def canary(name: str, given: CanaryCommand) -> Response:
+    async def canary(request: Request, name: str, given: CanaryCommand) -> Response:
         if given.version is not None and given.share is None:
             raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
         ended = given.version is None or not given.share
         chosen = None if ended else Canary(version=str(given.version), share=given.share or 0)
         what = f"canary {name} {given.version or 'off'} {given.share or ''}"
-        return await changed(name, what, lambda p: plan.set_canary(p, name, chosen))
+        return await changed(request, name, what, lambda p: plan.set_canary(p, name, chosen))
 
     @command("shadow", "Let another version compute along")
     @grant(Access.admin)
-    async def shadow(name: str, given: ShadowCommand) -> Response:
+    async def shadow(request: Request, name: str, given: ShadowCommand) -> Response:
         what = f"shadow {name} {given.version or 'off'}"
-        return await changed(name, what, lambda p: plan.set_shadow(p, name, given.version))
+        return await changed(request, name, what, lambda p: plan.set_shadow(p, name, given.version))
 
     # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: nobody reads it.
     def repository(path: str, summary: str) -> Callable[[Route], Route]:
@@ -160,14 +181,14 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
 
     @repository("load", "Load a model's newest version")
     @grant(Access.admin)
-    async def load_model(name: str) -> Response:
-        await control.change(_load(control, name, None), what=f"load {name} newest")
+    async def load_model(request: Request, name: str) -> Response:
+        await apply(request, f"load {name} newest", _load(control, name, None))
         return Response(b"{}", media_type="application/json")
 
     @repository("unload", "Unload a model, all its versions")
     @grant(Access.admin)
-    async def unload_model(name: str) -> Response:
-        await control.change(lambda p: plan.unload(p, name, None), what=f"unload {name}")
+    async def unload_model(request: Request, name: str) -> Response:
+        await apply(request, f"unload {name}", lambda p: plan.unload(p, name, None))
         return Response(b"{}", media_type="application/json")
 
 

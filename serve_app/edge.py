@@ -16,7 +16,7 @@ from typing import Any
 
 from fastapi import Request
 from fastapi.routing import APIRoute
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rlservo.export.errors import (
     ActionError,
@@ -62,6 +62,7 @@ RETRY_AFTER_S = 1
 TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been read
 BUG = "the server failed on this request; its log says how"
 JSON = b"application/json"
+KEY = "rlservo.key"  # the key that opened a request, in its scope
 
 Headers = tuple[tuple[bytes, bytes], ...]
 Body = bytes | bytearray
@@ -77,8 +78,6 @@ class Endpoint:
         self._handle = handle
         self._check_headers = check_headers
         self._core = core
-        self._max_body = core.settings.max_body_bytes
-        self._timeout_s = core.settings.body_timeout_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -86,9 +85,7 @@ class Endpoint:
         started = time.perf_counter()
         try:
             self._check_headers(scope["headers"])
-            check_length(scope["headers"], self._max_body)
-            with admission.reading(self._timeout_s) as timeout_s:
-                body = await read_body(receive, max_bytes=self._max_body, timeout_s=timeout_s)
+            body = await receive_body(self._core, scope, receive)
             if body is None:  # the client has gone
                 return
             received = min(started, admission.enter())  # only now: a body that is slow to come waits for itself
@@ -171,6 +168,27 @@ class BareRoute(APIRoute):
         self.app = endpoint
 
 
+async def receive_body(core: Core, scope: Scope, receive: Receive) -> Body | None:
+    """Return a request's body within the server's limits, or None when the client hung up.
+
+    The one way in which a body gets into this process. Raises TooLargeError, DeadlineError and OverloadedError.
+    """
+    settings = core.settings
+    check_length(scope["headers"], settings.max_body_bytes)
+    with core.admission.reading(settings.body_timeout_s) as timeout_s:
+        return await read_body(receive, max_bytes=settings.max_body_bytes, timeout_s=timeout_s)
+
+
+def replay(body: Body, receive: Receive) -> Receive:
+    """Return a `receive` that gives a body that has been read, and then what else comes."""
+    messages: list[Message] = [{"type": "http.request", "body": bytes(body), "more_body": False}]
+
+    async def receive_again() -> Message:
+        return messages.pop() if messages else await receive()
+
+    return receive_again
+
+
 async def read_body(receive: Receive, *, max_bytes: int, timeout_s: float) -> Body | None:
     """Return the body, or None when the client hung up. The first message usually holds all of it.
 
@@ -244,6 +262,12 @@ def request_id(scope: Scope) -> str | None:
         if name == b"x-request-id":
             return str(value.decode("latin-1"))
     return None
+
+
+def peer_of(scope: Scope) -> str | None:
+    """Return the client's address; behind HAProxy uvicorn takes it from `X-Forwarded-For`, which HAProxy adds."""
+    client = scope.get("client")
+    return None if client is None else str(client[0])
 
 
 def check_length(headers: list[tuple[bytes, bytes]], max_bytes: int) -> None:

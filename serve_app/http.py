@@ -41,7 +41,6 @@ CODES = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "wr
 ACT_PATH = "/v1/policies/{name}/act"
 ACT_VERSION_PATH = "/v1/policies/{name}/versions/{version}/act"
 PATHS_REMEMBERED = 1024
-KEY = "rlservo.key"  # the key that opened a request, in its scope
 
 
 def create_app(
@@ -129,11 +128,12 @@ class PolicyApp(FastAPI):
             check_path(scope, path)
             direct = self._find_direct(scope, path)
             route, access = (direct[0], direct[0].access) if direct is not None else self._find(scope)
-            presented = self._checks.read(scope)
-            scope[KEY] = self._core.guard.check(presented, access)
+            presented, unreadable = self._checks.read(scope)
+            scope[edge.KEY] = self._core.guard.check(presented, access)
+            if unreadable is not None:
+                raise RequestError(f"the header '{unreadable[:64]}' is not UTF-8")
         except RlservoError as error:
-            self._core.kept_out(scope["type"], error, edge.request_id(scope))
-            await refuse(scope, receive, send, error)
+            await self._refuse(scope, receive, send, error)
             return
         if direct is not None:
             scope["path_params"] = direct[1]
@@ -144,7 +144,17 @@ class PolicyApp(FastAPI):
         elif route is None:
             await _http_error(404, scope)(scope, receive, send)
         else:
-            await super().__call__(scope, receive, send)
+            try:
+                body = await edge.receive_body(self._core, scope, receive)
+            except RlservoError as error:
+                await self._refuse(scope, receive, send, error)
+                return
+            if body is not None:  # else the client has gone
+                await super().__call__(scope, edge.replay(body, receive), send)
+
+    async def _refuse(self, scope: Scope, receive: Receive, send: Send, error: RlservoError) -> None:
+        self._core.kept_out(scope["type"], error, edge.request_id(scope), peer=edge.peer_of(scope))
+        await refuse(scope, receive, send, error)
 
     def _find_direct(self, scope: Scope, path: str) -> tuple[BareRoute | StreamRoute, dict[str, Any]] | None:
         """Return the direct route of a path below the prefix, and the path's parameters."""

@@ -41,7 +41,6 @@ from rlservo.serve_app.edge import (
     Headers,
     check_media_type,
     error_models,
-    read_body,
     session_of,
     too_large,
 )
@@ -427,7 +426,7 @@ def _options(parameters: Mapping[str, Any]) -> tuple[bool, int | None, int | Non
                 {"known": sorted(PARAMETERS | IGNORED)},
             )
     explore, seed, seq, deadline_ms = wire.read_options(parameters)
-    timeout_us = wire.read_integer(parameters, TIMEOUT)
+    timeout_us = wire.read_finite(parameters, TIMEOUT, "an integer of microseconds", kinds=(int,))
     if deadline_ms is None and timeout_us:
         deadline_ms = timeout_us / 1e3
     return explore, seed, seq, deadline_ms
@@ -641,8 +640,7 @@ def _add_models(app: FastAPI, core: Core) -> None:
     )
     @grant(Access.act)
     async def index(request: Request) -> Response:
-        settings = core.settings
-        body = await read_body(request.receive, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+        body = await request.body()
         ready = False
         if body:
             document, _ = wire.read_json(body, such_as='{"ready": true}')

@@ -182,7 +182,7 @@ class Grpc:
         try:
             self._core.guard.check(presented_key(headers), Access.open if method in OPEN else Access.act)
         except RlservoError as error:
-            self._core.kept_out(PROTOCOL, error, given.get(REQUEST_ID))
+            self._core.kept_out(PROTOCOL, error, given.get(REQUEST_ID), peer=_caller(context.peer(), metadata))
             raise
         return given.get(REQUEST_ID), given.get(SESSION)
 
@@ -395,6 +395,12 @@ def is_local(peer: str) -> bool:
         return False
     mapped = getattr(host, "ipv4_mapped", None)
     return host.is_loopback if mapped is None else bool(mapped.is_loopback)
+
+
+def _caller(peer: str, metadata: Any) -> str:
+    """Return where a call came from: what HAProxy says, which is on this machine and adds its word last."""
+    forwarded = [value for name, value in metadata if name == "x-forwarded-for" and type(value) is str]
+    return forwarded[-1].rpartition(",")[2].strip() if forwarded and is_local(peer) else peer
 
 
 def _bytes(value: str | bytes) -> bytes:

@@ -27,8 +27,11 @@ if TYPE_CHECKING:
 # routed at all: control characters, encoded and doubled slashes, dot segments, ';', '\'.
 PATH = re.compile(r"(?:/(?!\.\.?(?:/|\Z))[A-Za-z0-9._~-]+)*/?")
 HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+?)\.?(?::[0-9]{1,5})?")
+SECONDS = re.compile(rb"[0-9]{1,9}(\.[0-9]{1,9})?")
 READING = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that change nothing
 OWN_SITES = frozenset({b"same-origin", b"none"})  # 'none' is the user, not a page; 'same-site' is another port or name
+UNREADABLE = b"x-rlservo-unreadable"  # says which header is not UTF-8, where `mend_headers` has made it so
+TIMEOUT = b"x-request-timeout-seconds"  # Ray Serve's; infinity makes its event loop raise
 PAGE_SCHEMES = (b"http://", b"https://")  # a proxy may have ended TLS
 HOSTS_REMEMBERED = 256
 ANY_HOST = "*"
@@ -87,12 +90,12 @@ class RequestChecks:
     def __init__(self, hosts: Hosts) -> None:
         self._hosts = hosts
 
-    def read(self, scope: Scope) -> bytes | None:
-        """Return the API key that is presented, None where there is none.
+    def read(self, scope: Scope) -> tuple[bytes | None, str | None]:
+        """Return (the API key presented, the name of a header that is not UTF-8); None for what is not there.
 
         Raises ForbiddenError for another host's request or another origin's page, RequestError for two hosts.
         """
-        host = origin = site = key = None
+        host = origin = site = key = unreadable = None
         for name, value in scope["headers"]:
             if name == b"host":
                 if host is not None:
@@ -107,6 +110,10 @@ class RequestChecks:
                     key = _bearer(value)
             elif name == b"x-api-key" and key is None:
                 key = value.strip()
+            elif name == UNREADABLE:
+                unreadable = value.decode("latin-1")
+            if not value.isascii() and not _is_utf8(value):
+                unreadable = name.decode("latin-1")
         if host is not None and not self._hosts.permit(host):
             raise ForbiddenError(
                 f"this server is not called '{host[:100].decode('latin-1')}': call it by its address, or name it in "
@@ -116,7 +123,29 @@ class RequestChecks:
             scope["type"] == "websocket" or scope["method"] not in READING
         ):
             _check_page(origin, site, host)
-        return key
+        return key, unreadable
+
+
+def mend_headers(headers: list[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
+    """Return headers that Ray Serve (2.60) can read, which decodes some as UTF-8 and answers what it cannot with 500.
+
+    `RequestChecks` refuses such a request later, when it has seen the key.
+    """
+    mended: list[tuple[bytes, bytes]] = []
+    for name, value in headers:
+        if not value.isascii() and not _is_utf8(value):
+            mended += [(name, value.decode("latin-1").encode()), (UNREADABLE, name)]
+        elif name != TIMEOUT or SECONDS.fullmatch(value):
+            mended.append((name, value))
+    return mended
+
+
+def _is_utf8(value: bytes) -> bool:
+    try:
+        value.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def presented_key(headers: list[tuple[bytes, bytes]]) -> bytes | None:
