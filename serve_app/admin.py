@@ -7,19 +7,22 @@ without an admin key. The Open Inference Protocol's `load` and `unload` are two 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import orjson
-from fastapi import Body, FastAPI
+from fastapi import Depends, FastAPI, Request
 from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from rlservo.export.errors import RequestError
-from rlservo.serve_app import listing, plan, wire
+from rlservo.export.errors import RequestError, RlservoError
+from rlservo.serve_app import listing, oip, plan, wire
 from rlservo.serve_app.control import Change, Control
 from rlservo.serve_app.core import Core
-from rlservo.serve_app.edge import error_models
+from rlservo.serve_app.edge import KEY, error_models, json_only, peer_of, request_id
+from rlservo.serve_app.keys import Access, grant
 from rlservo.serve_app.library import digest_of
+from rlservo.serve_app.logs import administered
 from rlservo.serve_app.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
 
 Route = TypeVar("Route", bound=Callable[..., Any])
@@ -58,12 +61,6 @@ class ShadowCommand(_Command):
     version: Reference | None = Field(description="A loaded version or an alias; null ends the shadow.")
 
 
-class RepositoryCommand(BaseModel):
-    """Triton's clients send parameters of their own, which mean nothing here."""
-
-    parameters: dict[str, Any] | None = None
-
-
 class Changed(BaseModel):
     """A change that every replica serves."""
 
@@ -78,7 +75,7 @@ class Changed(BaseModel):
 
 def add_admin(app: FastAPI, core: Core, control: Control) -> None:
     """Add /v1/admin and the repository extension's load and unload to the application."""
-    errors = error_models(400, 401, 403, 404, 409, 503)
+    errors = error_models(404, 409, 415, 503)
 
     def command(path: str, summary: str) -> Callable[[Route], Route]:
         return app.post(
@@ -87,10 +84,28 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             summary=summary,
             response_model=Changed,
             responses=errors,
+            dependencies=[Depends(json_only)],
         )
 
-    async def changed(name: str, what: str, change: Change) -> Response:
-        return _answer(name, await control.change(change, what=what))
+    async def apply(request: Request, what: str, change: Change) -> Plan:
+        key = request.scope.get(KEY)
+        log = partial(
+            administered,
+            what,
+            key="" if key is None else key.label,
+            peer=peer_of(request.scope),
+            request_id=request_id(request.scope),
+        )
+        try:
+            after = await control.change(change, what=what)
+        except RlservoError as error:
+            log(error.code)
+            raise
+        log("ok", generation=after.generation)
+        return after
+
+    async def changed(request: Request, name: str, what: str, change: Change) -> Response:
+        return _answer(name, await apply(request, what, change))
 
     @app.get(
         "/v1/admin/policies",
@@ -99,26 +114,33 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
         response_model=list[listing.PolicyList],
         responses=errors,
     )
+    @grant(Access.admin)
     async def status() -> Response:
         replies = [listing.describe(core)] if control.gather is None else await control.gather()
         return Response(orjson.dumps(replies), media_type="application/json")
 
     @command("load", "Load a version, prove it, and keep it ready")
-    async def load(name: str, given: LoadCommand) -> Response:
-        return await changed(name, f"load {name} {given.version or 'newest'}", _load(control, name, given.version))
+    @grant(Access.admin)
+    async def load(request: Request, name: str, given: LoadCommand) -> Response:
+        return await changed(
+            request, name, f"load {name} {given.version or 'newest'}", _load(control, name, given.version)
+        )
 
     @command("unload", "Drop a version, or the policy")
-    async def unload(name: str, given: UnloadCommand) -> Response:
+    @grant(Access.admin)
+    async def unload(request: Request, name: str, given: UnloadCommand) -> Response:
         version = given.version
-        return await changed(name, f"unload {name} {version or ''}", lambda p: plan.unload(p, name, version))
+        return await changed(request, name, f"unload {name} {version or ''}", lambda p: plan.unload(p, name, version))
 
     @command("alias", "Let an alias lead to a loaded version")
-    async def alias(name: str, given: AliasCommand) -> Response:
+    @grant(Access.admin)
+    async def alias(request: Request, name: str, given: AliasCommand) -> Response:
         what = f"alias {name} {given.alias}={given.version or ''}"
-        return await changed(name, what, lambda p: plan.set_alias(p, name, given.alias, given.version))
+        return await changed(request, name, what, lambda p: plan.set_alias(p, name, given.alias, given.version))
 
     @command("rollback", "Let an alias lead where it led before")
-    async def rollback(name: str, given: RollbackCommand) -> Response:
+    @grant(Access.admin)
+    async def rollback(request: Request, name: str, given: RollbackCommand) -> Response:
         def change(before: Plan) -> dict[str, PolicyPlan]:
             return plan.roll_back(
                 before,
@@ -128,22 +150,25 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
                 expected=given.expected,
             )
 
-        return await changed(name, f"rollback {name} {given.alias}", change)
+        return await changed(request, name, f"rollback {name} {given.alias}", change)
 
     @command("canary", "Send a share of the sessions to another version")
-    async def canary(name: str, given: CanaryCommand) -> Response:
+    @grant(Access.admin)
+    async def canary(request: Request, name: str, given: CanaryCommand) -> Response:
         if given.version is not None and given.share is None:
             raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
         ended = given.version is None or not given.share
         chosen = None if ended else Canary(version=str(given.version), share=given.share or 0)
         what = f"canary {name} {given.version or 'off'} {given.share or ''}"
-        return await changed(name, what, lambda p: plan.set_canary(p, name, chosen))
+        return await changed(request, name, what, lambda p: plan.set_canary(p, name, chosen))
 
     @command("shadow", "Let another version compute along")
-    async def shadow(name: str, given: ShadowCommand) -> Response:
+    @grant(Access.admin)
+    async def shadow(request: Request, name: str, given: ShadowCommand) -> Response:
         what = f"shadow {name} {given.version or 'off'}"
-        return await changed(name, what, lambda p: plan.set_shadow(p, name, given.version))
+        return await changed(request, name, what, lambda p: plan.set_shadow(p, name, given.version))
 
+    # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: nobody reads it.
     def repository(path: str, summary: str) -> Callable[[Route], Route]:
         return app.post(
             f"/v2/repository/models/{{name}}/{path}",
@@ -151,16 +176,19 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             summary=summary,
             response_class=Response,
             responses=errors,
+            dependencies=[Depends(oip.media_type)],
         )
 
     @repository("load", "Load a model's newest version")
-    async def load_model(name: str, _given: RepositoryCommand | None = Body(None)) -> Response:  # noqa: B008  # FastAPI's way
-        await control.change(_load(control, name, None), what=f"load {name} newest")
+    @grant(Access.admin)
+    async def load_model(request: Request, name: str) -> Response:
+        await apply(request, f"load {name} newest", _load(control, name, None))
         return Response(b"{}", media_type="application/json")
 
     @repository("unload", "Unload a model, all its versions")
-    async def unload_model(name: str, _given: RepositoryCommand | None = Body(None)) -> Response:  # noqa: B008
-        await control.change(lambda p: plan.unload(p, name, None), what=f"unload {name}")
+    @grant(Access.admin)
+    async def unload_model(request: Request, name: str) -> Response:
+        await apply(request, f"unload {name}", lambda p: plan.unload(p, name, None))
         return Response(b"{}", media_type="application/json")
 
 

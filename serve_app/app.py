@@ -137,7 +137,12 @@ class PolicyServer(InferenceService):
 
     def __serve_build_asgi_app__(self) -> PolicyApp:  # Serve's hook: the app is built in the replica
         app = create_app(
-            lambda: self._control.store, self._settings, replica=self._replica, control=self._control, alone=_alone
+            lambda: self._control.store,
+            self._settings,
+            replica=self._replica,
+            control=self._control,
+            alone=_alone,
+            host=self._host,
         )
         core: Core = app.state.core
         self._core = core

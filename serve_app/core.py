@@ -156,10 +156,10 @@ class Core:
             version = store.version_of(name, version)
         self.metrics.failed(protocol, name, version or "", code)
 
-    def kept_out(self, protocol: str, error: RlservoError, request_id: str | None) -> None:
-        """Count and log a request that the guard let nobody look at."""
+    def kept_out(self, protocol: str, error: RlservoError, request_id: str | None, *, peer: str | None) -> None:
+        """Count and log a request that was refused before anybody looked at it, and the address it came from."""
         self.metrics.failed(protocol, "", "", error.code)
-        self.log.failed(protocol, "", None, error.code, error.message, request_id=request_id)
+        self.log.failed(protocol, "", None, error.code, error.message, request_id=request_id, peer=peer)
 
     def policies(self) -> Iterator[tuple[str, str, Policy]]:
         """Yield (name, version, policy) of all that are loaded."""

@@ -11,7 +11,10 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import HTMLResponse
+from starlette.routing import Mount
 from starlette.staticfiles import StaticFiles
+
+from rlservo.serve_app.keys import Access, grant
 
 OPENAPI_VERSION = "3.0.3"
 
@@ -37,6 +40,12 @@ SwaggerUIBundle({url: "openapi.json", dom_id: "#swagger-ui", deepLinking: true, 
 """
 
 
+class _Files(Mount):
+    """Swagger UI's own files, the same for everybody."""
+
+    access = Access.open
+
+
 def add_docs(app: FastAPI) -> None:
     """Serve /docs, its files, and /openapi.json as OpenAPI 3.0."""
     # Here: a server without /docs does not need the package.
@@ -49,10 +58,11 @@ def add_docs(app: FastAPI) -> None:
         return app.openapi_schema
 
     @app.get("/docs", include_in_schema=False)
+    @grant(Access.open)
     async def docs() -> HTMLResponse:
         return HTMLResponse(PAGE)
 
-    app.mount("/docs/files", StaticFiles(directory=swagger_ui_path), name="docs-files")
+    app.router.routes.append(_Files("/docs/files", StaticFiles(directory=swagger_ui_path), name="docs-files"))
     app.openapi = openapi  # type: ignore[method-assign]  # FastAPI's own documented way
 
 

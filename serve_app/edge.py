@@ -14,8 +14,9 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
+from fastapi import Request
 from fastapi.routing import APIRoute
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rlservo.export.errors import (
     ActionError,
@@ -35,6 +36,7 @@ from rlservo.export.errors import (
 )
 from rlservo.serve_app import wire
 from rlservo.serve_app.core import Core
+from rlservo.serve_app.keys import Access
 from rlservo.serve_app.logs import FIELDS
 from rlservo.serve_app.store import Decision
 
@@ -55,10 +57,12 @@ STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; w
     (ForbiddenError, 403),
     (ActionError, 500),
 )
+ANY_ROUTE = (400, 401, 403, 408, 413)  # its path, key, host, page and body
 RETRY_AFTER_S = 1
 TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been read
 BUG = "the server failed on this request; its log says how"
 JSON = b"application/json"
+KEY = "rlservo.key"  # the key that opened a request, in its scope
 
 Headers = tuple[tuple[bytes, bytes], ...]
 Body = bytes | bytearray
@@ -74,8 +78,6 @@ class Endpoint:
         self._handle = handle
         self._check_headers = check_headers
         self._core = core
-        self._max_body = core.settings.max_body_bytes
-        self._timeout_s = core.settings.body_timeout_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -83,9 +85,7 @@ class Endpoint:
         started = time.perf_counter()
         try:
             self._check_headers(scope["headers"])
-            check_length(scope["headers"], self._max_body)
-            with admission.reading(self._timeout_s) as timeout_s:
-                body = await read_body(receive, max_bytes=self._max_body, timeout_s=timeout_s)
+            body = await receive_body(self._core, scope, receive)
             if body is None:  # the client has gone
                 return
             received = min(started, admission.enter())  # only now: a body that is slow to come waits for itself
@@ -128,6 +128,8 @@ JSON_HEADERS: Headers = ((b"content-type", JSON),)
 class BareRoute(APIRoute):
     """A route FastAPI documents and routes to, and otherwise leaves alone: `app` is a bare ASGI callable."""
 
+    access = Access.act
+
     def __init__(
         self,
         path: str,
@@ -164,6 +166,27 @@ class BareRoute(APIRoute):
             generate_unique_id_function=lambda _route: operation,
         )
         self.app = endpoint
+
+
+async def receive_body(core: Core, scope: Scope, receive: Receive) -> Body | None:
+    """Return a request's body within the server's limits, or None when the client hung up.
+
+    The one way in which a body gets into this process. Raises TooLargeError, DeadlineError and OverloadedError.
+    """
+    settings = core.settings
+    check_length(scope["headers"], settings.max_body_bytes)
+    with core.admission.reading(settings.body_timeout_s) as timeout_s:
+        return await read_body(receive, max_bytes=settings.max_body_bytes, timeout_s=timeout_s)
+
+
+def replay(body: Body, receive: Receive) -> Receive:
+    """Return a `receive` that gives a body that has been read, and then what else comes."""
+    messages: list[Message] = [{"type": "http.request", "body": bytes(body), "more_body": False}]
+
+    async def receive_again() -> Message:
+        return messages.pop() if messages else await receive()
+
+    return receive_again
 
 
 async def read_body(receive: Receive, *, max_bytes: int, timeout_s: float) -> Body | None:
@@ -241,11 +264,46 @@ def request_id(scope: Scope) -> str | None:
     return None
 
 
+def peer_of(scope: Scope) -> str | None:
+    """Return the client's address; behind HAProxy uvicorn takes it from `X-Forwarded-For`, which HAProxy adds."""
+    client = scope.get("client")
+    return None if client is None else str(client[0])
+
+
 def check_length(headers: list[tuple[bytes, bytes]], max_bytes: int) -> None:
     """Raise TooLargeError for a body that announces itself as too large."""
     for name, value in headers:
         if name == b"content-length" and value.isdigit() and len(value) < 20 and int(value) > max_bytes:
             raise too_large(max_bytes)
+
+
+def check_media_type(headers: list[tuple[bytes, bytes]], *accepted: bytes, optional: bool = False) -> None:
+    """Raise MediaTypeError unless the body is of an accepted content type.
+
+    A web page can send forms, plain text and bodies of no type to any server; for another type a browser asks the
+    server first. Triton's client names no type: `optional` lets through who does not, unless it is a browser.
+    """
+    named = page = False
+    for name, value in headers:
+        if name == b"content-type":
+            named = True
+            if value not in accepted and value.split(b";", 1)[0].strip().lower() not in accepted:
+                raise MediaTypeError(
+                    f"the content type is '{value[:64].decode('latin-1')}': send {accepted[0].decode()} "
+                    f"(curl: -H 'content-type: {accepted[0].decode()}')"
+                )
+        elif name in (b"origin", b"sec-fetch-site"):
+            page = True
+    if not named and (page or not optional):
+        raise MediaTypeError(
+            f"the request has no content type: send {accepted[0].decode()} "
+            f"(curl: -H 'content-type: {accepted[0].decode()}')"
+        )
+
+
+async def json_only(request: Request) -> None:
+    """Raise MediaTypeError for what is not JSON: a dependency of the routes that FastAPI runs."""
+    check_media_type(request.scope["headers"], JSON)
 
 
 def too_large(limit: int) -> TooLargeError:
@@ -297,5 +355,5 @@ def encode_bug() -> bytes:
 
 
 def error_models(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return FastAPI's `responses` for these error statuses."""
-    return {status: {"model": wire.ErrorReply} for status in statuses}
+    """Return FastAPI's `responses` for these error statuses, and for those that every route may answer with."""
+    return {status: {"model": wire.ErrorReply} for status in sorted({*ANY_ROUTE, *statuses})}

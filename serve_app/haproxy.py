@@ -85,6 +85,8 @@ def mend(text: str, error_file: Path, *, bridged: bool = False) -> str:
     text = re.sub(r"^( *errorfile 50[234]) .*$", rf"\1 {error_file}", text, flags=re.MULTILINE)
     more = f"    timeout http-request {REQUEST_TIMEOUT_S}s\n    errorfile 408 {error_file.with_name(LATE_FILE)}"
     text = re.sub(r"^defaults$", rf"\g<0>\n{more}", text, flags=re.MULTILINE)
+    # Whose requests were refused, and who administers, is logged with the client's address, not the proxy's.
+    text = re.sub(r"^defaults$", r"\g<0>\n    option forwardfor", text, flags=re.MULTILINE)
     if "RAY_SERVE_HAPROXY_TIMEOUT_CONNECT_S" not in os.environ:
         text = re.sub(r"^( *timeout connect) .*$", rf"\1 {CONNECT_TIMEOUT_MS}ms", text, flags=re.MULTILINE)
     # Not for gRPC, whose streams are requests that go on. A connection on which nothing came gets no 408.

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,10 +14,17 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.exceptions import HTTPException
+from starlette.routing import BaseRoute, Match
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from rlservo.export.bundle import Contract, contract_json
-from rlservo.export.errors import MediaTypeError, ObservationError, RequestError, RlservoError
+from rlservo.export.errors import (
+    MediaTypeError,
+    ObservationError,
+    RequestError,
+    RlservoError,
+    UnknownPolicyError,
+)
 from rlservo.serve_app import edge, listing, oip, wire
 from rlservo.serve_app.admin import add_admin
 from rlservo.serve_app.control import Control
@@ -26,14 +32,16 @@ from rlservo.serve_app.core import Core, StoreProvider
 from rlservo.serve_app.docs import add_docs
 from rlservo.serve_app.edge import JSON, JSON_HEADERS, BareRoute, Body, Endpoint, Headers
 from rlservo.serve_app.gauges import gauges_of
+from rlservo.serve_app.keys import Access, access_of, grant
+from rlservo.serve_app.request_checks import Hosts, RequestChecks, check_path
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import Decision
-from rlservo.serve_app.stream import STREAM_PATTERN, Stream, refuse
+from rlservo.serve_app.stream import STREAM_PATHS, Stream, StreamRoute, refuse
 
 CODES = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "wrong-media-type"}
 ACT_PATH = "/v1/policies/{name}/act"
 ACT_VERSION_PATH = "/v1/policies/{name}/versions/{version}/act"
-ACT_PATTERN = re.compile(r"/v1/policies/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/act")
+PATHS_REMEMBERED = 1024
 
 
 def create_app(
@@ -43,32 +51,31 @@ def create_app(
     replica: str = "",
     control: Control | None = None,
     alone: Callable[[], bool] = lambda: True,
+    host: str = "127.0.0.1",
 ) -> PolicyApp:
     """Return the application; `store_provider` gives None for as long as the policies are being loaded.
 
     With a `control` what is served can be administered. `replica` and `alone` are the `Core`'s, which is the
-    application's `state.core`. Raises UsageError when the API keys that `settings` name cannot be read.
+    application's `state.core`; `host` is the address that is listened on. Raises UsageError when the API keys that
+    `settings` name cannot be read.
     """
     core = Core(store_provider, settings, replica=replica, control=control, alone=alone)
     core.metrics.sources += gauges_of(core)
-    act = Endpoint("json", _Act(core), _check_headers, core)
-    infer = oip.endpoint(core)
+    checks = RequestChecks(Hosts(host, settings, keyed=core.guard.asks_for_keys))
+    # A redirect would be an answer to a path that no route has: there is none.
     app = PolicyApp(
-        ((ACT_PATTERN, act), (oip.INFER_PATTERN, infer)),
-        Stream(core),
-        core,
-        title="rlservo",
-        description=DESCRIPTION,
-        docs_url=None,
-        redoc_url=None,
+        core, checks, title="rlservo", description=DESCRIPTION, docs_url=None, redoc_url=None, redirect_slashes=False
     )
+    (document,) = app.routes  # FastAPI's own, /openapi.json: it tells nothing of policies
+    grant(Access.open)(document)
     app.state.core = core  # for gRPC and the replica, which are no part of the application
-    _add_act(app, act)
+    _add_act(app, Endpoint("json", _Act(core), _check_headers, core))
+    _add_streams(app, Stream(core))
     _add_policies(app, core)
     _add_health(app, core)
     if control is not None:
         add_admin(app, core, control)
-    oip.add_routes(app, core, infer)
+    oip.add_routes(app, core, app.add_direct)
     if settings.docs:
         add_docs(app)
     app.add_exception_handler(RlservoError, _on_rlservo_error)
@@ -82,31 +89,30 @@ DESCRIPTION = "Actions from exported RLlib policies. Every error is a sentence, 
 
 
 class PolicyApp(FastAPI):
-    """A FastAPI application that answers requests for actions before its middleware and router see them.
+    """A FastAPI application that finds each request's route itself, lets the route decide who may use it, and answers
+    requests for actions before its middleware and router see them.
 
-    Those cost as much again as the request does (measured: a sixth of the round trip). The routes are still there: for
-    the documentation, and for whatever is not a POST. What it `takes` needs nothing that Serve does, either
-    (`ingress.py`).
+    Those cost as much again as the request does (measured: a sixth of the round trip). What it `takes` needs nothing
+    that Serve does, either (`ingress.py`). A path that no route has never reaches FastAPI.
     """
 
-    def __init__(
-        self, direct: tuple[tuple[re.Pattern[str], ASGIApp], ...], stream: ASGIApp, core: Core, **options: Any
-    ) -> None:
+    def __init__(self, core: Core, checks: RequestChecks, **options: Any) -> None:
         super().__init__(**options)
-        self._direct = direct
-        self._stream = stream
         self._core = core
+        self._checks = checks
+        self._direct: dict[str, list[BareRoute | StreamRoute]] = {"POST": [], "WEBSOCKET": []}
+        self._found: dict[tuple[str, str], tuple[BareRoute | StreamRoute, dict[str, Any]]] = {}
         self._mount: str | None = None  # the paths' prefix, which the first request that Serve brings tells
+
+    def add_direct(self, route: BareRoute | StreamRoute) -> None:
+        """Add a route that is answered without FastAPI, which only documents it."""
+        self.router.routes.append(route)
+        self._direct["POST" if isinstance(route, BareRoute) else "WEBSOCKET"].append(route)
 
     def takes(self, scope: Scope) -> bool:
         """Whether this is a request for actions, or a stream, that Serve has not handled yet."""
         mount, path = self._mount, scope["path"]
-        if mount is None or not path.startswith(mount):
-            return False
-        path = path[len(mount) :]
-        if scope["type"] == "http":
-            return scope["method"] == "POST" and any(pattern.fullmatch(path) for pattern, _ in self._direct)
-        return scope["type"] == "websocket" and STREAM_PATTERN.fullmatch(path) is not None
+        return mount is not None and path.startswith(mount) and self._find_direct(scope, path[len(mount) :]) is not None
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer what it takes, under the prefix that Serve would have put it."""
@@ -119,24 +125,77 @@ class PolicyApp(FastAPI):
             await super().__call__(scope, receive, send)
             return
         self._mount = scope.get("root_path", "")
-        path = scope["path"].removeprefix(self._mount)
+        path = route_path(scope)
         try:
-            self._core.guard.check(scope, path)
+            check_path(scope, path)
+            direct = self._find_direct(scope, path)
+            route, access = (direct[0], direct[0].access) if direct is not None else self._find(scope)
+            presented, unreadable = self._checks.read(scope)
+            scope[edge.KEY] = self._core.guard.check(presented, access)
+            if unreadable is not None:
+                raise RequestError(f"the header '{unreadable[:64]}' is not UTF-8")
         except RlservoError as error:
-            self._core.kept_out(scope["type"], error, edge.request_id(scope))
-            await refuse(scope, receive, send, error)
+            await self._refuse(scope, receive, send, error)
             return
-        if scope["type"] == "http" and scope["method"] == "POST":
-            for pattern, endpoint in self._direct:
-                match = pattern.fullmatch(path)
-                if match is not None:
-                    scope["path_params"] = match.groupdict()
-                    await endpoint(scope, receive, send)
-                    return
+        if direct is not None:
+            scope["path_params"] = direct[1]
+            await direct[0].app(scope, receive, send)
         elif scope["type"] == "websocket":
-            await self._stream(scope, receive, send)
-            return
-        await super().__call__(scope, receive, send)
+            sentence = f"no stream is at {path[:200]}: connect to /v1/policies/NAME/stream"
+            await refuse(scope, receive, send, UnknownPolicyError(sentence))
+        elif route is None:
+            await _http_error(404, scope)(scope, receive, send)
+        else:
+            try:
+                body = await edge.receive_body(self._core, scope, receive)
+            except RlservoError as error:
+                await self._refuse(scope, receive, send, error)
+                return
+            if body is not None:  # else the client has gone
+                await super().__call__(scope, edge.replay(body, receive), send)
+
+    async def _refuse(self, scope: Scope, receive: Receive, send: Send, error: RlservoError) -> None:
+        self._core.kept_out(scope["type"], error, edge.request_id(scope), peer=edge.peer_of(scope))
+        await refuse(scope, receive, send, error)
+
+    def _find_direct(self, scope: Scope, path: str) -> tuple[BareRoute | StreamRoute, dict[str, Any]] | None:
+        """Return the direct route of a path below the prefix, and the path's parameters."""
+        kind = scope["method"] if scope["type"] == "http" else "WEBSOCKET"
+        found = self._found.get((kind, path))
+        if found is None:
+            for route in self._direct.get(kind, ()):
+                match = route.path_regex.fullmatch(path)
+                if match is not None:
+                    if len(self._found) >= PATHS_REMEMBERED:
+                        self._found.clear()
+                    found = self._found[kind, path] = (route, match.groupdict())
+                    break
+        return found
+
+    def _find(self, scope: Scope) -> tuple[BaseRoute | None, Access]:
+        """Return (the route that FastAPI will take, who may use it).
+
+        A path with another method is kept as its most guarded route is; one without any is for whoever has a key.
+        """
+        others: list[BaseRoute] = []
+        for route in self.router.routes:
+            match, _ = route.matches(scope)
+            if match is Match.FULL:
+                return route, access_of(route)
+            if match is Match.PARTIAL:
+                others.append(route)
+        if not others:
+            return None, Access.act
+        levels = {access_of(route) for route in others}
+        return others[0], next(level for level in (Access.admin, Access.act, Access.open) if level in levels)
+
+
+def route_path(scope: Scope) -> str:
+    """Return a connection's path below the prefix that the application is mounted at, as Starlette's routes see it."""
+    path: str = scope["path"]
+    root: str = scope.get("root_path", "")
+    below = path[len(root) :]
+    return below if path.startswith(root) and below[:1] in ("", "/") else path
 
 
 class _Act:
@@ -174,12 +233,12 @@ class _Act:
         return wire.encode_decision(decision, request.seq, clock), JSON_HEADERS, decision
 
 
-def _add_act(app: FastAPI, act: ASGIApp) -> None:
+def _add_act(app: PolicyApp, act: ASGIApp) -> None:
     for path, operation, summary in (
         (ACT_PATH, "act", "Act with the default version"),
         (ACT_VERSION_PATH, "act_version", "Act with one version, or with what an alias leads to"),
     ):
-        app.router.routes.append(
+        app.add_direct(
             BareRoute(
                 path,
                 act,
@@ -193,10 +252,22 @@ def _add_act(app: FastAPI, act: ASGIApp) -> None:
         )
 
 
+def _add_streams(app: PolicyApp, stream: ASGIApp) -> None:
+    for path in STREAM_PATHS:
+        app.add_direct(StreamRoute(path, stream))
+
+
 def _add_policies(app: FastAPI, core: Core) -> None:
     store = core.store
 
-    @app.get("/v1/policies", tags=["policies"], summary="What is served", response_model=listing.PolicyList)
+    @app.get(
+        "/v1/policies",
+        tags=["policies"],
+        summary="What is served",
+        response_model=listing.PolicyList,
+        responses=edge.error_models(),
+    )
+    @grant(Access.act)
     async def list_policies() -> Response:
         return _json(200, listing.describe(core))
 
@@ -207,6 +278,7 @@ def _add_policies(app: FastAPI, core: Core) -> None:
         response_model=Contract,
         responses=edge.error_models(404, 503),
     )
+    @grant(Access.act)
     async def get_policy(name: str) -> Response:
         return Response(contract_json(store().get(name).contract), media_type="application/json")
 
@@ -217,16 +289,31 @@ def _add_policies(app: FastAPI, core: Core) -> None:
         response_model=Contract,
         responses=edge.error_models(404, 503),
     )
+    @grant(Access.act)
     async def get_policy_version(name: str, version: str) -> Response:
         return Response(contract_json(store().get(name, version).contract), media_type="application/json")
 
 
 def _add_health(app: FastAPI, core: Core) -> None:
-    @app.get("/healthz", tags=["health"], summary="The process answers", response_class=Response)
+    @app.get(
+        "/healthz",
+        tags=["health"],
+        summary="The process answers",
+        response_class=Response,
+        responses=edge.error_models(),
+    )
+    @grant(Access.open)
     async def healthz() -> Response:
         return Response("OK", media_type="text/plain")
 
-    @app.get("/metrics", tags=["health"], summary="For Prometheus: what this replica answered", response_class=Response)
+    @app.get(
+        "/metrics",
+        tags=["health"],
+        summary="For Prometheus: what this replica answered",
+        response_class=Response,
+        responses=edge.error_models(),
+    )
+    @grant(Access.act)
     async def metrics() -> Response:
         return Response(core.exposition(), media_type=CONTENT_TYPE_LATEST)
 
@@ -242,14 +329,18 @@ async def _on_rlservo_error(_request: Request, error: Exception) -> Response:
 
 async def _on_http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    code = CODES.get(error.status_code, "http-error")
-    path = request.url.path[:200]
+    return _http_error(error.status_code, request.scope, error)
+
+
+def _http_error(status: int, scope: Scope, error: HTTPException | None = None) -> Response:
+    """Return the answer where no route of ours has decided."""
+    path, headers = scope["path"][:200], (error and error.headers) or {}
     sentences = {
         404: f"nothing is at {path}: policies are under /v1/policies, documentation at /docs",
-        405: f"{request.method} is not what {path} takes: {(error.headers or {}).get('Allow', 'another method')} is",
+        405: f"{scope['method']} is not what {path} takes: {headers.get('Allow', 'another method')} is",
     }
-    sentence = sentences.get(error.status_code, str(error.detail))
-    return _json(error.status_code, {"error": sentence, "code": code}, error.headers)
+    sentence = sentences.get(status, str(error and error.detail))
+    return _json(status, {"error": sentence, "code": CODES.get(status, "http-error")}, headers)
 
 
 async def _on_validation_error(_request: Request, error: Exception) -> Response:
@@ -264,14 +355,9 @@ async def _on_bug(_request: Request, _error: Exception) -> Response:
 
 
 def _check_headers(headers: list[tuple[bytes, bytes]]) -> None:
+    edge.check_media_type(headers, JSON)
     for name, value in headers:
-        if name == b"content-type":
-            if value != JSON and value.split(b";", 1)[0].strip().lower() != JSON:
-                raise MediaTypeError(
-                    f"the content type is '{value[:64].decode('latin-1')}': send application/json "
-                    "(curl: -H 'content-type: application/json')"
-                )
-        elif name == b"content-encoding" and value.lower() != b"identity":
+        if name == b"content-encoding" and value.lower() != b"identity":
             raise MediaTypeError(f"the content encoding '{value[:32].decode('latin-1')}' is not read: send plain JSON")
 
 

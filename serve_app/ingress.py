@@ -31,6 +31,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rlservo.serve_app.joined import join_writes
 from rlservo.serve_app.logs import FIELDS
+from rlservo.serve_app.request_checks import mend_headers
 
 logger = logging.getLogger(__name__)
 
@@ -105,8 +106,8 @@ class Ingress:
                 logger.exception("a request failed", extra={FIELDS: {"request_id": request_id.decode("latin-1")}})
                 raise
             return
-        if http:
-            scope["headers"] = [*scope["headers"], NO_WATCH]
+        headers = mend_headers(scope["headers"])
+        scope["headers"] = [*headers, NO_WATCH] if http else headers
         await self._app(scope, receive, send)
 
 

@@ -5,7 +5,7 @@ key file, or an entry of RLSERVO_API_KEYS (separated by commas), is
 
     <label> <act|admin> sha256:<64 hexadecimal digits>
 
-`rlservo key LABEL` makes a key and its line. It knows HTTP's headers and ASGI's scope; nothing of policies.
+`rlservo key LABEL` makes a key and its line. It knows nothing of HTTP or of policies.
 """
 
 from __future__ import annotations
@@ -16,28 +16,24 @@ import ipaddress
 import re
 import secrets
 import stat
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
+from typing import Any, TypeVar
 
 from typing_extensions import Self
 
 from rlservo.export.errors import ForbiddenError, UnauthenticatedError, UsageError
 from rlservo.serve_app.settings import ServerSettings
 
-if TYPE_CHECKING:
-    from starlette.types import Scope
-
 LINE = re.compile(r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|admin)\s+sha256:(?P<digest>[0-9a-f]{64})")
 KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets can tell what they found
 KEY_BYTES = 32
 SCHEMES = (b"bearer", b"api-key")  # the second is what openpi's clients say
-# What orchestrators probe without a key, and the documentation, which says nothing of this server's policies.
-OPEN = frozenset({"/healthz", "/v2/health/live", "/v2/health/ready", "/docs", "/openapi.json"})
-OPEN_FOLDER = "/docs/files/"
-ADMIN = re.compile(r"/v1/admin(/.*)?|/v2/repository/models/[^/]+/(load|unload)")
+ACCESS = "access"  # the attribute of a route, or of its endpoint, that says who may use it
+
+Endpoint = TypeVar("Endpoint")
 
 
 class Role(str, Enum):
@@ -45,6 +41,38 @@ class Role(str, Enum):
 
     act = "act"
     admin = "admin"
+
+
+class Access(Enum):
+    """Who may use a route or a method; `grant` and the route classes write it down where a route is made."""
+
+    open = "open"
+    """Everybody, without a key: what orchestrators probe, and the documentation, which tells nothing of policies."""
+
+    act = "act"
+    """Whoever has a key; where the server has none, everybody."""
+
+    admin = "admin"
+    """Whoever has an admin key, or the operator's; where the server has none, nobody."""
+
+
+def grant(access: Access) -> Callable[[Endpoint], Endpoint]:
+    """Write down who may use a route, on its endpoint."""
+
+    def mark(endpoint: Endpoint) -> Endpoint:
+        setattr(endpoint, ACCESS, access)
+        return endpoint
+
+    return mark
+
+
+def access_of(route: Any) -> Access:
+    """Return who may use a route; where nobody has said so, administrators alone."""
+    for part in (route, getattr(route, "endpoint", None)):
+        found = getattr(part, ACCESS, None)
+        if isinstance(found, Access):
+            return found
+    return Access.admin
 
 
 @dataclass(frozen=True)
@@ -99,26 +127,27 @@ class Keys:
 
 
 class Guard:
-    """Checks requests before anything else sees them."""
+    """Decides by a request's key whether it may use what its route, or its method, grants."""
 
     def __init__(self, keys: Keys) -> None:
         self._keys = keys
 
-    def check(self, scope: Scope, path: str) -> None:
-        """Raise UnauthenticatedError or ForbiddenError unless this request may go on.
+    @property
+    def asks_for_keys(self) -> bool:
+        """Whether whoever wants actions needs a key."""
+        return bool(self._keys.keys)
 
-        Without keys everything may but administration, which always needs an admin key, or the operator's.
-        """
-        admin = ADMIN.fullmatch(path) is not None
+    def check(self, presented: bytes | None, access: Access) -> Key | None:
+        """Return the key that opens this, None where it needs none. Raises UnauthenticatedError or ForbiddenError."""
+        if access is Access.open:
+            return None
+        admin = access is not Access.act
         if not self._keys.keys and not (admin and self._keys.operator):
             if admin:
                 raise ForbiddenError(
                     "administration needs an admin key, and this server has none: see 'rlservo key --help'"
                 )
-            return
-        if path in OPEN or path.startswith(OPEN_FOLDER):
-            return
-        presented = _presented(scope["headers"])
+            return None
         if presented is None:
             what = "administration needs an admin" if admin else "this server wants an API"
             raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
@@ -127,27 +156,7 @@ class Guard:
             raise UnauthenticatedError("this API key is not known to the server")
         if admin and key.role is not Role.admin:
             raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key")
-
-
-def check_origin(scope: Scope) -> None:
-    """Raise ForbiddenError for a WebSocket that a web page of another origin opens.
-
-    Browsers let any page open a WebSocket to any address, the robot's own computer included; robots send no origin.
-    """
-    origin = host = None
-    for name, value in scope["headers"]:
-        if name == b"origin":
-            origin = value
-        elif name == b"host":
-            host = value
-    if origin is None:
-        return
-    try:
-        own = urlsplit(origin.decode("latin-1")).netloc.encode("latin-1") == host
-    except ValueError:  # no address at all
-        own = False
-    if not own:
-        raise ForbiddenError(f"a page of {origin[:100].decode('latin-1')} may not open a stream here")
+        return key
 
 
 def new_key(label: str, *, admin: bool = False) -> tuple[str, str]:
@@ -191,14 +200,3 @@ def _read_file(file: Path) -> list[tuple[str, str]]:
         raise UsageError(f"the key file {file} can be written by every user of this machine: chmod o-w {file}")
     stripped = ((number, line.strip()) for number, line in enumerate(lines, start=1))
     return [(f"{file}, line {number}", line) for number, line in stripped if line and not line.startswith("#")]
-
-
-def _presented(headers: list[tuple[bytes, bytes]]) -> bytes | None:
-    for name, value in headers:
-        if name == b"authorization":
-            scheme, _, key = value.partition(b" ")
-            if scheme.lower() in SCHEMES:
-                return key.strip()
-        elif name == b"x-api-key":
-            return value.strip()
-    return None

@@ -19,6 +19,7 @@ FIELDS = "fields"  # where a record carries its fields
 LONGEST_ID = 128
 
 _requests = logging.getLogger(f"{LOGGER}.requests")
+_administration = logging.getLogger(f"{LOGGER}.administration")
 
 
 class JsonFormatter(logging.Formatter):
@@ -102,8 +103,9 @@ class RequestLog:
         request_id: str | None,
         seconds: float | None = None,
         seq: Any = None,
+        peer: str | None = None,
     ) -> None:
-        """Write a request that got none; `seq` is what its client gave as its number on a stream."""
+        """Write a request that got none; `seq` is its client's number on a stream, `peer` its client's address."""
         if not _requests.isEnabledFor(logging.INFO):
             return
         fields: dict[str, Any] = {
@@ -117,9 +119,27 @@ class RequestLog:
             fields["ms"] = round(seconds * 1e3, 3)
         if type(seq) is int:
             fields["seq"] = seq
+        if peer is not None:
+            fields["peer"] = peer
         if self._values:
             fields["error"] = sentence
         _requests.info("refused", extra={FIELDS: fields})
+
+
+def administered(
+    change: str, code: str, *, key: str, peer: str | None, request_id: str | None, generation: int | None = None
+) -> None:
+    """Write a change of what is served, or one that was refused: whose key asked for it, from which address."""
+    fields: dict[str, Any] = {
+        "request_id": _short(request_id),
+        "change": change.strip(),
+        "code": code,
+        "key": key,
+        "peer": peer,
+    }
+    if generation is not None:
+        fields["generation"] = generation
+    _administration.info("changed" if code == "ok" else "refused", extra={FIELDS: fields})
 
 
 def _short(request_id: str | None) -> str | None:

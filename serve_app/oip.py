@@ -13,16 +13,15 @@ Specification: github.com/kserve/open-inference-protocol, and Triton's extension
 
 from __future__ import annotations
 
-import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
 import orjson
-from fastapi import FastAPI, Request
+from fastapi import Depends, FastAPI, Request
 from fastapi.responses import Response
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
@@ -33,17 +32,19 @@ from rlservo.export.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.serve_app import wire
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import (
+    JSON,
     JSON_HEADERS,
     BareRoute,
     Body,
     Endpoint,
     Headers,
+    check_media_type,
     error_models,
-    read_body,
     session_of,
     too_large,
 )
 from rlservo.serve_app.episodes import Episode
+from rlservo.serve_app.keys import Access, grant
 from rlservo.serve_app.listing import states_of
 from rlservo.serve_app.sessions import SessionId
 from rlservo.serve_app.state_names import BELONGS_TO
@@ -51,7 +52,6 @@ from rlservo.serve_app.store import Decision
 from rlservo.serve_app.structure import action_leaves, build_action
 from rlservo.serve_app.tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor
 
-INFER_PATTERN = re.compile(r"/v2/models/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/infer")
 LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
 BINARY = b"application/octet-stream"
 PLATFORM = "onnx_onnxv1"
@@ -138,11 +138,6 @@ class ModelState(BaseModel):
     version: str
     state: str
     reason: str
-
-
-def endpoint(core: Core) -> Endpoint:
-    """Return the endpoint that answers inference requests."""
-    return Endpoint("oip", _Infer(core), _check_headers, core)
 
 
 class _Infer:
@@ -430,7 +425,7 @@ def _options(parameters: Mapping[str, Any]) -> tuple[bool, int | None, int | Non
                 {"known": sorted(PARAMETERS | IGNORED)},
             )
     explore, seed, seq, deadline_ms = wire.read_options(parameters)
-    timeout_us = wire.read_integer(parameters, TIMEOUT)
+    timeout_us = wire.read_finite(parameters, TIMEOUT, "an integer of microseconds", kinds=(int,))
     if deadline_ms is None and timeout_us:
         deadline_ms = timeout_us / 1e3
     return explore, seed, seq, deadline_ms
@@ -486,6 +481,7 @@ def output_names(contract: Contract) -> list[str]:
 
 def _check_headers(headers: list[tuple[bytes, bytes]]) -> None:
     """Triton's client names no content type, others name JSON or octets: the length header is what tells them apart."""
+    check_media_type(headers, JSON, BINARY, optional=True)
     for name, value in headers:
         if name == b"content-encoding" and value.strip().lower() not in (b"identity", b"gzip", b"deflate", b""):
             raise MediaTypeError(
@@ -527,11 +523,17 @@ def _compress(content: bytes, headers: Headers, accepted: bytes) -> tuple[bytes,
     return content, headers
 
 
+async def media_type(request: Request) -> None:
+    """Raise MediaTypeError for what none of the protocol's clients sends: a dependency of routes that FastAPI runs."""
+    check_media_type(request.scope["headers"], JSON, BINARY, optional=True)
+
+
 # What can be asked about the server and its models. FastAPI runs these: nobody asks a thousand times a second.
 
 
-def add_routes(app: FastAPI, core: Core, infer: Endpoint) -> None:
-    """Add /v2 to the application."""
+def add_routes(app: FastAPI, core: Core, add_direct: Callable[[BareRoute], None]) -> None:
+    """Add /v2 to the application; `add_direct` adds what FastAPI only documents."""
+    infer = Endpoint("oip", _Infer(core), _check_headers, core)
     _add_health(app, core)
     _add_models(app, core)
     for path, operation, summary in (
@@ -542,7 +544,7 @@ def add_routes(app: FastAPI, core: Core, infer: Endpoint) -> None:
             "Infer with one version, or with what an alias leads to",
         ),
     ):
-        app.router.routes.append(
+        add_direct(
             BareRoute(
                 path,
                 infer,
@@ -567,13 +569,20 @@ def _request_schema() -> dict[str, Any]:
 
 
 def _add_health(app: FastAPI, core: Core) -> None:
-    @app.get("/v2/health/live", tags=["health"], summary="The process answers (Open Inference Protocol)")
+    @app.get(
+        "/v2/health/live",
+        tags=["health"],
+        summary="The process answers (Open Inference Protocol)",
+        responses=error_models(),
+    )
+    @grant(Access.open)
     async def live() -> Response:
         return _json({"live": True})
 
     @app.get(
         "/v2/health/ready", tags=["health"], summary="The policies are loaded and proven", responses=error_models(503)
     )
+    @grant(Access.open)
     async def ready() -> Response:
         core.store()
         return _json({"ready": True})
@@ -583,11 +592,19 @@ def _add_models(app: FastAPI, core: Core) -> None:
     tags: list[Any] = ["open inference protocol"]
     errors = error_models(404, 503)
 
-    @app.get("/v2", tags=tags, summary="The server and the extensions it speaks", response_model=ServerMetadata)
+    @app.get(
+        "/v2",
+        tags=tags,
+        summary="The server and the extensions it speaks",
+        response_model=ServerMetadata,
+        responses=error_models(),
+    )
+    @grant(Access.act)
     async def server() -> Response:
         return _json(server_metadata())
 
     @app.get("/v2/models/{name}", tags=tags, summary="A model", response_model=ModelMetadata, responses=errors)
+    @grant(Access.act)
     async def model(name: str) -> Response:
         return _json(model_metadata(core, name, None))
 
@@ -598,14 +615,17 @@ def _add_models(app: FastAPI, core: Core) -> None:
         response_model=ModelMetadata,
         responses=errors,
     )
+    @grant(Access.act)
     async def model_version(name: str, version: str) -> Response:
         return _json(model_metadata(core, name, version))
 
     @app.get("/v2/models/{name}/ready", tags=tags, summary="The model is loaded and proven", responses=errors)
+    @grant(Access.act)
     async def model_ready(name: str) -> Response:
         return _json({"name": core.store().get(name).contract.name, "ready": True})
 
     @app.get("/v2/models/{name}/versions/{version}/ready", tags=tags, summary="The version is loaded", responses=errors)
+    @grant(Access.act)
     async def model_version_ready(name: str, version: str) -> Response:
         return _json({"name": core.store().get(name, version).contract.name, "ready": True})
 
@@ -613,12 +633,13 @@ def _add_models(app: FastAPI, core: Core) -> None:
         "/v2/repository/index",
         tags=tags,
         summary="Every version of every model",
+        dependencies=[Depends(media_type)],
         response_model=list[ModelState],
-        responses=error_models(400, 408, 413, 503),
+        responses=error_models(415, 503),
     )
+    @grant(Access.act)
     async def index(request: Request) -> Response:
-        settings = core.settings
-        body = await read_body(request.receive, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+        body = await request.body()
         ready = False
         if body:
             document, _ = wire.read_json(body, such_as='{"ready": true}')

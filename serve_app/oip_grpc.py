@@ -35,6 +35,8 @@ from rlservo.serve_app import oip_messages as messages
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import BUG, RETRY_AFTER_S, status_of
 from rlservo.serve_app.grpc_ingress import Incoming
+from rlservo.serve_app.keys import Access
+from rlservo.serve_app.request_checks import presented_key
 from rlservo.serve_app.tensors import DTYPES, MAX_AXES, datatype_of, from_bytes
 
 logger = logging.getLogger(__name__)
@@ -54,17 +56,7 @@ CODES = {
     422: grpc.StatusCode.INVALID_ARGUMENT,
     503: grpc.StatusCode.UNAVAILABLE,
 }
-# What the guard knows a method as: the key that opens a path over HTTP opens its method here.
-PATHS = {
-    "ServerLive": "/v2/health/live",
-    "ServerReady": "/v2/health/ready",
-    "ServerMetadata": "/v2",
-    "ModelReady": "/v2/models",
-    "ModelMetadata": "/v2/models",
-    "ModelInfer": "/v2/models",
-    "ModelStreamInfer": "/v2/models",
-    "RepositoryIndex": "/v2/repository/index",
-}
+OPEN = frozenset({"ServerLive", "ServerReady"})  # what orchestrators probe; every other method wants the keys' `act`
 # The field of InferTensorContents that holds a datatype; FP16 has none and comes raw.
 FIELDS = {
     "BOOL": "bool_contents",
@@ -188,9 +180,9 @@ class Grpc:
         headers = [(name.encode(), _bytes(value)) for name, value in metadata]
         given = {name: value for name, value in metadata if type(value) is str}
         try:
-            self._core.guard.check({"headers": headers}, PATHS[method])
+            self._core.guard.check(presented_key(headers), Access.open if method in OPEN else Access.act)
         except RlservoError as error:
-            self._core.kept_out(PROTOCOL, error, given.get(REQUEST_ID))
+            self._core.kept_out(PROTOCOL, error, given.get(REQUEST_ID), peer=_caller(context.peer(), metadata))
             raise
         return given.get(REQUEST_ID), given.get(SESSION)
 
@@ -403,6 +395,12 @@ def is_local(peer: str) -> bool:
         return False
     mapped = getattr(host, "ipv4_mapped", None)
     return host.is_loopback if mapped is None else bool(mapped.is_loopback)
+
+
+def _caller(peer: str, metadata: Any) -> str:
+    """Return where a call came from: what HAProxy says, which is on this machine and adds its word last."""
+    forwarded = [value for name, value in metadata if name == "x-forwarded-for" and type(value) is str]
+    return forwarded[-1].rpartition(",")[2].strip() if forwarded and is_local(peer) else peer
 
 
 def _bytes(value: str | bytes) -> bytes:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -65,6 +66,11 @@ class ServerSettings(BaseModel):
     allow_unauthenticated: bool = False
     """Listen beyond this machine without any key: whoever reaches the port can ask for actions."""
 
+    allowed_hosts: str = ""
+    """Names, separated by commas, by which requests may call this server beside `localhost`, the address listened on
+    and, beyond this machine, every address and the machine's own name; `*` is any. A server beyond this machine with
+    API keys takes any name unless some are given here: a web page whose name leads to it has no key."""
+
     default_policy: str | None = None
     """The policy of a WebSocket at `/`, where openpi's clients connect; the only one, where there is one."""
 
@@ -103,6 +109,14 @@ class ServerSettings(BaseModel):
     def _absolute(cls, value: str | None) -> str | None:
         """A replica's working directory is not the caller's."""
         return None if value is None else str(Path(value).expanduser().absolute())
+
+    @field_validator("allowed_hosts")
+    @classmethod
+    def _names(cls, value: str) -> str:
+        for name in value.split(","):
+            if re.fullmatch(r"\s*(\*|\[?[A-Za-z0-9._:-]+\]?)?\s*", name) is None:
+                raise ValueError(f"expected names without scheme or path, such as robot-7.local, got {name[:80]!r}")
+        return value
 
     @field_validator("policy_options", mode="before")
     @classmethod

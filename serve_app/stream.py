@@ -19,7 +19,6 @@ import asyncio
 import contextlib
 import json
 import logging
-import re
 import secrets
 import sys
 import time
@@ -27,6 +26,7 @@ from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
+from starlette.routing import WebSocketRoute
 from starlette.types import Message, Receive, Scope, Send
 
 from rlservo.export.bundle import Contract, DictSpec
@@ -36,14 +36,14 @@ from rlservo.serve_app.admission import IdleTimer
 from rlservo.serve_app.arrays import pack, unpack
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import encode_bug, error_answer, request_id, session_of
-from rlservo.serve_app.keys import check_origin
+from rlservo.serve_app.keys import Access
 from rlservo.serve_app.logs import FIELDS
 from rlservo.serve_app.sessions import Session
 from rlservo.serve_app.store import Decision
 
 logger = logging.getLogger(__name__)
 
-STREAM_PATTERN = re.compile(r"/(?:v1/policies/(?P<name>[^/]+)(?:/versions/(?P<version>[^/]+))?/stream)?")
+STREAM_PATHS = ("/", "/v1/policies/{name}/stream", "/v1/policies/{name}/versions/{version}/stream")
 GOING_AWAY = 1001
 FAILED = 1011  # the close code openpi's server uses for every error
 KEEP = b"errors=keep"
@@ -68,6 +68,12 @@ class _Conversation:
     seq: Any = None  # as the client gave it
 
 
+class StreamRoute(WebSocketRoute):
+    """A path of streams; its `app` is a bare ASGI callable."""
+
+    access = Access.act
+
+
 class Stream:
     """Answers WebSocket connections."""
 
@@ -80,8 +86,7 @@ class Stream:
         name = ""
         version: str | None = None
         try:
-            check_origin(scope)
-            name, version = self._addressed(scope["path"].removeprefix(scope.get("root_path", "")))
+            name, version = self._addressed(scope["path_params"])
             # All requests of a stream get the same version where a canary runs.
             label = session_of(scope) or secrets.token_hex(8)
             policy = self._core.store().choose(name, version, label)
@@ -229,13 +234,10 @@ class Stream:
             reply.update(wire.clock(timestamp, received))
         return reply, decision
 
-    def _addressed(self, path: str) -> tuple[str, str | None]:
-        """Return (policy, version) that a path means; `/` is the default policy."""
-        match = STREAM_PATTERN.fullmatch(path)
-        if match is None:
-            raise UnknownPolicyError(f"no stream is at {path[:200]}: connect to /v1/policies/NAME/stream")
-        if match["name"] is not None:
-            return match["name"], match["version"]
+    def _addressed(self, params: Mapping[str, str]) -> tuple[str, str | None]:
+        """Return (policy, version) that a path's parameters name; without any it is the default policy."""
+        if "name" in params:
+            return params["name"], params.get("version")
         names = self._core.store().names
         default = self._core.settings.default_policy or (names[0] if len(names) == 1 else None)
         if default is None:

@@ -7,6 +7,7 @@ It knows nothing of HTTP and nothing of policies.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
@@ -233,7 +234,7 @@ def read_options(document: Mapping[str, Any]) -> tuple[bool, int | None, int | N
         raise RequestError(f"'explore' must be true or false, got {json_type(explore)}")
     seed = read_integer(document, "seed")
     if seed is not None and not 0 <= seed <= MAX_SEED:
-        raise RequestError(f"'seed' must be in 0..{MAX_SEED}, got {seed}")
+        raise RequestError(f"'seed' must be in 0..{MAX_SEED}, got {json_type(seed)}")
     return bool(explore), seed, read_integer(document, "seq"), read_deadline(document)
 
 
@@ -257,12 +258,7 @@ def read_episode(document: Mapping[str, Any]) -> Episode | None:
 
 def read_timestamp(document: Mapping[str, Any]) -> float | None:
     """Return the optional field `timestamp`. Raises RequestError when it is not a finite number."""
-    value = document.get("timestamp")
-    if value is None:
-        return None
-    if type(value) not in (int, float) or not math.isfinite(value):
-        raise RequestError(f"'timestamp' must be a number of seconds, got {json_type(value)}")
-    return float(value)
+    return read_finite(document, "timestamp", "a number of seconds")
 
 
 def read_integer(document: Mapping[str, Any], name: str) -> int | None:
@@ -275,12 +271,22 @@ def read_integer(document: Mapping[str, Any], name: str) -> int | None:
 
 def read_deadline(document: Mapping[str, Any]) -> float | None:
     """Return the optional field `deadline_ms`. Raises RequestError when it is not a finite number."""
-    value = document.get("deadline_ms")
+    return read_finite(document, "deadline_ms", "a number of milliseconds")
+
+
+def read_finite(
+    document: Mapping[str, Any], name: str, expected: str, *, kinds: tuple[type, ...] = (int, float)
+) -> float | None:
+    """Return an optional field as a float. Raises RequestError when it is something else, or no float can hold it."""
+    value = document.get(name)
     if value is None:
         return None
-    if type(value) not in (int, float) or not math.isfinite(value):
-        raise RequestError(f"'deadline_ms' must be a number of milliseconds, got {json_type(value)}")
-    return float(value)
+    if type(value) in kinds:
+        with contextlib.suppress(OverflowError):  # JSON's integers have no end
+            number = float(value)
+            if math.isfinite(number):
+                return number
+    raise RequestError(f"'{name}' must be {expected}, got {json_type(value)}")
 
 
 def json_type(value: Any) -> str:

@@ -5,6 +5,7 @@ They are written with `onnx.helper` and `rlservo.export.bundle` alone, so that t
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import secrets
@@ -44,8 +45,10 @@ from rlservo.export.bundle import (
     StateSpec,
     TensorSpec,
 )
+from rlservo.serve_app.control import Control
 from rlservo.serve_app.keys import new_key
 from rlservo.serve_app.launcher import serve_policies
+from rlservo.serve_app.library import Library, Repository
 from rlservo.serve_app.processes import free_ports
 
 OBS = 27
@@ -381,6 +384,38 @@ def over_uvicorn(app: Any) -> Iterator[int]:
 def served() -> Callable[[Any], AbstractContextManager[int]]:
     """`over_uvicorn`."""
     return over_uvicorn
+
+
+class MemoryLedger:
+    """The plans of one process, without Ray."""
+
+    def __init__(self) -> None:
+        self.plans: dict[int, bytes] = {}
+
+    def newest(self) -> int:
+        return max(self.plans, default=0)
+
+    def read(self, generation: int) -> bytes | None:
+        return self.plans.get(generation)
+
+    def append(self, generation: int, content: bytes) -> bool:
+        return self.plans.setdefault(generation, content) is content
+
+
+@pytest.fixture(scope="session")
+def controlled() -> Callable[..., AbstractContextManager[Control]]:
+    """Control over what is served of some folders, for an application that can be administered."""
+
+    @contextlib.contextmanager
+    def control_of(*folders: Path, config: Any = None) -> Iterator[Control]:
+        control = Control(Library(Repository(list(folders))), MemoryLedger(), replica="only")
+        try:
+            asyncio.run(control.configure({} if config is None else config))
+            yield control
+        finally:
+            control.close()
+
+    return control_of
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,10 @@ def serve(policies: Path, served: Callable[[Any], AbstractContextManager[int]]) 
 
 
 def request(body: bytes, *, path: str = "/v1/policies/ur5/act") -> bytes:
-    head = f"POST {path} HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\ncontent-length: {len(body)}\r\n\r\n"
+    head = (
+        f"POST {path} HTTP/1.1\r\nhost: 127.0.0.1\r\n"
+        f"content-type: application/json\r\ncontent-length: {len(body)}\r\n\r\n"
+    )
     return head.encode() + body
 
 
@@ -125,7 +128,7 @@ def test_more_half_sent_requests_than_allowed_are_refused_and_whole_ones_still_s
 def test_health_is_told_when_there_is_too_much_to_do(serve: Serve) -> None:
     with serve(max_ongoing_requests=1) as port, connections(port, 2) as (busy, health):
         busy.sendall(ask(OBS))
-        health.sendall(b"GET /v2/health/ready HTTP/1.1\r\nhost: x\r\n\r\n")
+        health.sendall(b"GET /v2/health/ready HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n")
         assert answer(health)[0] == 200
         assert answer(busy)[0] == 200
 

@@ -20,7 +20,10 @@ from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
 
 TIME_S = 0.3
-HEAD = b"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\ncontent-length: %d\r\n\r\n"
+HEAD = (
+    b"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: 127.0.0.1\r\n"
+    b"content-type: application/json\r\ncontent-length: %d\r\n\r\n"
+)
 BODY = json.dumps({"obs": [0.1] * 27}).encode()
 
 

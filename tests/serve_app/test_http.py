@@ -26,6 +26,10 @@ from rlservo.serve_app.store import PolicyStore
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
 JSON = {"content-type": "application/json"}
+HALF_SENT = (
+    b"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: 127.0.0.1\r\n"
+    b'content-type: application/json\r\ncontent-length: 1000\r\n\r\n{"obs": ['
+)
 SETTINGS = ServerSettings(max_body_bytes=200_000, max_batch=64, body_timeout_s=1.0)
 Ask = Callable[..., tuple[int, dict[str, str], Any]]
 
@@ -165,7 +169,8 @@ def test_unknown_names_versions_paths_and_methods(ask: Ask) -> None:
     cases = [
         ("POST", "/v1/policies/ur6/act", 404, "unknown-policy", "this server has gridworld, unsafe, ur5"),
         ("POST", "/v1/policies/ur5/versions/9/act", 404, "unknown-version", "loaded are 1, 2, 10"),
-        ("POST", "/v1/policies/..%2f..%2fetc/act", 404, "not-found", "nothing is at"),
+        ("POST", "/v1/policies/..%2f..%2fetc/act", 400, "bad-request", "without percent-encoding"),
+        ("POST", "/v1/policies/ur5/act/", 404, "not-found", "nothing is at"),
         ("GET", "/v1/policies/ur6", 404, "unknown-policy", "this server has"),
         ("GET", "/v1/policies/ur5/versions/9", 404, "unknown-version", "loaded are"),
         ("GET", "/nowhere", 404, "not-found", "policies are under /v1/policies"),
@@ -199,7 +204,7 @@ def test_an_unsafe_action_stays_on_the_server(ask: Ask) -> None:
 
 def test_a_body_that_never_arrives_is_answered_in_time(port: int) -> None:
     with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
-        client.sendall(b'POST /v1/policies/ur5/act HTTP/1.1\r\nhost: x\r\ncontent-length: 1000\r\n\r\n{"obs": [')
+        client.sendall(HALF_SENT)
         started = time.monotonic()
         reply = client.recv(65536)
     assert reply.startswith(b"HTTP/1.1 408") and b"did not arrive within 1 s" in reply
@@ -209,7 +214,7 @@ def test_a_body_that_never_arrives_is_answered_in_time(port: int) -> None:
 def test_a_client_that_hangs_up_halfway_does_no_harm(port: int, ask: Ask) -> None:
     for _ in range(5):
         with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
-            client.sendall(b'POST /v1/policies/ur5/act HTTP/1.1\r\nhost: x\r\ncontent-length: 1000\r\n\r\n{"obs": [')
+            client.sendall(HALF_SENT)
     assert act(ask, {"obs": OBS})[0] == 200
 
 

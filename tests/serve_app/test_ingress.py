@@ -121,10 +121,10 @@ def test_everything_else_is_left_to_serve_and_marked_as_not_to_be_watched(app: A
             ("GET", "/healthz", 200),
             ("GET", "/v1/policies", 200),
             ("GET", ACT, 405),
-            ("POST", "/v1/policies/ur5/act/", 307),
+            ("POST", "/v1/policies/ur5/act/", 404),
             ("POST", "/robots" + ACT, 404),
             ("POST", "/v1/policies/a/b/act", 404),
-            ("POST", "//v1/policies/ur5/act", 404),
+            ("POST", "//v1/policies/ur5/act", 400),
         ):
             assert (await ask(ingress, path, method=method))[0] == status
         assert len(serve.seen) == 7

@@ -16,6 +16,7 @@ import websockets.sync.client
 from websockets.exceptions import InvalidStatus
 
 from rlservo.export.errors import UsageError
+from rlservo.serve_app.control import Control
 from rlservo.serve_app.http import create_app
 from rlservo.serve_app.keys import Keys, Role, check_exposure, is_loopback, new_key
 from rlservo.serve_app.settings import ServerSettings
@@ -159,14 +160,19 @@ def test_probes_and_documentation_need_no_key(port: int) -> None:
 
 
 def test_administration_wants_an_admin_key_even_where_no_key_is_asked_for(
-    port: int, store: PolicyStore, served: Serve
+    ur5: Path, controlled: Callable[..., AbstractContextManager[Control]], served: Serve
 ) -> None:
-    status, _, reply = call(port, *LOAD, authorization=f"Bearer {CELL}")
-    assert (status, reply["code"]) == (403, "forbidden") and "'cell-7'" in reply["error"]
-    with served(create_app(lambda: store, ServerSettings())) as open_port:
-        assert call(open_port, *ACT)[0] == 200
-        status, _, reply = call(open_port, *LOAD)
-        assert status == 403 and "this server has none" in reply["error"]
+    with controlled(ur5) as control:
+        lines = f"{CELL_LINE},{ADMIN_LINE}"
+        with served(create_app(lambda: control.store, ServerSettings(api_keys=lines), control=control)) as port:
+            status, _, reply = call(port, *LOAD, authorization=f"Bearer {CELL}")
+            assert (status, reply["code"]) == (403, "forbidden") and "'cell-7'" in reply["error"]
+            assert call(port, *LOAD)[0] == call(port, *LOAD, authorization="Bearer wrong")[0] == 401
+            assert call(port, *LOAD, authorization=f"Bearer {ADMIN}")[0] in (200, 409)
+        with served(create_app(lambda: control.store, ServerSettings(), control=control)) as open_port:
+            assert call(open_port, *ACT)[0] == 200
+            status, _, reply = call(open_port, *LOAD)
+            assert status == 403 and "this server has none" in reply["error"]
 
 
 def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served: Serve) -> None:

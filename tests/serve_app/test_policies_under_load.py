@@ -383,7 +383,7 @@ def half_sent(cluster: Cluster) -> Iterator[Callable[[], list[int]]]:
     ports = {int(port) for port in re.findall(r"server SERVE_REPLICA\S+ [\d.]+:(\d+)", backend)}
     body = json.dumps({"obs": OBS}).encode()
     head = (
-        f"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {KEY}\r\n"
+        f"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: 127.0.0.1\r\nauthorization: Bearer {KEY}\r\n"
         f"content-type: application/json\r\ncontent-length: {len(body)}\r\n\r\n"
     ).encode()
     with contextlib.ExitStack() as stack:

@@ -135,7 +135,8 @@ def test_http_bodies(live_server: Any) -> None:
 def test_what_is_not_http_at_all(live_server: Any) -> None:
     rng = random.Random(SEED)
     good = (
-        b"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\ncontent-length: 9\r\n\r\n"
+        b"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: 127.0.0.1\r\n"
+        b"content-type: application/json\r\ncontent-length: 9\r\n\r\n"
     )
     with contextlib.ExitStack() as stack:
         clients = []
@@ -188,7 +189,7 @@ def test_broken_websocket_frames_end_their_connection_only(live_server: Any) -> 
     for _ in range(int(20 * TIMES)):
         with socket.create_connection(("127.0.0.1", live_server.port), timeout=SLOWEST_S) as client:
             client.sendall(
-                b"GET / HTTP/1.1\r\nhost: x\r\nupgrade: websocket\r\nconnection: upgrade\r\n"
+                b"GET / HTTP/1.1\r\nhost: 127.0.0.1\r\nupgrade: websocket\r\nconnection: upgrade\r\n"
                 b"sec-websocket-version: 13\r\nsec-websocket-key: AAAAAAAAAAAAAAAAAAAAAA==\r\nauthorization: "
                 + live_server.bearer.encode()
                 + b"\r\n\r\n"
