@@ -17,7 +17,6 @@ import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.types import Scope
 
+import rlservo
 from rlservo.export.bundle import Contract, TensorSpec
 from rlservo.export.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.serve_app import wire
@@ -632,7 +632,7 @@ def _add_models(app: FastAPI, core: Core) -> None:
 
 def server_metadata() -> dict[str, Any]:
     """Return who this is, and the extensions it speaks."""
-    return {"name": "rlservo", "version": _version(), "extensions": EXTENSIONS}
+    return {"name": "rlservo", "version": rlservo.__version__, "extensions": EXTENSIONS}
 
 
 def repository_index(core: Core, *, ready: bool = False) -> list[dict[str, str]]:
@@ -663,13 +663,6 @@ def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]
         "inputs": [described(tensor) for tensor in inputs],
         "outputs": [described(tensor) for tensor in contract.outputs if tensor.name in output_names(contract)],
     }
-
-
-def _version() -> str:
-    try:
-        return version("rlservo")
-    except PackageNotFoundError:  # run from a checkout that was never installed
-        return "0"
 
 
 def _json(document: Any) -> Response:
