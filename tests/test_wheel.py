@@ -70,7 +70,8 @@ def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -
     assert loaded.returncode == 0, loaded.stderr
     missing = run(str(python), "-c", "from rlservo import PolicyClient")
     assert "rlservo.PolicyClient needs the Python package 'httpx': pip install 'rlservo[client]'" in missing.stderr
-    started = run(str(python), "-c", "import sys; print(*sorted(n for n in sys.modules if 'rlservo' in n), 'typing' in sys.modules)")
+    program = "import sys; print(*sorted(name for name in sys.modules if 'rlservo' in name), 'typing' in sys.modules)"
+    started = run(str(python), "-c", program)
     assert started.stdout.split() == ["rlservo", "rlservo.envs", "rlservo.envs.discovery", "False"]
     rlservo = str(tmp_path / "env" / "bin" / "rlservo")
     assert run(rlservo, "--version").stdout.startswith("rlservo ")
