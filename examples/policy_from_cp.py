@@ -91,8 +91,8 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
     from rlservo.export.restore import restore
     from rlservo.export.unpickle import user_code
 
-    with user_code(app_dir):
-        restored = restore(locate_checkpoint(path, None), print)
+    with user_code(app_dir) as folder:
+        restored = restore(locate_checkpoint(path, None), folder, print)
     recipe = restored.recipe
     for side, ours, theirs in (
         ("observation", recipe.observation_space, env.observation_space),

@@ -17,11 +17,10 @@ from gymnasium.spaces import Box, MultiDiscrete
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from rlservo.export.bundle import REWARD
 from rlservo.export.observing import ObservationNode, observation_nodes
 from rlservo.export.recipe import Recipe, leaf_transform, parameter_count
 from rlservo.export.trees import Tree, build, map_tree, named_leaves
-
-REWARD = "reward"
 
 
 class TracedNetwork(Protocol):

@@ -39,6 +39,8 @@ SUMS_FILE = "SHA256SUMS"
 CONTRACT_KEY = "rlservo.contract"
 """Where the graph's own metadata repeat the contract."""
 
+REWARD = "reward"  # the graph's input for what the last action brought, of a policy that was trained to see it
+
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
 

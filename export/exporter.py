@@ -151,7 +151,7 @@ def _export(
     check_names(order.name, order.version)
     root = found[0].root
     order.notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else root))
-    with user_code(app_dir), contextlib.ExitStack() as folders:
+    with user_code(app_dir) as folder, contextlib.ExitStack() as folders:
         order.progress("reading the checkpoint")
         facts = read_facts(root, order.notify)
         base = order.name or default_name(facts.env_id, root)
@@ -165,7 +165,7 @@ def _export(
             if any(result.path == target for _, result in written):
                 raise UsageError(f"two modules would both be written to {target}: export them one by one, with --name")
             try:
-                written.append(_build(files, facts, target, order, folders))
+                written.append(_build(files, facts, folder, target, order, folders))
             except CheckpointError as error:
                 if not name_all or "agents" not in error.details:
                     raise
@@ -188,11 +188,11 @@ def _publish(written: Sequence[tuple[Path, ExportResult]]) -> None:
 
 
 def _build(
-    files: Files, facts: CheckpointFacts, target: Path, order: _Order, folders: contextlib.ExitStack
+    files: Files, facts: CheckpointFacts, app_dir: Path, target: Path, order: _Order, folders: contextlib.ExitStack
 ) -> tuple[Path, ExportResult]:
     """Return the finished bundle in a folder that only wants its name."""
     order.progress(f"restoring '{files.module_id}' (importing torch and RLlib takes seconds)")
-    restored = _load(files, order.notify, order.value)
+    restored = _load(files, app_dir, order.notify, order.value)
     for warning in loose_bounds(restored.recipe):
         order.notify(warning)
     elements = read_elements(facts.env_id, facts.env_config, restored.recipe, order.notify)
@@ -222,11 +222,11 @@ def _build(
     return folder, ExportResult(target, contract)
 
 
-def _load(files: Files, notify: Callable[[str], None], value: bool) -> Restored:
+def _load(files: Files, app_dir: Path, notify: Callable[[str], None], value: bool) -> Restored:
     # Here and not at the top: torch and RLlib take seconds to import, and a wrong path should not have to wait for it.
     from rlservo.export.restore import restore
 
-    return restore(files, notify, value=value)
+    return restore(files, app_dir, notify, value=value)
 
 
 @contextlib.contextmanager

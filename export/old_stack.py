@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ from rlservo.export.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.samples import Inputs
 from rlservo.export.steps import surprises
 from rlservo.export.trees import build, named_leaves, space_leaves, tree_leaves
-from rlservo.export.unpickle import explain, unpickle, user_folder
+from rlservo.export.unpickle import explain, unpickle
 
 DISTRIBUTIONS: dict[type, DistributionKind] = {
     TorchDiagGaussian: "diag_gaussian",
@@ -177,12 +178,14 @@ class OldStackCheckpoint:
         return OldStackLoop(self._policy, self.recipe, self.network.names)
 
 
-def load_old_stack(files: OldStackFiles, notify: Callable[[str], None], *, value: bool = True) -> OldStackCheckpoint:
-    """Restore one policy; `value` False leaves the value head out.
+def load_old_stack(
+    files: OldStackFiles, app_dir: Path, notify: Callable[[str], None], *, value: bool = True
+) -> OldStackCheckpoint:
+    """Restore one policy; the user's own classes are in `app_dir`. `value` False leaves the value head out.
 
     Raises CheckpointError when it cannot be read, UnsupportedError when exporting it would lose something.
     """
-    policy = _restore(files)
+    policy = _restore(files, app_dir)
     _check_policy(files, policy)
     action_space = policy.action_space
     observation_space = getattr(policy.observation_space, "original_space", policy.observation_space)
@@ -197,7 +200,7 @@ def load_old_stack(files: OldStackFiles, notify: Callable[[str], None], *, value
     if value and _has_value(policy, notify):
         names = (*names, "value")
     # A second policy to trace: a model keeps tensors of its last forward pass, which the reference needs for itself.
-    traced = _restore(files)
+    traced = _restore(files, app_dir)
     _prepare(traced)
     replace_bias_layers(traced.model)
     model = type(policy.model)
@@ -214,7 +217,7 @@ def _network_state(policy: Any) -> tuple[StateLeaf, ...]:
     return tuple(StateLeaf(name, one) for name, one in zip(names if initial else (), initial, strict=True))
 
 
-def _restore(files: OldStackFiles) -> Any:
+def _restore(files: OldStackFiles, app_dir: Path) -> Any:
     """Return the policy, as `Policy.from_checkpoint` would, but always on the CPU and without its optimizer."""
     state = unpickle(files.state)
     if not isinstance(state, dict) or not isinstance(state.get("policy_spec"), dict) or "weights" not in state:
@@ -225,7 +228,7 @@ def _restore(files: OldStackFiles) -> Any:
     _check_config(files, state["policy_spec"].get("policy_class"), config)
     check_connectors(state)
     for part in ("model", "policy_model_config", "q_model_config"):  # the last two are SAC's
-        register_custom_parts(config.get(part) or {}, user_folder())
+        register_custom_parts(config.get(part) or {}, app_dir)
     config.update({"num_gpus": 0, "num_gpus_per_env_runner": 0})
     state.pop("_optimizer_variables", None)
     chatty = logging.getLogger("ray._common.deprecation")

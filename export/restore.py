@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
@@ -52,8 +53,10 @@ class Restored(Protocol):
         ...
 
 
-def restore(files: CheckpointFiles | OldStackFiles, notify: Callable[[str], None], *, value: bool = True) -> Restored:
-    """Restore one policy; `value` False leaves the value head out.
+def restore(
+    files: CheckpointFiles | OldStackFiles, app_dir: Path, notify: Callable[[str], None], *, value: bool = True
+) -> Restored:
+    """Restore one policy; the user's own classes are in `app_dir`. `value` False leaves the value head out.
 
     Raises CheckpointError when it cannot be read, UnsupportedError when exporting it would lose something.
     """
@@ -61,7 +64,7 @@ def restore(files: CheckpointFiles | OldStackFiles, notify: Callable[[str], None
     if isinstance(files, OldStackFiles):
         from rlservo.export.old_stack import load_old_stack
 
-        return load_old_stack(files, notify, value=value)
+        return load_old_stack(files, app_dir, notify, value=value)
     from rlservo.export.checkpoint import load_checkpoint
 
     return load_checkpoint(files, notify, value=value)

@@ -18,22 +18,20 @@ TRUNCATED = "the file is truncated or damaged ({})"
 
 
 @contextmanager
-def user_code(app_dir: str | Path) -> Iterator[None]:
-    """Let the checkpoint import the user's own modules from `app_dir`, before anything else of that name."""
+def user_code(app_dir: str | Path) -> Iterator[Path]:
+    """Let the checkpoint import the user's own modules from `app_dir`, before anything else of that name.
+
+    Gives the folder's absolute path. Raises UsageError where it is not a folder.
+    """
     folder = str(Path(app_dir).expanduser().absolute())
     if not Path(folder).is_dir():
         raise UsageError(f"{folder} is not a folder: expected the one that holds your own classes (--app-dir)")
     sys.path.insert(0, folder)
     try:
-        yield
+        yield Path(folder)
     finally:
         if folder in sys.path:  # imported code may have changed the path itself
             sys.path.remove(folder)
-
-
-def user_folder() -> Path:
-    """Return the folder that `user_code` let the checkpoint import from."""
-    return Path(sys.path[0] or ".")
 
 
 def unpickle(file: Path) -> Any:

@@ -82,11 +82,11 @@ def _verify(
     if not same:
         notify("the bundle was exported from another checkpoint: expect a difference")
     progress("importing torch and RLlib")
-    with user_code(app_dir), one_thread():
+    with user_code(app_dir) as folder, one_thread():
         from rlservo.export.restore import restore
 
         has_value = any(output.name == "value" for output in loaded.contract.outputs)
-        restored = restore(files, notify, value=has_value)
+        restored = restore(files, folder, notify, value=has_value)
         _check_spaces(loaded.contract, restored.recipe)
         formats = _formats(loaded)
         labels = [element.name for element in loaded.contract.action_space.elements]

@@ -14,10 +14,7 @@ from typing import Any
 from rlservo.export.errors import RequestError
 from rlservo.serve_app.memory import State
 from rlservo.serve_app.policy import Policy, Step
-
-MARK = "@"  # begins the names of what is no array of the graph
-BELONGS_TO = "@policy"  # `<name>/<version>#<the graph's hash>`: `Policy.identity`
-LAST_ACTION = "@last_action"
+from rlservo.serve_app.state_names import BELONGS_TO, LAST_ACTION, MARK
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,11 +31,11 @@ from rlservo.export.errors import (
     UsageError,
 )
 from rlservo.serve_app.acting import Observation
+from rlservo.serve_app.state_names import MARK
 from rlservo.serve_app.structure import build_action
 from rlservo.serve_app.transport import Transport, encode
 
 POLL_S = 0.1  # between two looks at a server that is starting
-MARK = "@"  # begins the names in a state that are none of the contract's: they are sent back as they came
 
 
 class PolicyClient:

@@ -351,7 +351,7 @@ class Control:
         for policy in policies:
             self._served.setdefault(policy.contract.name, set()).add(policy.identity)
         changed = [name for name, identities in self._served.items() if len(identities) > 1]
-        self.store = PolicyStore(policies, serving, changed=changed)
+        self.store = PolicyStore(policies, serving, changed=changed, replaces=self.store)
         self.plan, self._serving, self._failed, self._behind = plan, serving, failed, tuple(behind)
         if behind:
             logger.error("generation %d cannot be served as it should: %s", plan.generation, "; ".join(behind))

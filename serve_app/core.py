@@ -18,7 +18,6 @@ from rlservo.export.errors import DeadlineError, RlservoError, TooLargeError, Un
 from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.control import Control
 from rlservo.serve_app.episodes import Episode, Episodes
-from rlservo.serve_app.gauges import batches, drift, queue, sessions
 from rlservo.serve_app.keys import Guard, Keys
 from rlservo.serve_app.logs import RequestLog
 from rlservo.serve_app.metrics import Metrics
@@ -55,13 +54,7 @@ class Core:
         self.settings = settings
         self.guard = Guard(Keys.from_settings(settings))
         self.metrics = Metrics(replica)
-        self.metrics.sources += [
-            partial(queue, self, replica),
-            partial(batches, self, replica),
-            partial(drift, self, replica),
-            partial(sessions, self, replica),
-            partial(self.shadows.families, replica),
-        ]
+        self.metrics.sources.append(partial(self.shadows.families, replica))
         self.log = RequestLog(settings)
         self.admission = Admission(
             max_queued=settings.max_ongoing_requests,

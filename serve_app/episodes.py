@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rlservo.export.errors import RequestError, SessionError, SessionLostError
-from rlservo.serve_app.carried import BELONGS_TO, NOTHING, Carried, carry
+from rlservo.serve_app.carried import NOTHING, Carried, carry
 from rlservo.serve_app.policy import Policy, Step
 from rlservo.serve_app.sessions import Session, SessionId, Sessions, shown
+from rlservo.serve_app.state_names import BELONGS_TO
 from rlservo.serve_app.store import (
     NEEDS,
     NEEDS_LAST,

@@ -6,18 +6,22 @@ families.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 
-if TYPE_CHECKING:
-    from rlservo.serve_app.core import Core
+from rlservo.serve_app.core import Core
 
 MAX_ELEMENTS = 128  # an image's pixels are no series each: only the largest is told
 LARGEST = "largest"
+
+
+def gauges_of(core: Core) -> list[Callable[[], Iterator[Metric]]]:
+    """Return the gauges of a core, for its `metrics.sources`."""
+    return [partial(families, core, core.replica) for families in (queue, batches, drift, sessions)]
 
 
 def queue(core: Core, replica: str) -> Iterator[Metric]:
@@ -47,9 +51,10 @@ def batches(core: Core, replica: str) -> Iterator[Metric]:
         "rlservo_micro_batch_observations", "Single observations computed in those runs", labels=labels
     )
     for name, version, policy in core.policies():
-        if policy.batcher is not None:
-            runs.add_metric([replica, name, version], policy.batcher.runs)
-            observations.add_metric([replica, name, version], policy.batcher.observations)
+        batcher = core.store().batcher_of(policy)
+        if batcher is not None:
+            runs.add_metric([replica, name, version], batcher.runs)
+            observations.add_metric([replica, name, version], batcher.observations)
     yield from (runs, observations)
 
 

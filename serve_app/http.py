@@ -25,6 +25,7 @@ from rlservo.serve_app.control import Control
 from rlservo.serve_app.core import Core, StoreProvider
 from rlservo.serve_app.docs import add_docs
 from rlservo.serve_app.edge import JSON, JSON_HEADERS, BareRoute, Body, Endpoint, Headers
+from rlservo.serve_app.gauges import gauges_of
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import Decision
 from rlservo.serve_app.stream import STREAM_PATTERN, Stream, refuse
@@ -49,6 +50,7 @@ def create_app(
     application's `state.core`. Raises UsageError when the API keys that `settings` name cannot be read.
     """
     core = Core(store_provider, settings, replica=replica, control=control, alone=alone)
+    core.metrics.sources += gauges_of(core)
     act = Endpoint("json", _Act(core), _check_headers, core)
     infer = oip.endpoint(core)
     app = PolicyApp(

@@ -12,10 +12,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.export.bundle import Contract, DiscreteSpec, StateSpec
+from rlservo.export.bundle import REWARD, Contract, DiscreteSpec, StateSpec
 from rlservo.export.errors import RequestError
 
-REWARD = "reward"
 State: TypeAlias = dict[str, NDArray[Any]]
 """Arrays `[batch, *shape]` by state name."""
 

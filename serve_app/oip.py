@@ -28,10 +28,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.types import Scope
 
 import rlservo
-from rlservo.export.bundle import Contract, TensorSpec
+from rlservo.export.bundle import REWARD, Contract, TensorSpec
 from rlservo.export.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.serve_app import wire
-from rlservo.serve_app.carried import BELONGS_TO
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import (
     JSON_HEADERS,
@@ -46,8 +45,8 @@ from rlservo.serve_app.edge import (
 )
 from rlservo.serve_app.episodes import Episode
 from rlservo.serve_app.listing import states_of
-from rlservo.serve_app.memory import REWARD
 from rlservo.serve_app.sessions import SessionId
+from rlservo.serve_app.state_names import BELONGS_TO
 from rlservo.serve_app.store import Decision
 from rlservo.serve_app.structure import action_leaves, build_action
 from rlservo.serve_app.tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor

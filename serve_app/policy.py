@@ -24,6 +24,7 @@ from rlservo.export.bundle import (
     CONTRACT_FILE,
     CONTRACT_KEY,
     GOLDEN_FILE,
+    REWARD,
     BoxSpec,
     Bundle,
     Contract,
@@ -47,12 +48,11 @@ from rlservo.export.errors import (
 from rlservo.export.scores import split_scores
 from rlservo.export.session import open_session
 from rlservo.serve_app.acting import Observation
-from rlservo.serve_app.batching import Batcher, Tensors
 from rlservo.serve_app.drift import Drift
 from rlservo.serve_app.exploring import distribution_size, sample_leaves
 from rlservo.serve_app.guard import ActionGuard
 from rlservo.serve_app.limits import StepLimit
-from rlservo.serve_app.memory import REWARD, Memory, State
+from rlservo.serve_app.memory import Memory, State
 from rlservo.serve_app.observation import ObservationReader
 from rlservo.serve_app.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.structure import StructureReader, action_leaves, build_action
@@ -76,6 +76,8 @@ ONNX_TYPES = {
 }  # fmt: skip
 
 _Run = Callable[[list[str], dict[str, NDArray[Any]]], Any]
+Network = Callable[[dict[str, NDArray[Any]]], dict[str, NDArray[Any]]]
+"""Computes tensors `[batch, ...]` by name from tensors by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,11 +161,6 @@ class Policy:
         self._input = contract.inputs[0].name
         self._action_only = ["action"]
         self._dist_only = ["action_dist_inputs"]
-        self.batcher: Batcher | None = None
-        """Where it computes together with others what comes at the same time, if the options want that."""
-        if options.micro_batch > 1 and not self.episodic and len(contract.inputs) == len(self._observed):
-            # The session's own `run`: what is waiting when the policy is closed is computed all the same.
-            self.batcher = Batcher(_named(session.run, list(self._guards)), options.micro_batch)
 
     @classmethod
     def load(
@@ -192,10 +189,7 @@ class Policy:
         _check_copy(bundle, session)
         if check_golden:
             check_golden_vectors(bundle, session.run)
-        policy = cls(bundle, session, options, graph_hash=hashlib.sha256(bundle.onnx.read_bytes()).hexdigest())
-        if policy.batcher is not None:
-            _check_rows(bundle, session.run)
-        return policy
+        return cls(bundle, session, options, graph_hash=hashlib.sha256(bundle.onnx.read_bytes()).hexdigest())
 
     @property
     def contract(self) -> Contract:
@@ -296,11 +290,22 @@ class Policy:
         return self._reader.read(obs)
 
     def action(self, computed: Mapping[str, NDArray[Any]], *, batch: bool) -> Any:
-        """Return the action that the network's outputs are (`read`, `batcher`), checked. Raises ActionError."""
+        """Return the action that the network's outputs are (`read`, `network`), checked. Raises ActionError."""
         for name, guard in self._guards.items():
             guard.check(computed[name])
         own = {name: computed[name] if batch else computed[name][0, ...] for name in self._guards}
         return build_action(self._contract.action_space, own)
+
+    def network(self) -> Network:
+        """Return the network: from what `read` gives to the action's tensors by name, unchecked (`action` checks).
+
+        It is onnxruntime's own `run`: what has been given to it is computed even when the policy is closed meanwhile.
+        """
+        return _named(self._open_session().run, list(self._guards))
+
+    def check_rows(self) -> None:
+        """Raise BundleError where the network computes several observations otherwise than each by itself."""
+        check_rows(self._bundle, self._open_session().run)
 
     def fingerprint(self, fed: Mapping[str, NDArray[Any]]) -> bytes:
         """Return what tells the observation of a feed (`read`, `Step.fed`) from others."""
@@ -311,9 +316,7 @@ class Policy:
 
     def twin(self) -> Policy:
         """Return another policy over the same graph, for another thread: its memory, notices and drift are its own."""
-        if self._session is None:
-            _refuse_closed([], {})
-        return Policy(self._bundle, self._session, self.options, graph_hash=self._graph_hash)
+        return Policy(self._bundle, self._open_session(), self.options, graph_hash=self._graph_hash)
 
     def reset(self) -> None:
         """Start an episode: a recurrent policy forgets. Nothing to do for a stateless one."""
@@ -321,7 +324,7 @@ class Policy:
 
     def close(self) -> None:
         """Drop the session; `act` raises UsageError from now on."""
-        self._run, self._session, self.batcher = _refuse_closed, None, None
+        self._run, self._session = _refuse_closed, None
 
     def __enter__(self) -> Self:
         return self
@@ -330,6 +333,11 @@ class Policy:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _open_session(self) -> onnxruntime.InferenceSession:
+        if self._session is None:
+            _refuse_closed([], {})
+        return self._session
 
     def _act_on(self, obs: Observation, explore: bool, seed: int | None, reward: ArrayLike | None) -> Any:
         step = self.step(obs, before=self._state, last=self._last, explore=explore, seed=seed, reward=reward)
@@ -386,7 +394,7 @@ class Policy:
         return sample_leaves(inputs, self._check_explores(), self._contract.action_space, rng)
 
 
-def _named(run: _Run, names: list[str]) -> Callable[[Tensors], Tensors]:
+def _named(run: _Run, names: list[str]) -> Network:
     return lambda feed: dict(zip(names, run(names, feed), strict=True))
 
 
@@ -545,7 +553,7 @@ def check_golden_vectors(bundle: Bundle, run: _Run) -> None:
     logger.debug("%s: %d golden vectors reproduced", bundle.path, len(next(iter(recorded.values()))))
 
 
-def _check_rows(bundle: Bundle, run: _Run) -> None:
+def check_rows(bundle: Bundle, run: _Run) -> None:
     """Refuse to compute observations together where that is something else than one by one. Raises BundleError."""
     inputs, _ = bundle.golden()
     names = [tensor.name for tensor in bundle.contract.outputs]

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rlservo.export.bundle import REWARD
 from rlservo.export.errors import RlservoError, UsageError
 from rlservo.serve_app.acting import ActingPolicy
 from rlservo.serve_app.fallback import LinkCounts, StoppedError, WithFallback
-from rlservo.serve_app.memory import REWARD
 from rlservo.serve_app.rollout_env import check_fit, control_rate_of, make_env
 from rlservo.serve_app.rollout_report import EpisodeRow, Link, Rate, RolloutReport, summarise
 from rlservo.serve_app.video import VideoFile, rgb_frame

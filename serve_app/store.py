@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.bundle import DictSpec, SpaceSpec, TupleSpec, find_bundles, read_contract, version_key
+from rlservo.export.bundle import DictSpec, SpaceSpec, TupleSpec, find_bundles, leaf_specs, read_contract, version_key
 from rlservo.export.errors import (
     BundleError,
     RequestError,
@@ -24,6 +24,7 @@ from rlservo.export.errors import (
     UsageError,
 )
 from rlservo.serve_app.acting import Observation
+from rlservo.serve_app.batching import Batcher
 from rlservo.serve_app.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.plan import PolicyPlan
 from rlservo.serve_app.policy import Policy
@@ -77,10 +78,12 @@ class PolicyStore:
         plans: Mapping[str, PolicyPlan] | None = None,
         *,
         changed: Iterable[str] = (),
+        replaces: PolicyStore | None = None,
     ) -> None:
         """Take loaded policies, and by name which are to do what; those `changed` were served otherwise before.
 
         A plan may name versions that are not among the policies; where it leads to one, that part of it is left out.
+        What goes on of a store that this one `replaces` is the micro-batching of the policies that both have.
         Raises UsageError when two have the same name and version, or, without plans, when there is none.
         """
         self._policies: dict[str, dict[str, Policy]] = {}
@@ -106,7 +109,14 @@ class PolicyStore:
         self._shadow: dict[str, Shadow] = {}
         for name, versions in self._policies.items():
             self._arrange(name, versions, (plans or {}).get(name) or PolicyPlan(versions=dict.fromkeys(versions, "")))
-        self.batches = any(policy.batcher for versions in self._policies.values() for policy in versions.values())
+        before: dict[Policy, Batcher] = {} if replaces is None else replaces._batchers
+        self._batchers: dict[Policy, Batcher] = {
+            policy: before.get(policy) or Batcher(policy.network(), policy.options.micro_batch)
+            for versions in self._policies.values()
+            for policy in versions.values()
+            if _wants_batches(policy)
+        }
+        self.batches = bool(self._batchers)
         """Whether some policy computes together what comes at the same time."""
 
     @classmethod
@@ -213,6 +223,10 @@ class PolicyStore:
         """Return the version that computes along, if there is one."""
         return self._shadow.get(name)
 
+    def batcher_of(self, policy: Policy) -> Batcher | None:
+        """Return what gathers the single observations for a policy; None where each is computed by itself."""
+        return self._batchers.get(policy)
+
     def act(
         self,
         name: str,
@@ -243,7 +257,7 @@ class PolicyStore:
         `check` is asked again right before the network runs. Raises what it and `act` raise.
         """
         policy = self._stateless(name, version, session)
-        batcher = policy.batcher
+        batcher = self._batchers.get(policy)
         if batcher is None:
             return _act(policy, obs)
         policy.notices.clear()
@@ -260,7 +274,8 @@ class PolicyStore:
         return Decision(action, name, policy.contract.version, infer_ms, batch_of(action, space), notices)
 
     def close(self) -> None:
-        """Close every policy."""
+        """Close every policy; what is waiting to be computed with others is computed."""
+        self._batchers = {}
         for versions in self._policies.values():
             for policy in versions.values():
                 policy.close()
@@ -290,6 +305,13 @@ class PolicyStore:
                 {"policies": list(self.names)},
             )
         return versions
+
+
+def _wants_batches(policy: Policy) -> bool:
+    """Return whether single observations are computed together: the options say so, and nothing else goes in."""
+    contract = policy.contract
+    observed = leaf_specs(contract.observation_space, "obs")
+    return policy.options.micro_batch > 1 and not policy.episodic and len(contract.inputs) == len(observed)
 
 
 def _act(policy: Policy, obs: Observation, explore: bool = False, seed: int | None = None) -> Decision:
@@ -345,4 +367,7 @@ def load_policy(folder: Path, *, threads: int = 1, options: Mapping[str, PolicyO
     if not options:
         return Policy.load(folder, threads=threads)
     name = read_contract(folder).name
-    return Policy.load(folder, threads=threads, options=options.get(name, options.get("*", DEFAULT_OPTIONS)))
+    policy = Policy.load(folder, threads=threads, options=options.get(name, options.get("*", DEFAULT_OPTIONS)))
+    if _wants_batches(policy):
+        policy.check_rows()
+    return policy

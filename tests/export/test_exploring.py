@@ -89,7 +89,7 @@ def test_the_old_stack_explores_as_rllib_does(old_zoo: Path, app: Path, tmp_path
     with user_code(app):
         files = locate_checkpoint(old_zoo / name)
         assert isinstance(files, OldStackFiles)
-        restored = load_old_stack(files, lambda _: None)
+        restored = load_old_stack(files, app, lambda _: None)
     policy, loop = restored._policy, restored.loop()
     seen: list[Any] = []
     compute = policy.compute_actions_from_input_dict

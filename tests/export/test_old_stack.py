@@ -54,7 +54,7 @@ def load(old_zoo: Path, app: Path, notices: list[str]) -> Callable[..., OldStack
         files = locate_checkpoint(folder / checkpoint, policy)
         assert isinstance(files, OldStackFiles)
         with user_code(app):
-            return load_old_stack(files, notices.append)
+            return load_old_stack(files, app, notices.append)
 
     return load
 
@@ -542,11 +542,13 @@ def test_the_users_own_old_models_are_found_in_the_app_dir_and_only_there(
     script = (
         "import sys; from rlservo.export.exporter import export_checkpoint\n"
         "from rlservo.export.errors import CheckpointError\n"
+        # Whatever else comes before it on the import path, as a class of the checkpoint's may bring.
+        f"def disturb(step): sys.path.insert(0, {str(tmp_path)!r})\n"
         "for name in ('user_model', 'named_model'):\n"
         f"    for folder in ({str(tmp_path)!r}, {str(app)!r}):\n"
         "        try:\n"
         f"            r = export_checkpoint({str(old_zoo)!r} + '/' + name, {str(tmp_path / 'out')!r}, app_dir=folder,\n"
-        "                                  notify=lambda line: None)\n"
+        "                                  notify=lambda line: None, progress=disturb)\n"
         "            print('module:', r.contract.provenance.module_class)\n"
         "        except CheckpointError as error: print('refused:', error)\n"
     )

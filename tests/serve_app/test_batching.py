@@ -7,6 +7,8 @@ import contextlib
 import json
 import re
 import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -30,7 +32,7 @@ from rlservo.serve_app.oip_grpc import Grpc
 from rlservo.serve_app.options import PolicyOptions
 from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.settings import ServerSettings
-from rlservo.serve_app.store import Decision, PolicyStore
+from rlservo.serve_app.store import Decision, PolicyStore, load_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -116,10 +118,10 @@ def bounded(box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFa
 
 
 @contextlib.contextmanager
-def watched(policy: Policy) -> Iterator[list[int]]:
+def watched(store: PolicyStore, policy: Policy) -> Iterator[list[int]]:
     """Give the sizes of the policy's runs."""
-    assert policy.batcher is not None
-    batcher = policy.batcher
+    batcher = store.batcher_of(policy)
+    assert batcher is not None
     run, sizes = batcher._run, []
 
     def counting(tensors: Tensors) -> Tensors:
@@ -136,7 +138,7 @@ def watched(policy: Policy) -> Iterator[list[int]]:
 def in_a_crowd(store: PolicyStore) -> None:
     """As if several had come in the turn before."""
     for name in store.names:
-        batcher = store.get(name).batcher
+        batcher = store.batcher_of(store.get(name))
         assert batcher is not None
         batcher._several = True
 
@@ -167,7 +169,7 @@ def test_json_requests_are_computed_together_and_get_their_own_actions(
     port: int, store: PolicyStore, ur5: Path
 ) -> None:
     before = counted(port)
-    with Policy.load(ur5) as alone, watched(store.get("ur5")) as sizes:
+    with Policy.load(ur5) as alone, watched(store, store.get("ur5")) as sizes:
         for _ in range(20):  # on a busy computer they may come one after the other
             in_a_crowd(store)
             answers = ask_all(port, "/v1/policies/ur5/act", [{"obs": row.tolist()} for row in OBS[:40]])
@@ -187,7 +189,7 @@ def test_a_bad_observation_and_a_bad_action_are_their_own_requests_faults(port: 
     documents: list[Any] = [{"obs": (row * 0.02).tolist()} for row in OBS[:12]]
     documents[3] = {"obs": [0.0] * 26}
     documents[7] = {"obs": (OBS[7] * 1e4).tolist()}  # far outside: the action leaves its space
-    with watched(store.get("unsafe")) as sizes:
+    with watched(store, store.get("unsafe")) as sizes:
         for _ in range(20):
             sizes.clear()
             in_a_crowd(store)
@@ -228,7 +230,7 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
             requests.append((asked.SerializeToString(), None))
         return await asyncio.gather(*(service._infer(request, None, None) for request in requests))
 
-    with Policy.load(ur5) as alone, watched(store.get("ur5")) as sizes:
+    with Policy.load(ur5) as alone, watched(store, store.get("ur5")) as sizes:
         expected = [alone.act(row) for row in OBS[:8]]
 
         def check(actions: list[Any]) -> None:
@@ -259,7 +261,7 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
 
 
 def test_exploring_requests_draw_for_themselves(port: int, store: PolicyStore) -> None:
-    with watched(store.get("ur5")) as sizes:
+    with watched(store, store.get("ur5")) as sizes:
         drawn = ask_all(port, "/v1/policies/ur5/act", [{"obs": OBS[0].tolist(), "explore": True, "seed": 5}] * 4)
         assert len({json.dumps(reply.json()["action"]) for reply in drawn}) == 1
         assert sizes == [256 * 15]
@@ -290,7 +292,7 @@ def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(s
         patient = core.act("ur5", None, OBS[1], received=now, deadline_ms=30_000.0)
         return await asyncio.gather(hurried, patient, slow(), return_exceptions=True)
 
-    with watched(store.get("ur5")) as sizes:
+    with watched(store, store.get("ur5")) as sizes:
         in_a_crowd(store)
         late, done, _ = asyncio.run(main())
     assert isinstance(late, DeadlineError) and "nothing computed" in late.message
@@ -327,11 +329,29 @@ def test_a_graph_that_takes_one_observation_at_a_time_is_refused(bounded: Path, 
     with pytest.raises(
         BundleError, match=r"does not compute three observations as it computes each .*leave micro_batch"
     ):
-        Policy.load(folder, options=PolicyOptions(micro_batch=16))
+        load_policy(folder, options=TOGETHER)
 
 
 def test_policies_with_a_memory_or_a_limit_are_computed_one_by_one(recurrent: Path, policies: Path) -> None:
     store = PolicyStore.load([recurrent], options=TOGETHER)
     assert not store.batches
     limited = PolicyOptions(micro_batch=16, max_action_step=0.1)
-    assert PolicyStore.load([policies], options={"ur5": limited}).get("ur5").batcher is None
+    assert not PolicyStore.load([policies], options={"ur5": limited}).batches
+
+
+def test_the_next_store_goes_on_with_the_batchers_of_the_policies_it_keeps(policies: Path) -> None:
+    first = PolicyStore.load([policies], options=TOGETHER)
+    kept = first.get("ur5")
+    batcher = first.batcher_of(kept)
+    assert batcher is not None
+    assert asyncio.run(batcher.compute({"obs": OBS[:1]})).outputs["action"].shape == (1, 6)
+    after = PolicyStore([kept], replaces=first).batcher_of(kept)
+    assert after is batcher and after.observations == 1  # the counts are Prometheus counters: they do not start again
+    other = kept.twin()
+    assert PolicyStore([other], replaces=first).batcher_of(other) is not batcher
+
+
+def test_the_in_process_runtime_imports_no_event_loop() -> None:
+    script = "import sys, rlservo.serve_app.policy; print(*{'asyncio', 'ray', 'fastapi', 'torch'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=100, check=True)
+    assert not done.stdout.split()
