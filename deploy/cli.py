@@ -280,6 +280,13 @@ def serve(
         int | None, typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC, here.")
     ] = None,
     replicas: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
+    default_policy: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Policy of a WebSocket at '/', where openpi's clients connect; the only one by default.",
+        ),
+    ] = None,
     config: policy_commands.ConfigOption = None,
     versions: policy_commands.VersionsOption = None,
     alias: policy_commands.AliasOption = None,
@@ -318,6 +325,7 @@ def serve(
         port=port,
         grpc_port=grpc_port,
         replicas=replicas,
+        settings=None if default_policy is None else {"default_policy": default_policy},
         served=policy_commands.served_config(config, versions, alias, canary, shadow),
         admin_key_file=key_file(port),
         on_start=lambda: terminal.errors().print("starting Ray Serve ...", style="dim"),

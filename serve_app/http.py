@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from rlservo.export.bundle import Contract, contract_json
 from rlservo.export.errors import MediaTypeError, ObservationError, RequestError, RlservoError
-from rlservo.serve_app import edge, listing, oip, wire
+from rlservo.serve_app import edge, listing, oip, oip_config, wire
 from rlservo.serve_app.admin import add_admin
 from rlservo.serve_app.control import Control
 from rlservo.serve_app.core import Core, StoreProvider
@@ -68,6 +68,7 @@ def create_app(
     _add_health(app, core)
     if control is not None:
         add_admin(app, core, control)
+    oip_config.add_routes(app, core)
     oip.add_routes(app, core, infer)
     if settings.docs:
         add_docs(app)

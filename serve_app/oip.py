@@ -58,7 +58,14 @@ PLATFORM = "onnx_onnxv1"
 STATE_IN, STATE_OUT = "state_in.", "state_out."
 LAST_ACTION = "last_action"  # inputs like the outputs `action` and `action.<path>`
 STATE_POLICY = "state_policy"  # whose the states are
-EXTENSIONS = ("binary_tensor_data", "parameters", "sequence", "model_repository")
+EXTENSIONS = (
+    "binary_tensor_data",
+    "model_configuration",
+    "model_repository",
+    "parameters",
+    "sequence",
+    "statistics",
+)
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
 MODEL_NAME = "model_name"  # KServe's client says again what the path says
 # What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.

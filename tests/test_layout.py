@@ -25,6 +25,7 @@ ONLY_IN = {
         "serve_app/http.py",
         "serve_app/edge.py",
         "serve_app/oip.py",
+        "serve_app/oip_config.py",
         "serve_app/docs.py",
         "serve_app/admin.py",
         "serve_app/app.py",

@@ -189,6 +189,12 @@ def test_every_command_has_help_with_an_example() -> None:
         assert "Example" in done.stdout
 
 
+def test_serve_refuses_a_default_policy_that_is_not_served(policies: Path) -> None:
+    done = rlservo("serve", policies, "--default-policy", "mir100")
+    refused(done, 2, "the default policy 'mir100' is not among those to serve: ur5")
+    assert "starting" not in done.stderr
+
+
 HEAVY = {"asyncio", "fastapi", "grpc", "gymnasium", "httpx", "mujoco", "numpy", "onnxruntime", "ray", "rich",
          "starlette", "torch"}  # fmt: skip
 MODULES_OF = """
