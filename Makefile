@@ -41,7 +41,7 @@ setup: $(STAMP)  ## Only the set-up
 
 $(STAMP): pyproject.toml constraints.txt setup.py envs/rlservo-gymnasium.pth
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[all]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[all,dev]'
 	touch $(STAMP)
 
 clean:  ## Remove what the other targets made, .venv included

@@ -1,4 +1,4 @@
-"""Write typings/: one-line stubs that show type checkers folder X as the package rlservo.X.
+"""Write typings/: one-line stubs that show type checkers folder X as the package rlservo.X, deploy/package as rlservo.
 
 Setuptools' `package-dir` gives the folders that name at run time; mypy, pyright and editors do not read it.
 `make check` runs this first.
@@ -11,16 +11,19 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("envs", "export", "serve_app", "deploy")
+PACKAGE = Path("deploy") / "package"  # imports as `rlservo` itself
 
 
 def main() -> None:
     typings = ROOT / "typings" / "rlservo"
     shutil.rmtree(typings.parent, ignore_errors=True)
     typings.mkdir(parents=True)
-    (typings / "__init__.pyi").write_text("")
+    (typings / "__init__.pyi").write_text("from deploy.package import *\n")
     for folder in FOLDERS:
         for module in sorted((ROOT / folder).rglob("*.py")):
             path = module.relative_to(ROOT)
+            if path.parent == PACKAGE:
+                continue
             stub = typings / path.with_suffix(".pyi")
             stub.parent.mkdir(parents=True, exist_ok=True)
             names = path.with_suffix("").parts

@@ -5,7 +5,6 @@ Heavy libraries are imported by the command that needs them, so that `rlservo in
 
 from __future__ import annotations
 
-import ctypes.util
 import json
 import os
 import sys
@@ -13,27 +12,26 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from enum import Enum
-from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
-from rlservo.deploy import policy_commands, robot_commands
+import rlservo
+from rlservo.deploy import policy_commands, robot_commands, terminal
 from rlservo.export.errors import RlservoError, UsageError
-from rlservo.serve_app.acting import ActingPolicy
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.acting import ActingPolicy
 
 app = typer.Typer(
     name="rlservo",
     help="From a Ray RLlib checkpoint to a robot in the loop: export it, prove it, serve it, drive with it.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
+    rich_markup_mode=None,  # plain help: rich's tables and its Markdown parser would double the time of `--help`
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_out = Console()
-_err = Console(stderr=True)
 
 
 class Rate(str, Enum):
@@ -65,14 +63,14 @@ def main() -> None:
     try:
         app()
     except RlservoError as error:
-        _err.print(f"rlservo: {error.message}", style="red", markup=False, highlight=False, soft_wrap=True)
+        terminal.errors().print(f"rlservo: {error.message}", style="red", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(2 if isinstance(error, UsageError) else 1) from None
     except BrokenPipeError:  # the reader of our output went away, as in `rlservo inspect ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except OSError as error:
         what = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
-        _err.print(f"rlservo: {what}", style="red", markup=False, highlight=False, soft_wrap=True)
+        terminal.errors().print(f"rlservo: {what}", style="red", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(1) from None
 
 
@@ -91,7 +89,7 @@ def _extra(name: str) -> Iterator[None]:
 
 def _note(line: str) -> None:
     """Print a line that a program reading our output should not see."""
-    _err.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+    terminal.errors().print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
 
 
 def _print_json(document: Any) -> None:
@@ -101,7 +99,7 @@ def _print_json(document: Any) -> None:
 @app.callback(invoke_without_command=True)
 def _root(show_version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
     if show_version:
-        print(f"rlservo {version('rlservo')}")
+        print(f"rlservo {rlservo.__version__}")
         raise typer.Exit
 
 
@@ -130,7 +128,7 @@ def export(
     mode: Annotated[Pick, typer.Option(help="Whether the best is the largest or the smallest.")] = Pick.max,
     as_json: Json = False,
 ) -> None:
-    """Turn an RLlib checkpoint into a policy bundle, proven equal to RLlib's own actions, or write nothing.
+    """Turn an RLlib checkpoint into a policy bundle. It is proven equal to RLlib's own actions, or nothing is written.
 
     Examples: `rlservo export examples/checkpoints/ur5_positioning --out policies`,
     `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
@@ -138,7 +136,7 @@ def export(
     started = time.perf_counter()
     if all_modules and (module_id is not None or agent_id is not None):
         raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
-    with _err.status("importing") as status, ExitStack() as fetching:
+    with terminal.errors().status("importing") as status, ExitStack() as fetching:
         with _extra("train"):
             from rlservo.export.experiment import best_checkpoint
             from rlservo.export.exporter import LOADING_RUNS_CODE, export_all_modules, export_checkpoint
@@ -185,9 +183,11 @@ def export(
         _print_json(documents if all_modules else documents[0])
         return
     for result in results:
-        _out.print(export_report(result.contract), soft_wrap=True)
-        _out.print(f"written   {result.path}", markup=False, highlight=False, soft_wrap=True)
-    _out.print(f"cost      {cost['seconds']:.1f} s, {cost['peak_memory_mb']} MB at the peak", highlight=False)
+        terminal.output().print(export_report(result.contract), soft_wrap=True)
+        terminal.output().print(f"written   {result.path}", markup=False, highlight=False, soft_wrap=True)
+    terminal.output().print(
+        f"cost      {cost['seconds']:.1f} s, {cost['peak_memory_mb']} MB at the peak", highlight=False
+    )
 
 
 @app.command()
@@ -197,7 +197,7 @@ def prune(
     module_id: Annotated[str | None, typer.Option(help="Which RLModule; needed when there are several.")] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
 ) -> None:
-    """Copy only what export needs out of a checkpoint: small enough to commit or to mail.
+    """Copy only what export needs out of a checkpoint. The copy is small enough to commit or to mail.
 
     Example: `rlservo prune runs/PPO-.../checkpoint_000015 --out examples/checkpoints/mine`
     """
@@ -212,19 +212,20 @@ def inspect(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
     as_json: Json = False,
 ) -> None:
-    """Show a bundle's contract: what goes in, what comes out, what is baked in, how it was proven.
+    """Show a bundle's contract. It says what goes in, what comes out, what is baked in and how it was proven.
 
     Example: `rlservo inspect policies/ur5`
     """
     from rlservo.export.bundle import load_bundle
-    from rlservo.export.report import contract_report
 
     loaded = load_bundle(bundle)
     if as_json:
         _print_json(loaded.contract.model_dump(mode="json"))
     else:
-        _out.print(contract_report(loaded.contract))
-        _out.print(f"{loaded.path}: all hashes match", markup=False, highlight=False, soft_wrap=True)
+        from rlservo.export.report import contract_report
+
+        terminal.output().print(contract_report(loaded.contract))
+        terminal.output().print(f"{loaded.path}: all hashes match", markup=False, highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -237,7 +238,7 @@ def verify(
     app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
     as_json: Json = False,
 ) -> None:
-    """Prove a bundle against its checkpoint again; with --env also in closed loop, written into the contract.
+    """Prove a bundle against its checkpoint again. With --env also in closed loop, written into the contract.
 
     Example: `rlservo verify policies/ur5 --checkpoint runs/best --env rlservo/EndEffectorPositioningURSim-v0`
     """
@@ -245,7 +246,7 @@ def verify(
         from rlservo.export.report import verification_report
         from rlservo.export.verify import verify_bundle
 
-    with _err.status("reading the bundle") as status:
+    with terminal.errors().status("reading the bundle") as status:
         result = verify_bundle(
             bundle,
             checkpoint,
@@ -265,7 +266,7 @@ def verify(
             }
         )
     else:
-        _out.print(verification_report(result.parity, result.evaluation))
+        terminal.output().print(verification_report(result.parity, result.evaluation))
 
 
 @app.command()
@@ -279,13 +280,20 @@ def serve(
         int | None, typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC, here.")
     ] = None,
     replicas: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
+    default_policy: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Policy of a WebSocket at '/', where openpi's clients connect; the only one by default.",
+        ),
+    ] = None,
     config: policy_commands.ConfigOption = None,
     versions: policy_commands.VersionsOption = None,
     alias: policy_commands.AliasOption = None,
     canary: policy_commands.CanaryOption = None,
     shadow: policy_commands.ShadowOption = None,
 ) -> None:
-    """Serve policies over HTTP with Ray Serve until Ctrl-C; nothing is left running afterwards.
+    """Serve policies with Ray Serve until Ctrl-C. Nothing is left running afterwards.
 
     Example: `rlservo serve policies`, then
     `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`
@@ -296,14 +304,20 @@ def serve(
 
     def ready(served: Served) -> None:
         for name, default in served.policies:
-            _out.print(f"{served.url}/v1/policies/{name}  (version {default})", highlight=False, soft_wrap=True)
+            terminal.output().print(
+                f"{served.url}/v1/policies/{name}  (version {default})", highlight=False, soft_wrap=True
+            )
         if served.grpc is not None:
-            _out.print(f"{served.grpc}  gRPC, Open Inference Protocol", highlight=False, soft_wrap=True)
+            terminal.output().print(f"{served.grpc}  gRPC, Open Inference Protocol", highlight=False, soft_wrap=True)
         if not served.haproxy:
-            _err.print("HAProxy is not installed here: Ray's own proxy answers, at several times the latency")
+            terminal.errors().print(
+                "HAProxy is not installed here: Ray's own proxy answers, at several times the latency"
+            )
         if served.admin_key_file is not None:
             _note(f"administration: rlservo policy --help; its key is in {served.admin_key_file}")
-        _out.print(f"ready; documentation at {served.url}/docs; Ctrl-C stops", highlight=False, soft_wrap=True)
+        terminal.output().print(
+            f"ready; documentation at {served.url}/docs; Ctrl-C stops", highlight=False, soft_wrap=True
+        )
 
     serve_policies(
         directories,
@@ -311,9 +325,10 @@ def serve(
         port=port,
         grpc_port=grpc_port,
         replicas=replicas,
+        settings=None if default_policy is None else {"default_policy": default_policy},
         served=policy_commands.served_config(config, versions, alias, canary, shadow),
         admin_key_file=key_file(port),
-        on_start=lambda: _err.print("starting Ray Serve ...", style="dim"),
+        on_start=lambda: terminal.errors().print("starting Ray Serve ...", style="dim"),
         on_ready=ready,
     )
 
@@ -324,7 +339,7 @@ def key(
     admin: Annotated[bool, typer.Option("--admin", help="For administration; robots need no such key.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Make an API key: the key for the client, and the line with its hash for the server's key file.
+    """Make an API key. What is printed is the key for the client and the line with its hash for the server's key file.
 
     Example: `rlservo key cell-7`; append the line to a file and name that in RLSERVO_API_KEYS_FILE
     """
@@ -374,7 +389,7 @@ def rollout(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Drive an environment with a policy and report success, return, latency and deadline misses.
+    """Drive an environment with a policy. Success, return, latency and deadline misses are reported.
 
     Example: `rlservo rollout rlservo/EndEffectorPositioningURSim-v0 --url http://127.0.0.1:8000 --policy ur5`
     """
@@ -402,7 +417,7 @@ def rollout(
     if as_json:
         _print_json(report.as_dict())
     else:
-        _out.print(render_report(report))
+        terminal.output().print(render_report(report))
     if report.interrupted:
         raise typer.Exit(130)
     if report.stopped is not None:
@@ -417,7 +432,7 @@ def demo(
         "examples/checkpoints"
     ),
 ) -> None:
-    """Export the two shipped checkpoints, serve them, drive both simulators, and show the result.
+    """Export two policies, serve them and drive both robots. The checkpoints are those that ship with the project.
 
     Example: `rlservo demo` in the checkout (`make demo` installs everything first)
     """
@@ -425,7 +440,7 @@ def demo(
     with _extra("all"):
         from rlservo.deploy.demo import run_demo
 
-    run_demo(out, checkpoints=checkpoints, episodes=episodes, console=_out)
+    run_demo(out, checkpoints=checkpoints, episodes=episodes, console=terminal.output())
 
 
 robot_commands.add_to(app)
@@ -486,8 +501,10 @@ def choose_gl_backend() -> None:
     """Let MuJoCo render off screen where there is no display. It must be said before mujoco is imported."""
     if "MUJOCO_GL" in os.environ or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         return
+    from ctypes.util import find_library  # it imports subprocess
+
     for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-        if ctypes.util.find_library(library):
+        if find_library(library):
             os.environ["MUJOCO_GL"] = backend
             return
 

@@ -9,19 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
+from rlservo.deploy import terminal
 from rlservo.export.errors import UsageError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from rlservo.serve_app.admin_client import AdminClient
 
 policy = typer.Typer(
-    help="Say what a running server serves: versions, aliases, rollback, canary, shadow; on all of its replicas.",
+    help="Say what a running server serves. Versions, aliases, rollback, canary, shadow; on all of its replicas.",
     no_args_is_help=True,
 )
-_out = Console()
 
 Url = Annotated[str, typer.Option(help="The server.", envvar="RLSERVO_URL")]
 KeyFile = Annotated[
@@ -35,7 +35,7 @@ LOCAL = "http://127.0.0.1:8000"
 
 @policy.command("list")
 def list_policies(url: Url = LOCAL, key_file: KeyFile = None, as_json: Json = False) -> None:
-    """Show what every replica serves, since when, and what was refused.
+    """Show what every replica serves, and since when. What was refused is shown, too.
 
     Example: `rlservo policy list`
     """
@@ -45,12 +45,12 @@ def list_policies(url: Url = LOCAL, key_file: KeyFile = None, as_json: Json = Fa
         print(json.dumps(replicas, indent=2))
         return
     for replica in replicas:
-        _out.print(_table(replica))
+        terminal.output().print(_table(replica))
         for sentence in replica["behind"]:
-            _out.print(f"behind: {sentence}", style="red", markup=False, highlight=False, soft_wrap=True)
+            terminal.output().print(f"behind: {sentence}", style="red", markup=False, highlight=False, soft_wrap=True)
         if replica["refused"] is not None:
             refused = f"refused: {replica['refused']['change']} at {replica['refused']['at']}: "
-            _out.print(refused + replica["refused"]["reason"], style="red", markup=False, highlight=False)
+            terminal.output().print(refused + replica["refused"]["reason"], style="red", markup=False, highlight=False)
 
 
 @policy.command()
@@ -93,7 +93,7 @@ def alias(
     key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:
-    """Let an alias lead to a loaded version; `production` is what clients get that ask for none.
+    """Let an alias lead to a loaded version. `production` is what clients get that ask for none.
 
     Example: `rlservo policy alias ur5 production=4`
     """
@@ -110,7 +110,7 @@ def rollback(
     key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:
-    """Let an alias lead where it led before; once more goes one further back.
+    """Let an alias lead where it led before. Once more goes one further back.
 
     Example: `rlservo policy rollback ur5`
     """
@@ -143,7 +143,7 @@ def shadow(
     key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:
-    """Let another version compute along and record how its actions differ, or end that.
+    """Let another version compute along, or end that. How its actions differ is recorded.
 
     Example: `rlservo policy shadow ur5 candidate`
     """
@@ -276,10 +276,12 @@ def _show(reply: dict[str, Any], as_json: bool) -> None:
         lines.append(f"canary {reply['canary']['version']} gets {reply['canary']['share']:g} of the sessions")
     if reply["shadow"] is not None:
         lines.append(f"shadow {reply['shadow']}")
-    _out.print("; ".join(lines), markup=False, highlight=False, soft_wrap=True)
+    terminal.output().print("; ".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
 def _table(replica: dict[str, Any]) -> Table:
+    from rich.table import Table
+
     table = Table(title=f"replica {replica['replica']}, generation {replica['generation']} ({replica['changed_by']})")
     for column in ("policy", "version", "state", "aliases", "since (UTC)", "requests", "reason"):
         table.add_column(column, no_wrap=column != "reason")

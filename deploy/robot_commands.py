@@ -9,15 +9,14 @@ from enum import Enum
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
+from rlservo.deploy import terminal
 from rlservo.export.errors import RlservoError, UsageError
 
 robot_server = typer.Typer(
-    help="Serve a simulated robot to robo-gym's environments, as a drop-in for the ROS robot server.",
+    help="Serve a simulated robot to robo-gym's environments. It is a drop-in for the ROS robot server.",
     no_args_is_help=True,
 )
-_out = Console()
 
 
 class ClockKind(str, Enum):
@@ -119,7 +118,7 @@ def server_manager(
         float, typer.Option(min=0.0, help="Seconds without a client after which a robot server ends; 0: never.")
     ] = 120.0,
 ) -> None:
-    """Start robot servers for robo-gym's Sim environments, in place of its ROS server manager, until Ctrl-C.
+    """Start robot servers for robo-gym's Sim environments. It stands in for the ROS server manager, until Ctrl-C.
 
     Example: `rlservo server-manager`, then
     `gym.make("EndEffectorPositioningURSim-v0", ip="127.0.0.1", ur_model="ur5")` in robo-gym
@@ -128,7 +127,9 @@ def server_manager(
         from rlservo.envs.robot_server.manager import serve_manager
 
         def ready(bound: int) -> None:
-            _out.print(f"server manager on {host}:{bound}, clock {clock.value}; Ctrl-C stops it", highlight=False)
+            terminal.output().print(
+                f"server manager on {host}:{bound}, clock {clock.value}; Ctrl-C stops it", highlight=False
+            )
 
         serve_manager(
             host=host,
@@ -148,7 +149,7 @@ def _serve(settings: object, title: str) -> None:
     host = settings.host
 
     def ready(port: int) -> None:
-        _out.print(f"robot server on {host}:{port}: {title}; Ctrl-C stops it", highlight=False)
+        terminal.output().print(f"robot server on {host}:{port}: {title}; Ctrl-C stops it", highlight=False)
 
     serve_robot(settings, on_ready=ready)
 

@@ -24,10 +24,7 @@ import numpy as np
 import yaml
 from help_text import DefaultsFormatter
 
-from rlservo.export.errors import RlservoError
-from rlservo.export.exporter import export_checkpoint
-from rlservo.serve_app.policy import Policy
-from rlservo.serve_app.rollout import rollout
+import rlservo
 from rlservo.serve_app.rollout_report import EpisodeRow, wilson_interval
 
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
@@ -63,12 +60,12 @@ def load_settings(name: str) -> dict[str, Any]:
     return settings
 
 
-def evaluate(policy: Policy, settings: Mapping[str, Any], episodes: int, seed: int) -> list[Measured]:
+def evaluate(policy: rlservo.Policy, settings: Mapping[str, Any], episodes: int, seed: int) -> list[Measured]:
     """Run every evaluation of the settings with a loaded policy."""
     measured = []
     for wanted in settings["evaluation"]:
         env_config = wanted.get("env_config", {})
-        report = rollout(policy, settings["env"], episodes=episodes, seed=seed, env_kwargs=env_config)
+        report = rlservo.rollout(policy, settings["env"], episodes=episodes, seed=seed, env_kwargs=env_config)
         if report.interrupted:
             raise KeyboardInterrupt
         measured.append(_measured(wanted, env_config, report.episodes, seed))
@@ -154,12 +151,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as bundles:
         for name in names:
             try:
-                exported = export_checkpoint(
+                exported = rlservo.export_checkpoint(
                     args.checkpoint or SHIPPED / name, bundles, name=name, notify=lambda line: None
                 )
-                with Policy.load(exported.path) as policy:
+                with rlservo.Policy.load(exported.path) as policy:
                     measured = evaluate(policy, load_settings(name), args.episodes, args.seed)
-            except RlservoError as error:
+            except rlservo.errors.RlservoError as error:
                 sys.exit(f"error: {name}: {error.message}")
             print(f"{name}\n{render(measured)}\n", flush=True)
             if args.write:

@@ -26,8 +26,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordVideo
 from training_run import RETURN, STEPS, Run
 
+from rlservo import Policy
 from rlservo.deploy.cli import choose_gl_backend
-from rlservo.serve_app.policy import Policy
 from rlservo.serve_app.rollout_env import control_rate_of
 from rlservo.serve_app.video import VideoFile
 

@@ -41,8 +41,7 @@ from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.tune.registry import get_trainable_cls
 
-from rlservo.export.exporter import export_checkpoint
-from rlservo.serve_app.policy import Policy
+from rlservo import Policy, export_checkpoint
 
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 MILESTONE = 0.95  # the success rate whose time is printed

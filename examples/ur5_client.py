@@ -14,8 +14,7 @@ import argparse
 
 import gymnasium as gym
 
-from rlservo.export.errors import RlservoError
-from rlservo.serve_app.client import PolicyClient
+import rlservo
 
 
 def main() -> None:
@@ -27,7 +26,7 @@ def main() -> None:
     args = parser.parse_args()
 
     env = gym.make("rlservo/EndEffectorPositioningURSim-v0", render_mode="human" if args.show else None)
-    with PolicyClient(args.url, args.policy) as policy:
+    with rlservo.PolicyClient(args.url, args.policy) as policy:
         for episode in range(args.episodes):
             obs, info = env.reset(seed=episode)
             policy.reset()
@@ -42,5 +41,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except RlservoError as error:
+    except rlservo.errors.RlservoError as error:
         raise SystemExit(f"error: {error}") from None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
+import logging
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +22,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+import rlservo
 from rlservo.export.bundle import (
     CONTRACT_KEY,
     ONNX_FILE,
@@ -51,6 +53,8 @@ from rlservo.export.unpickle import user_code
 
 if TYPE_CHECKING:
     from rlservo.export.restore import Restored
+
+logger = logging.getLogger(__name__)
 
 GOLDEN_SAMPLES = {"likely": 48, "wide": 8, "extreme": 8}
 GOLDEN_BYTES = 2_000_000  # of images a few observations are as much as a bundle should carry
@@ -98,7 +102,7 @@ def export_checkpoint(
     agent_id: str | None = None,
     app_dir: str | Path = ".",
     value: bool = True,
-    notify: Say,
+    notify: Say = logger.warning,
     progress: Say = _silent,
 ) -> ExportResult:
     """Export one policy of an RLlib checkpoint to `out/<name>/<version>/`.
@@ -106,8 +110,8 @@ def export_checkpoint(
     `checkpoint` is what `locate_checkpoint` takes, or a URI of such a folder. `name` defaults to the environment's (of
     several policies with the module's behind it), `version` to the next integer after the newest one present.
     `app_dir` holds the user's own classes, if the checkpoint needs any. `value` False leaves the value head out, which
-    costs a third of a small policy's time. `notify` gets one sentence for each thing a person should know, `progress`
-    what is being done.
+    costs a third of a small policy's time. `notify` gets one sentence for each thing a person should know (by default
+    they are logged), `progress` what is being done.
 
     Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
     cannot be exported, ParityError when the graph does not give RLlib's own actions. Nothing is left behind then.
@@ -339,18 +343,9 @@ def _provenance(files: Files, facts: CheckpointFacts, restored: Restored) -> Pro
         env_config=facts.env_config,
         ray_version=facts.ray_version or ray.__version__,
         torch_version=torch.__version__,
-        rlservo_version=_own_version(),
+        rlservo_version=rlservo.__version__,
         exported_at=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     )
-
-
-def _own_version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("rlservo")
-    except PackageNotFoundError:  # run from a source tree that was never installed
-        return "unknown"
 
 
 def _write_rest(folder: Path, contract: Contract, golden: _Golden) -> None:

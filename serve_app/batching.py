@@ -27,6 +27,7 @@ class Computed:
 
     outputs: Tensors  # `[1, ...]`
     milliseconds: float  # that the run took, for all that were in it
+    requests: int  # whose observations were in it
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +85,7 @@ class Batcher:
         """Return what a batch that came as one comes to: it waits for nobody. Raises what `run` raises."""
         started = time.perf_counter()
         outputs = self._run(feed)
-        return Computed(outputs, (time.perf_counter() - started) * 1e3)
+        return Computed(outputs, (time.perf_counter() - started) * 1e3, 1)  # one run, whatever is in it
 
     def _end_turn(self) -> None:
         self._compute_all()
@@ -116,6 +117,6 @@ class Batcher:
         self.runs += 1
         self.observations += rows
         return [
-            Computed({name: output[row : row + 1] for name, output in outputs.items()}, milliseconds)
+            Computed({name: output[row : row + 1] for name, output in outputs.items()}, milliseconds, rows)
             for row in range(rows)
         ]

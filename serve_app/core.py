@@ -50,6 +50,7 @@ class Core:
         self._store_provider = store_provider
         self.control = control
         self.replica = replica
+        self.is_alone = alone
         self.shadows = Shadows()
         self.settings = settings
         self.guard = Guard(Keys.from_settings(settings))
@@ -152,9 +153,9 @@ class Core:
         store = self._store_provider()
         if store is None or name not in store.names:
             name = version = ""
-        elif version is not None:  # an alias is counted as the version it leads to
-            version = store.version_of(name, version)
-        self.metrics.failed(protocol, name, version or "", code)
+        else:  # an alias is counted as the version it leads to, no version as the default
+            version = store.default(name) if version is None else store.version_of(name, version)
+        self.metrics.failed(protocol, name, version, code)
 
     def kept_out(self, protocol: str, error: RlservoError, request_id: str | None, *, peer: str | None) -> None:
         """Count and log a request that was refused before anybody looked at it, and the address it came from."""

@@ -15,7 +15,17 @@ from typing import Any
 import grpc
 
 SERVICE = "inference.GRPCInferenceService"
-UNARY = ("ServerLive", "ServerReady", "ServerMetadata", "ModelReady", "ModelMetadata", "ModelInfer", "RepositoryIndex")
+UNARY = (
+    "ServerLive",
+    "ServerReady",
+    "ServerMetadata",
+    "ModelReady",
+    "ModelMetadata",
+    "ModelConfig",
+    "ModelStatistics",
+    "ModelInfer",
+    "RepositoryIndex",
+)
 STREAMS = ("ModelStreamInfer",)
 LONGEST_S = 86400.0  # [s] gRPC says "no deadline" as one far away
 

@@ -25,7 +25,7 @@ from rlservo.export.errors import (
     RlservoError,
     UnknownPolicyError,
 )
-from rlservo.serve_app import edge, listing, oip, wire
+from rlservo.serve_app import edge, listing, oip, oip_config, wire
 from rlservo.serve_app.admin import add_admin
 from rlservo.serve_app.control import Control
 from rlservo.serve_app.core import Core, StoreProvider
@@ -75,6 +75,7 @@ def create_app(
     _add_health(app, core)
     if control is not None:
         add_admin(app, core, control)
+    oip_config.add_routes(app, core)
     oip.add_routes(app, core, app.add_direct)
     if settings.docs:
         add_docs(app)

@@ -89,6 +89,10 @@ def serve_policies(
     _check_ray()
     with contextlib.closing(load_served(paths, ServedConfig.read(served))) as store:
         policies = tuple((name, store.default(name)) for name in store.names)
+        if chosen.default_policy not in (None, *store.names):
+            raise UsageError(
+                f"the default policy '{chosen.default_policy}' is not among those to serve: {', '.join(store.names)}"
+            )
     check_port(host, port)
     if grpc_port is not None:
         check_port(host, grpc_port)

@@ -7,8 +7,10 @@ conventions (base units, `_total`). It knows nothing of HTTP.
 
 from __future__ import annotations
 
+import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
@@ -17,6 +19,7 @@ from prometheus_client.registry import Collector
 
 from rlservo.serve_app.store import Decision
 
+IDLE = "idle"  # what a stream is closed with that was silent for too long
 SECONDS = (1e-5, 2.5e-5, 5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0)
 BATCHES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0, 2048.0, 4096.0)
 
@@ -46,12 +49,27 @@ class Histogram:
 class _Series:
     """What is known of one policy's version over one protocol."""
 
-    __slots__ = ("batch", "inference", "latency")
+    __slots__ = ("batch", "inference", "last_answer_s", "latency", "runs")
 
     def __init__(self) -> None:
+        self.runs = 0.0  # of the network; of one that several requests share, each has its part
+        self.last_answer_s = 0.0  # since 1970
         self.latency = Histogram(SECONDS)
         self.inference = Histogram(SECONDS)
         self.batch = Histogram(BATCHES)
+
+
+@dataclass(frozen=True)
+class Totals:
+    """What one policy's version has answered since the start, over all protocols."""
+
+    requests: int
+    failures: int
+    observations: int
+    runs: int  # of the network
+    request_s: float
+    inference_s: float
+    last_answer_ms: int  # since 1970; 0 where there was none
 
 
 class Metrics:
@@ -74,6 +92,8 @@ class Metrics:
         series.latency.add(seconds)
         series.inference.add(decision.infer_ms / 1e3)
         series.batch.add(batch)
+        series.runs += 1 / decision.sharers
+        series.last_answer_s = time.time()
 
     def failed(self, protocol: str, policy: str, version: str, code: str) -> None:
         """Count a request that got none; `policy` is empty unless it is loaded, so that nobody can make up labels."""
@@ -87,6 +107,20 @@ class Metrics:
     def requests(self, policy: str, version: str) -> int:
         """Return how many requests a version has answered, over all protocols."""
         return sum(sum(series.latency.counts) for key, series in self._answered.items() if key[:2] == (policy, version))
+
+    def totals(self, policy: str, version: str) -> Totals:
+        """Return the sums over a version's requests; what failed without asking for an action does not count."""
+        found = [series for key, series in self._answered.items() if key[:2] == (policy, version)]
+        failed = (count for key, count in self._failed.items() if key[:2] == (policy, version) and key[3] != IDLE)
+        return Totals(
+            requests=self.requests(policy, version),
+            failures=sum(failed),
+            observations=round(sum(series.batch.total for series in found)),
+            runs=round(sum(series.runs for series in found)),
+            request_s=sum(series.latency.total for series in found),
+            inference_s=sum(series.inference.total for series in found),
+            last_answer_ms=round(1e3 * max((series.last_answer_s for series in found), default=0.0)),
+        )
 
     def exposition(self, policies: dict[str, tuple[str, ...]]) -> bytes:
         """Return the text Prometheus reads; `policies` are the versions by name, the default last."""

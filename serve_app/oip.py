@@ -16,7 +16,6 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.types import Scope
 
+import rlservo
 from rlservo.export.bundle import REWARD, Contract, TensorSpec
 from rlservo.export.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.serve_app import wire
@@ -58,7 +58,14 @@ PLATFORM = "onnx_onnxv1"
 STATE_IN, STATE_OUT = "state_in.", "state_out."
 LAST_ACTION = "last_action"  # inputs like the outputs `action` and `action.<path>`
 STATE_POLICY = "state_policy"  # whose the states are
-EXTENSIONS = ("binary_tensor_data", "parameters", "sequence", "model_repository")
+EXTENSIONS = (
+    "binary_tensor_data",
+    "model_configuration",
+    "model_repository",
+    "parameters",
+    "sequence",
+    "statistics",
+)
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
 MODEL_NAME = "model_name"  # KServe's client says again what the path says
 # What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
@@ -652,7 +659,7 @@ def _add_models(app: FastAPI, core: Core) -> None:
 
 def server_metadata() -> dict[str, Any]:
     """Return who this is, and the extensions it speaks."""
-    return {"name": "rlservo", "version": _version(), "extensions": EXTENSIONS}
+    return {"name": "rlservo", "version": rlservo.__version__, "extensions": EXTENSIONS}
 
 
 def repository_index(core: Core, *, ready: bool = False) -> list[dict[str, str]]:
@@ -683,13 +690,6 @@ def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]
         "inputs": [described(tensor) for tensor in inputs],
         "outputs": [described(tensor) for tensor in contract.outputs if tensor.name in output_names(contract)],
     }
-
-
-def _version() -> str:
-    try:
-        return version("rlservo")
-    except PackageNotFoundError:  # run from a checkout that was never installed
-        return "0"
 
 
 def _json(document: Any) -> Response:

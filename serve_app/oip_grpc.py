@@ -30,7 +30,7 @@ from rlservo.export.errors import (
     RlservoError,
     TooLargeError,
 )
-from rlservo.serve_app import oip
+from rlservo.serve_app import oip, oip_config
 from rlservo.serve_app import oip_messages as messages
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import BUG, RETRY_AFTER_S, status_of
@@ -93,6 +93,12 @@ class InferenceService:
     async def ModelMetadata(self, request: Incoming, grpc_context: Any) -> Any:
         return await self._grpc.answer("ModelMetadata", request, grpc_context)
 
+    async def ModelConfig(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("ModelConfig", request, grpc_context)
+
+    async def ModelStatistics(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("ModelStatistics", request, grpc_context)
+
     async def ModelInfer(self, request: Incoming, grpc_context: Any) -> Any:
         return await self._grpc.answer("ModelInfer", request, grpc_context)
 
@@ -117,6 +123,8 @@ class Grpc:
             "ServerMetadata": lambda _request: messages.ServerMetadataResponse(**oip.server_metadata()),
             "ModelReady": self._model_ready,
             "ModelMetadata": self._model_metadata,
+            "ModelConfig": self._model_config,
+            "ModelStatistics": self._model_statistics,
             "RepositoryIndex": self._index,
         }
 
@@ -194,6 +202,16 @@ class Grpc:
         asked = _parse(messages.ModelMetadataRequest, request[0])
         return messages.ModelMetadataResponse(**oip.model_metadata(self._core, asked.name, asked.version or None))
 
+    def _model_config(self, request: Incoming) -> Any:
+        asked = _parse(messages.ModelConfigRequest, request[0])
+        config = oip_config.model_config(self._core, asked.name, asked.version or None)
+        return messages.ModelConfigResponse(config=_numbered(config))
+
+    def _model_statistics(self, request: Incoming) -> Any:
+        asked = _parse(messages.ModelStatisticsRequest, request[0])
+        found = oip_config.statistics(self._core, asked.name or None, asked.version or None)
+        return messages.ModelStatisticsResponse(model_stats=found)
+
     def _index(self, request: Incoming) -> Any:
         asked = _parse(messages.RepositoryIndexRequest, request[0])
         return messages.RepositoryIndexResponse(models=oip.repository_index(self._core, ready=asked.ready))
@@ -241,6 +259,16 @@ class Grpc:
                 PROTOCOL, decision.name, decision.version, taken, batch=batch, request_id=request_id
             )
         return reply
+
+
+def _numbered(document: Any) -> Any:
+    """Return a configuration with the names of its data types as the numbers that stand for them in a message."""
+    if isinstance(document, dict):
+        return {
+            key: messages.DATA_TYPES[value] if key == "data_type" else _numbered(value)
+            for key, value in document.items()
+        }
+    return [_numbered(each) for each in document] if isinstance(document, list) else document
 
 
 def _reply(answer: oip.Answer, request_id: str, *, raw: bool) -> Any:

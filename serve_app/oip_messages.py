@@ -30,8 +30,8 @@ _TYPES = {
 }
 _TENSOR = ["string name", "string datatype", "repeated int64 shape"]
 _VALUES = ["map InferParameter parameters", "InferTensorContents contents"]
-# message -> its fields in the order of their numbers; `oneof` fields share the one oneof of their message, and `map`
-# is from string. A nested message is written Outer.Inner, after its outer one.
+# message -> its fields in the order of their numbers, or with a number of their own (`= 17`); `oneof` fields share the
+# one oneof of their message, and `map` is from string. A nested message is written Outer.Inner, after its outer one.
 _MESSAGES: dict[str, list[str]] = {
     "ServerLiveRequest": [],
     "ServerLiveResponse": ["bool live"],
@@ -91,7 +91,58 @@ _MESSAGES: dict[str, list[str]] = {
     "RepositoryIndexRequest": ["string repository_name", "bool ready"],
     "RepositoryIndexResponse": ["repeated RepositoryIndexResponse.ModelIndex models"],
     "RepositoryIndexResponse.ModelIndex": ["string name", "string version", "string state", "string reason"],
+    # Of Triton's configuration and statistics only what is told here (`oip_config.py`). On the wire an enumeration is
+    # an int32: DATA_TYPES has its names.
+    "ModelConfigRequest": ["string name", "string version"],
+    "ModelConfigResponse": ["ModelConfig config"],
+    "ModelConfig": [
+        "string name = 1",
+        "string platform = 2",
+        "int32 max_batch_size = 4",
+        "repeated ModelConfig.Input input = 5",
+        "repeated ModelConfig.Output output = 6",
+        "string default_model_filename = 8",
+        "ModelConfig.DynamicBatching dynamic_batching = 11",
+        "ModelConfig.SequenceBatching sequence_batching = 13",
+        "string backend = 17",
+        "ModelConfig.TransactionPolicy model_transaction_policy = 19",
+    ],
+    "ModelConfig.Input": ["string name = 1", "int32 data_type = 2", "repeated int64 dims = 4", "bool optional = 8"],
+    "ModelConfig.Output": ["string name = 1", "int32 data_type = 2", "repeated int64 dims = 3"],
+    "ModelConfig.DynamicBatching": ["repeated int32 preferred_batch_size", "uint64 max_queue_delay_microseconds"],
+    "ModelConfig.SequenceBatching": [
+        "uint64 max_sequence_idle_microseconds = 1",
+        "repeated ModelConfig.State state = 5",
+    ],
+    "ModelConfig.State": ["string input_name", "string output_name", "int32 data_type", "repeated int64 dims"],
+    "ModelConfig.TransactionPolicy": ["bool decoupled"],
+    "ModelStatisticsRequest": ["string name", "string version"],
+    "ModelStatisticsResponse": ["repeated ModelStatistics model_stats"],
+    "ModelStatistics": [
+        "string name",
+        "string version",
+        "uint64 last_inference",
+        "uint64 inference_count",
+        "uint64 execution_count",
+        "InferStatistics inference_stats",
+        "repeated InferBatchStatistics batch_stats",
+    ],
+    "InferStatistics": [
+        "StatisticDuration success",
+        "StatisticDuration fail",
+        "StatisticDuration queue",
+        "StatisticDuration compute_input",
+        "StatisticDuration compute_infer",
+        "StatisticDuration compute_output",
+        "StatisticDuration cache_hit",
+        "StatisticDuration cache_miss",
+    ],
+    "InferBatchStatistics": ["uint64 batch_size"],
+    "StatisticDuration": ["uint64 count", "uint64 ns"],
 }
+_DATA_TYPES = "INVALID BOOL UINT8 UINT16 UINT32 UINT64 INT8 INT16 INT32 INT64 FP16 FP32 FP64"
+DATA_TYPES = {f"TYPE_{name}": number for number, name in enumerate(_DATA_TYPES.split())}
+"""Triton's numbers of the data types in a ModelConfig."""
 
 
 def _file() -> descriptor_pb2.FileDescriptorProto:
@@ -101,8 +152,9 @@ def _file() -> descriptor_pb2.FileDescriptorProto:
         outer, _, inner = name.rpartition(".")
         message = made[outer].nested_type.add(name=inner) if outer else file.message_type.add(name=inner)
         made[name] = message
-        for number, declaration in enumerate(fields, start=1):
-            _add_field(message, f".{PACKAGE}.{name}", number, declaration)
+        for position, declaration in enumerate(fields, start=1):
+            field, _, number = declaration.partition(" = ")
+            _add_field(message, f".{PACKAGE}.{name}", int(number or position), field)
     return file
 
 
@@ -145,6 +197,10 @@ ModelReadyRequest: Any = _message("ModelReadyRequest")
 ModelReadyResponse: Any = _message("ModelReadyResponse")
 ModelMetadataRequest: Any = _message("ModelMetadataRequest")
 ModelMetadataResponse: Any = _message("ModelMetadataResponse")
+ModelConfigRequest: Any = _message("ModelConfigRequest")
+ModelConfigResponse: Any = _message("ModelConfigResponse")
+ModelStatisticsRequest: Any = _message("ModelStatisticsRequest")
+ModelStatisticsResponse: Any = _message("ModelStatisticsResponse")
 ModelInferRequest: Any = _message("ModelInferRequest")
 ModelInferResponse: Any = _message("ModelInferResponse")
 ModelStreamInferResponse: Any = _message("ModelStreamInferResponse")

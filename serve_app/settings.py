@@ -72,7 +72,8 @@ class ServerSettings(BaseModel):
     API keys takes any name unless some are given here: a web page whose name leads to it has no key."""
 
     default_policy: str | None = None
-    """The policy of a WebSocket at `/`, where openpi's clients connect; the only one, where there is one."""
+    """The policy of a WebSocket at `/`, where openpi's clients connect; the only one, where there is one.
+    `rlservo serve --default-policy` sets it, too."""
 
     log_file: str | None = None
     """Append the log to this file; without one it goes to standard error, which Ray keeps in its session folder."""

@@ -51,6 +51,7 @@ class Decision:
     batch: int | None = None  # how many observations there were; None for one that came alone
     notices: tuple[str, ...] = ()  # what was out of bounds or limited, and used all the same
     episode: EpisodeNote | None = None
+    sharers: int = 1  # requests whose observations were computed in the same run of the network
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,7 +272,9 @@ class PolicyStore:
         action = policy.action(computed.outputs, batch=batch)
         infer_ms = read_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
         space = policy.contract.action_space
-        return Decision(action, name, policy.contract.version, infer_ms, batch_of(action, space), notices)
+        version = policy.contract.version
+        sharers = computed.requests
+        return Decision(action, name, version, infer_ms, batch_of(action, space), notices, sharers=sharers)
 
     def close(self) -> None:
         """Close every policy; what is waiting to be computed with others is computed."""

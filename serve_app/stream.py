@@ -38,6 +38,7 @@ from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import encode_bug, error_answer, request_id, session_of
 from rlservo.serve_app.keys import Access
 from rlservo.serve_app.logs import FIELDS
+from rlservo.serve_app.metrics import IDLE
 from rlservo.serve_app.sessions import Session
 from rlservo.serve_app.store import Decision
 
@@ -113,7 +114,7 @@ class Stream:
                 raise
             if sys.version_info >= (3, 11) and (task := asyncio.current_task()) is not None:
                 task.uncancel()  # Python counts cancellations
-            self._core.failed(PROTOCOL, name, version, "idle")
+            self._core.failed(PROTOCOL, name, version, IDLE)
             self._core.log.failed(
                 PROTOCOL, name, version, "idle", "silent for too long", request_id=conversation.request_id
             )
@@ -243,7 +244,7 @@ class Stream:
         if default is None:
             raise UnknownPolicyError(
                 f"this server has no default policy, but {', '.join(names)}: connect to /v1/policies/NAME/stream, or "
-                "set RLSERVO_DEFAULT_POLICY",
+                "serve with --default-policy (RLSERVO_DEFAULT_POLICY)",
                 {"policies": list(names)},
             )
         return default, None

@@ -39,7 +39,17 @@ def test_wheel_holds_every_module_and_asset_and_no_foreign_top_level(wheel: Path
     for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*"):
             if path.suffix in {".py", ".yaml"} or path.name == "py.typed":
-                assert f"rlservo/{path.relative_to(ROOT)}" in names
+                inside = path.relative_to(ROOT / "deploy") if path.parent.name == "package" else path.relative_to(ROOT)
+                assert f"rlservo/{inside}".replace("rlservo/package/", "rlservo/") in names
+
+
+def test_metadata_installs_no_developers_tools_and_has_no_placeholder(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        text = archive.read(next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))).decode()
+    head, _, readme = text.partition("\n\n")
+    (everything,) = [line for line in head.splitlines() if line.endswith('extra == "all"')]
+    assert everything == 'Requires-Dist: rlservo[client,serve,sim,train]; extra == "all"'
+    assert "<this repository>" not in readme
 
 
 @pytest.mark.slow
@@ -56,8 +66,13 @@ def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -
     listed = run(str(python), "-m", "pip", "list", "--format=freeze").stdout.lower()
     for heavy in ("torch", "ray", "gymnasium", "mujoco", "fastapi", "onnx"):
         assert f"\n{heavy}==" not in f"\n{listed}"
-    loaded = run(str(python), "-c", "from rlservo.serve_app.policy import Policy; print(Policy.load)")
+    loaded = run(str(python), "-c", "import rlservo; print(rlservo.__version__, rlservo.Policy.load, rlservo.rollout)")
     assert loaded.returncode == 0, loaded.stderr
+    missing = run(str(python), "-c", "from rlservo import PolicyClient")
+    assert "rlservo.PolicyClient needs the Python package 'httpx': pip install 'rlservo[client]'" in missing.stderr
+    program = "import sys; print(*sorted(name for name in sys.modules if 'rlservo' in name), 'typing' in sys.modules)"
+    started = run(str(python), "-c", program)
+    assert started.stdout.split() == ["rlservo", "rlservo.envs", "rlservo.envs.discovery", "False"]
     rlservo = str(tmp_path / "env" / "bin" / "rlservo")
     assert run(rlservo, "--version").stdout.startswith("rlservo ")
     refused = run(rlservo, "serve", ".")

@@ -189,6 +189,51 @@ def test_every_command_has_help_with_an_example() -> None:
         assert "Example" in done.stdout
 
 
+def test_serve_refuses_a_default_policy_that_is_not_served(policies: Path) -> None:
+    done = rlservo("serve", policies, "--default-policy", "mir100")
+    refused(done, 2, "the default policy 'mir100' is not among those to serve: ur5")
+    assert "starting" not in done.stderr
+
+
+HEAVY = {"asyncio", "fastapi", "grpc", "gymnasium", "httpx", "mujoco", "numpy", "onnxruntime", "ray", "rich",
+         "starlette", "torch"}  # fmt: skip
+MODULES_OF = """
+import sys
+from rlservo.deploy.cli import main
+try:
+    main()
+finally:
+    print(*sorted({name.split(".")[0] for name in sys.modules}), file=sys.stderr)
+"""
+
+
+def modules_of(*words: object) -> set[str]:
+    """The top-level modules that a command has imported when it is done."""
+    done = subprocess.run(
+        [sys.executable, "-c", MODULES_OF, *map(str, words)], capture_output=True, text=True, timeout=300
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return set(done.stderr.splitlines()[-1].split())
+
+
+def test_help_imports_nothing_that_takes_time(policies: Path) -> None:
+    assert not modules_of("--help") & {*HEAVY, "pydantic", "importlib.metadata"}
+    # pydantic is typer's own for the options of a command.
+    for command in ("export", "prune", "inspect", "verify", "serve", "key", "rollout", "demo", "server-manager"):
+        assert not modules_of(command, "--help") & HEAVY, command
+    assert not modules_of("policy", "load", "--help") & HEAVY
+    assert not modules_of("robot-server", "ur", "--help") & HEAVY
+    assert not modules_of("--version") & HEAVY
+    assert not modules_of("key", "cell-7") & (HEAVY - {"rich"})
+    assert not modules_of("inspect", policies) & (HEAVY - {"rich", "numpy"})
+
+
+def test_lists_of_commands_are_whole_sentences() -> None:
+    for group in ((), ("policy",), ("robot-server",)):
+        listed = rlservo(*group, "--help").stdout.partition("Commands:")[2].splitlines()
+        assert len(listed) > 2 and all(line.endswith(".") and "..." not in line for line in listed if line), listed
+
+
 def test_unknown_command_and_option_exit_with_2() -> None:
     assert rlservo("deploy").returncode == 2
     assert rlservo("inspect", "--colour", "red").returncode == 2

@@ -227,7 +227,7 @@ def test_no_spelling_of_a_path_gets_around_the_keys(server: Served) -> None:
     before, asked = server.plan, 0
     opened = {path for _, path, access in paths(server.app) if access is Access.open}
     with Wire(server.port) as wire:
-        for verb, target, key, path, access in attempts(server.app, server.kind):
+        for verb, target, key, _path, access in attempts(server.app, server.kind):
             status, answer = wire.ask(verb, target, *(() if key is None else bearer(key)))
             shown = (verb, target, key and key[:12], status, answer[:200])
             asked += 1

@@ -70,7 +70,7 @@ def test_requests_are_counted_by_policy_version_protocol_and_outcome(
         assert seen["rlservo_requests_total", "ok", "ur5", "json", "2"] == 1
         assert seen["rlservo_requests_total", "ok", "ur5", "oip", "10"] == 1
         assert seen["rlservo_requests_total", "ok", "ur5", "websocket", "10"] == 1
-        assert seen["rlservo_requests_total", "bad-observation", "ur5", "json", ""] == 1
+        assert seen["rlservo_requests_total", "bad-observation", "ur5", "json", "10"] == 1  # the default's
         assert seen["rlservo_requests_total", "unknown-policy", "", "json", ""] == 2  # one series for any made-up name
         assert seen["rlservo_requests_total", "unknown-version", "ur5", "json", ""] == 1
         assert seen["rlservo_batch_size_sum", "ur5", "json", "2"] == 5

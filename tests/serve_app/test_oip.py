@@ -96,6 +96,19 @@ def test_tritons_own_client_works_unchanged(
     assert len(facts["index"]) == 5
     older = facts["older"]
     assert (older["id"], older["model_version"], older["parameters"]["seq"]) == ("r-7", "2", 5)
+    measured = facts["measured"]
+    assert measured["config"]["max_batch_size"] == 64
+    assert measured["config"]["input"] == [{"name": "obs", "data_type": "TYPE_FP32", "dims": [27]}]
+    (before,), (after,) = measured["before"]["model_stats"], measured["after"]["model_stats"]
+    assert (after["name"], after["version"]) == ("ur5", "2")
+    assert after["inference_count"] - before["inference_count"] == 3 + len(BATCH)
+    assert after["execution_count"] - before["execution_count"] == 4
+    gained = {name: after["inference_stats"][name]["count"] - before["inference_stats"][name]["count"]
+              for name in ("success", "fail")}  # fmt: skip
+    assert gained == {"success": 4, "fail": 1}
+    assert [(each["name"], each["version"]) for each in measured["all"]["model_stats"]] == [
+        ("gridworld", "1"), ("unsafe", "1"), ("ur5", "1"), ("ur5", "2"), ("ur5", "10")
+    ]  # fmt: skip
     assert facts["dtypes"] == ["float32"]
     expected = store.act("ur5", None, BATCH).action
     np.testing.assert_array_equal(np.float32(facts["actions"].pop("older")), store.act("ur5", "2", BATCH).action)

@@ -95,8 +95,26 @@ def test_tritons_client_gets_everything_unchanged(
         "parameter": "INVALID_ARGUMENT",
         "walk": "NOT_FOUND",
         "late": "DEADLINE_EXCEEDED",
-        "config": "UNIMPLEMENTED",
+        "config": "NOT_FOUND",
+        "statistics": "NOT_FOUND",
+        "config without a key": "UNAUTHENTICATED",
     }
+    assert got["config"] == {
+        "name": "ur5",
+        "platform": "onnx_onnxv1",
+        "backend": "onnxruntime",
+        "max_batch_size": 4096,
+        "input": [{"name": "obs", "data_type": "TYPE_FP32", "dims": ["27"]}],
+        "output": [{"name": "action", "data_type": "TYPE_FP32", "dims": ["6"]}],
+        "default_model_filename": "policy.onnx",
+        "model_transaction_policy": {},
+    }
+    assert {(each["name"], each["version"]) for each in got["all"]} >= {("ur5", "2"), ("ur5", "10"), ("gridworld", "1")}
+    (before,), (after,) = got["before"], got["after"]
+    assert (after["name"], after["version"]) == ("ur5", "2")
+    assert int(after["inference_count"]) - int(before.get("inference_count", 0)) == len(OBS)
+    assert int(after["execution_count"]) - int(before.get("execution_count", 0)) == 1
+    assert int(after["inference_stats"]["success"]["ns"]) > int(after["inference_stats"]["compute_infer"]["ns"]) > 0
     assert "element 3 (element_3) of observation 0 is nan" in got["refused"]["nan"][1]
 
 

@@ -73,9 +73,14 @@ def main() -> None:
         out["server"] = client.get_server_metadata(headers=headers, as_json=True)
         out["model"] = client.get_model_metadata(MODEL, headers=headers, as_json=True)
         out["index"] = client.get_model_repository_index(headers=headers, as_json=True)
+        out["config"] = client.get_model_config(MODEL, headers=headers, as_json=True)["config"]
+        counts = partial(client.get_inference_statistics, MODEL, "2", headers=headers, as_json=True)
+        out["before"] = counts()["model_stats"]
+        out["all"] = client.get_inference_statistics(headers=headers, as_json=True)["model_stats"]
         reply = ask(tensor(obs), request_id="r1", outputs=[triton.InferRequestedOutput("action")])
         out["action"], out["id"] = reply.as_numpy("action").tolist(), reply.get_response().id
         out["version_2"] = ask(tensor(obs), model_version="2").as_numpy("action").tolist()
+        out["after"] = counts()["model_stats"]
         for name in ("gzip", "deflate"):
             out[name] = ask(tensor(obs), compression_algorithm=name).as_numpy("action").tolist()
         explored = [ask(tensor(obs), parameters={"explore": True, "seed": 5}).as_numpy("action") for _ in range(2)]
@@ -99,7 +104,9 @@ def main() -> None:
             "parameter": refusal(lambda: ask(tensor(obs), parameters={"speed": 3})),
             "walk": refusal(lambda: client.infer("../ur5", tensor(obs), headers=headers)),
             "late": refusal(lambda: ask(tensor(obs), timeout=1)),  # [us]
-            "config": refusal(lambda: client.get_model_config(MODEL, headers=headers)),
+            "config": refusal(lambda: client.get_model_config("nobody", headers=headers)),
+            "statistics": refusal(lambda: client.get_inference_statistics(MODEL, "77", headers=headers)),
+            "config without a key": refusal(lambda: client.get_model_config(MODEL)),
         }
     out["aio"] = asyncio.run(over_aio(url, headers, obs))
     print(json.dumps(out))

@@ -50,6 +50,24 @@ async def over_aio(url: str, obs: Any) -> dict[str, Any]:
         return {"ready": ready, "plain": plain.as_numpy("action"), "packed": packed.as_numpy("action")}
 
 
+def as_perf_analyzer_asks(client: Any, obs: Any) -> dict[str, Any]:
+    """What it asks, in its order: the model, how it is run, and its counts before and after the requests."""
+    model, config = client.get_model_metadata(MODEL, "2"), client.get_model_config(MODEL, "2")
+    before = client.get_inference_statistics(MODEL, "2")
+    for _ in range(3):
+        client.infer(MODEL, tensor(obs[:1]), model_version="2")
+    client.infer(MODEL, tensor(obs), model_version="2")
+    refusal(lambda: client.infer(MODEL, tensor(obs[:, :26]), model_version="2"))
+    after = client.get_inference_statistics(MODEL, "2")
+    return {
+        "model": model,
+        "config": config,
+        "before": before,
+        "after": after,
+        "all": client.get_inference_statistics(),
+    }
+
+
 def main() -> None:
     url = sys.argv[1]
     obs = np.array(json.load(sys.stdin)["obs"], np.float32)
@@ -89,6 +107,7 @@ def main() -> None:
             "version": client.get_model_metadata(MODEL, "2"),
             "index": client.get_model_repository_index(),
             "older": older.get_response(),
+            "measured": as_perf_analyzer_asks(client, obs),
             "unknown": refusal(lambda: client.infer("nobody", tensor(obs))),
             "short": refusal(lambda: client.infer(MODEL, tensor(obs[:, :26]))),
             "nan": refusal(lambda: client.infer(MODEL, tensor(np.full((1, 27), np.nan, np.float32)))),

@@ -1,0 +1,92 @@
+"""The public names of rlservo, loaded when they are first used.
+
+```python
+import rlservo
+
+policy = rlservo.Policy.load("policies/ur5")
+action = policy.act(obs)
+```
+
+This is the package `rlservo` itself (pyproject.toml maps it here). Python imports it at every start, through the file
+`rlservo-gymnasium.pth` (envs/discovery.py), so it imports nothing until a name is asked for.
+"""
+
+from __future__ import annotations
+
+TYPE_CHECKING = False  # type checkers read the name as true; importing it from `typing` takes milliseconds
+if TYPE_CHECKING:
+    from rlservo.export import errors
+    from rlservo.export.exporter import export_checkpoint
+    from rlservo.serve_app.acting import ActingPolicy
+    from rlservo.serve_app.admin_client import AdminClient
+    from rlservo.serve_app.client import PolicyClient
+    from rlservo.serve_app.fallback import WithFallback
+    from rlservo.serve_app.policy import Policy
+    from rlservo.serve_app.rollout import rollout
+    from rlservo.serve_app.stream_client import StreamClient
+
+    __version__: str
+
+__all__ = [
+    "ActingPolicy",
+    "AdminClient",
+    "Policy",
+    "PolicyClient",
+    "StreamClient",
+    "WithFallback",
+    "__version__",
+    "errors",
+    "export_checkpoint",
+    "rollout",
+]
+
+# Public name -> the module that holds it, and the extra that installs what it needs beyond the in-process runtime.
+_MODULES = {
+    "ActingPolicy": ("rlservo.serve_app.acting", ""),
+    "AdminClient": ("rlservo.serve_app.admin_client", "client"),
+    "Policy": ("rlservo.serve_app.policy", ""),
+    "PolicyClient": ("rlservo.serve_app.client", "client"),
+    "StreamClient": ("rlservo.serve_app.stream_client", "client"),
+    "WithFallback": ("rlservo.serve_app.fallback", ""),
+    "errors": ("rlservo.export", ""),
+    "export_checkpoint": ("rlservo.export.exporter", "train"),
+    "rollout": ("rlservo.serve_app.rollout", ""),
+}
+
+if not TYPE_CHECKING:  # a type checker would take it for a promise of every name
+
+    def __getattr__(name: str) -> object:
+        """Import what `name` is when it is first asked for, and keep it."""
+        if name == "__version__":
+            value = _installed_version()
+        elif name in _MODULES:
+            value = _load(name, *_MODULES[name])
+        else:
+            raise AttributeError(f"module 'rlservo' has no attribute {name!r}")
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
+def _load(name: str, module: str, extra: str) -> object:
+    try:
+        # What `from module import name` does: the name may be a module itself.
+        return getattr(__import__(module, fromlist=[name]), name)
+    except ModuleNotFoundError as error:
+        if not extra or (error.name or "").startswith("rlservo"):
+            raise
+        raise ModuleNotFoundError(
+            f"rlservo.{name} needs the Python package {error.name!r}: pip install 'rlservo[{extra}]'", name=error.name
+        ) from None
+
+
+def _installed_version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("rlservo")
+    except PackageNotFoundError:  # the folders were put on the path by hand
+        return "unknown"

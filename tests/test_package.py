@@ -1,0 +1,81 @@
+"""The public names of `import rlservo`: which there are, and what they import when. `make check` holds their types."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+import rlservo
+
+ROOT = Path(__file__).resolve().parent.parent
+UR5 = ROOT / "examples" / "checkpoints" / "ur5_positioning"
+NAMES = [
+    "ActingPolicy",
+    "AdminClient",
+    "Policy",
+    "PolicyClient",
+    "StreamClient",
+    "WithFallback",
+    "__version__",
+    "errors",
+    "export_checkpoint",
+    "rollout",
+]
+
+
+def python(program: str, *words: object, cwd: Path = ROOT) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program), *map(str, words)],
+        capture_output=True, text=True, timeout=300, cwd=cwd,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_public_names_are_all_there_and_nothing_else() -> None:
+    assert rlservo.__all__ == NAMES == dir(rlservo)
+    for name in NAMES:
+        assert getattr(rlservo, name) is not None
+    assert rlservo.Policy.__module__.startswith("rlservo.") and rlservo.Policy.__name__ == "Policy"
+    assert issubclass(rlservo.errors.UsageError, rlservo.errors.RlservoError)
+    assert isinstance(rlservo.__version__, str) and rlservo.__version__[0].isdigit()
+    with pytest.raises(AttributeError, match="module 'rlservo' has no attribute 'Polcy'"):
+        rlservo.Polcy  # type: ignore[attr-defined]  # noqa: B018
+
+
+@pytest.mark.parametrize("folder", [ROOT, Path("/")], ids=["in the checkout", "elsewhere"])
+def test_importing_it_imports_nothing(folder: Path) -> None:
+    program = """
+        import sys
+        before = set(sys.modules)
+        import rlservo
+        import rlservo.envs
+        print(sorted(set(sys.modules) - before))
+        print(sorted(name for name in before if name.startswith("rlservo")))
+    """
+    # The file rlservo-gymnasium.pth has imported these at Python's start.
+    assert python(program, cwd=folder).splitlines() == ["[]", "['rlservo', 'rlservo.envs', 'rlservo.envs.discovery']"]
+
+
+def test_first_action_needs_no_event_loop_and_no_server(tmp_path: Path) -> None:
+    rlservo.export_checkpoint(UR5, tmp_path, name="ur5", notify=lambda _sentence: None)
+    program = """
+        import os, sys, time
+        os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+        import numpy, onnxruntime
+        before, began = set(sys.modules), time.process_time()
+        import rlservo
+        action = rlservo.Policy.load(sys.argv[1]).act(numpy.zeros(27, numpy.float32))
+        spent = time.process_time() - began
+        assert action.shape == (5,), action
+        print(f"{spent:.3f}", *sorted({name.partition(".")[0] for name in set(sys.modules) - before}))
+    """
+    spent, *modules = python(program, tmp_path / "ur5").split()
+    print(f"from numpy and onnxruntime to the first action: {spent} s of CPU time")
+    unwanted = {"asyncio", "fastapi", "gymnasium", "httpx", "multiprocessing", "ray", "rich", "ssl", "starlette",
+                "torch", "typer", "websockets"}  # fmt: skip
+    assert "pydantic" in modules and not unwanted & set(modules)
