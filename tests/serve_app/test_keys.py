@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import http.client
 import json
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -19,6 +20,7 @@ from rlservo.export.errors import UsageError
 from rlservo.serve_app.control import Control
 from rlservo.serve_app.http import create_app
 from rlservo.serve_app.keys import Keys, Role, check_exposure, is_loopback, new_key
+from rlservo.serve_app.request_checks import Hosts
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
 
@@ -182,3 +184,31 @@ def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served
             with pytest.raises(InvalidStatus) as caught:
                 stream(port, origin=origin)
             assert caught.value.response.status_code == 403
+
+
+def asked_as(host: str, listening_on: str, *, keyed: bool = False, allowed: str = "") -> bool:
+    return Hosts(listening_on, ServerSettings(allowed_hosts=allowed), keyed=keyed).permit(host.encode())
+
+
+def test_a_server_answers_to_its_own_names_and_addresses() -> None:
+    for host in ("localhost", "LOCALHOST:8000", "localhost.", "127.0.0.1:8000", "127.3.2.1", "[::1]", "[::1]:8000"):
+        for listening_on in ("127.0.0.1", "::1", "0.0.0.0", "192.168.0.7"):
+            assert asked_as(host, listening_on), (host, listening_on)
+    for host in ("evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "", ":8000", "a b", "evil:x", "é"):
+        for listening_on in ("127.0.0.1", "0.0.0.0", "robot.lan"):
+            assert not asked_as(host, listening_on), (host, listening_on)
+    # An address cannot lead elsewhere, as a name can; beyond this machine it may be one that we do not know of.
+    assert not asked_as("10.1.2.3:8000", "127.0.0.1") and not asked_as("0.0.0.0:8000", "127.0.0.1")
+    assert asked_as("10.1.2.3:8000", "0.0.0.0") and asked_as("[fe80::1]:8000", "::")
+    assert asked_as(socket.gethostname(), "0.0.0.0") and asked_as(f"{socket.gethostname()}.local:8000", "0.0.0.0")
+    assert asked_as("robot.lan:8000", "robot.lan")
+
+
+def test_further_names_are_a_setting_and_keys_do_without() -> None:
+    assert asked_as("robot-7.lan:8000", "127.0.0.1", allowed=" proxy.lan, Robot-7.lan")
+    assert asked_as("evil.example", "127.0.0.1", allowed="*")
+    assert asked_as("policies.default.svc:8000", "0.0.0.0", keyed=True)  # a page has no key, whatever name it is of
+    assert not asked_as("other.example", "0.0.0.0", keyed=True, allowed="robot-7.lan")
+    assert not asked_as("evil.example", "127.0.0.1", keyed=True)
+    with pytest.raises(UsageError, match=r"RLSERVO_ALLOWED_HOSTS is not usable: .* expected names without scheme"):
+        ServerSettings.from_environment(environment={"RLSERVO_ALLOWED_HOSTS": "http://robot-7.lan"})
