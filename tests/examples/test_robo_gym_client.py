@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,7 +44,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     )
     try:
         with PolicyClient(f"http://127.0.0.1:{port}", "ur5") as waiting:
-            waiting.wait_until_ready(120.0)
+            waiting.wait_until_ready(300.0)
         yield f"http://127.0.0.1:{port}"
     finally:
         server.send_signal(signal.SIGINT)
@@ -87,7 +90,7 @@ def test_served_policies_arrive_in_robo_gyms_environments(
         line = ("--url", url, "--manager-port", str(manager.port), "--episodes", str(episodes), "--json")
         done = run(robo_gym_python, light_client, "--task", task, *line)
         assert done.returncode == 0, done.stderr
-        report = json.loads(done.stdout[done.stdout.index("{") : done.stdout.rindex("}") + 1])
+        report = json.loads(done.stdout)  # one document, whatever robo-gym prints
         assert report["environment"] == f"{task}Sim-v0"
         assert report["episodes"] == episodes
         assert report["successes"] >= expected, report["endings"]
@@ -109,21 +112,117 @@ def test_client_needs_neither_ray_nor_a_new_protobuf(robo_gym_python: Path, ligh
     assert done.stdout.strip().endswith("[]")
 
 
-def test_an_arms_model_for_the_mobile_robot_is_refused(robo_gym_python: Path, light_client: Path) -> None:
-    done = run(robo_gym_python, light_client, "--task", "ObstacleAvoidanceMir100", "--ur-model", "ur10")
-    assert done.returncode == 2
-    assert done.stderr.strip().endswith("--ur-model is for UR tasks, and ObstacleAvoidanceMir100 has a MiR100")
+def assert_sentence(done: subprocess.CompletedProcess[str], code: int, sentence: str) -> None:
+    assert done.returncode == code, done.stderr
+    assert re.search(sentence, done.stderr.strip().splitlines()[-1]), done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
 
 
-def test_missing_server_is_one_sentence(robo_gym_python: Path, light_client: Path) -> None:
-    manager = ServerManager(port=0, servers=RobotServers())
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ("--task ObstacleAvoidanceMir100 --ur-model ur10", "--ur-model is for UR tasks, and .* has a MiR100$"),
+        ("--ur-model ur7", "invalid choice: 'ur7' .*ur16e"),
+        ("--task Positioning", "invalid choice: 'Positioning' .*EndEffectorPositioningUR"),
+        ("--episodes 0", "--episodes is 0: expected at least 1"),
+        ("--manager-port 70000", "--manager-port is 70000: expected 1 to 65535"),
+        ("--rs-address robot", "--rs-address is 'robot': expected host:port"),
+        ("--rs-address robot:99999999999999", "expected host:port"),
+    ],
+)
+def test_wrong_arguments_are_one_sentence(
+    robo_gym_python: Path, light_client: Path, arguments: str, sentence: str
+) -> None:
+    assert_sentence(run(robo_gym_python, light_client, *arguments.split()), 2, sentence)
+
+
+def test_nobody_there_is_one_sentence_and_not_minutes(robo_gym_python: Path, light_client: Path) -> None:
+    (port,) = free_ports(1)
+    with socket.socket() as silent:  # accepts, and never answers
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        mute = silent.getsockname()[1]
+        for arguments, sentence in (
+            (
+                f"--manager-port {port}",
+                f"no server manager answers at 127.0.0.1:{port}: start one with 'rlservo server-",
+            ),
+            (f"--manager-port {mute}", f"no server manager answers at 127.0.0.1:{mute}"),
+            (f"--rs-address 127.0.0.1:{port}", f"--rs-address 127.0.0.1:{port}: no robot server answers there"),
+            (f"--rs-address 127.0.0.1:{mute}", f"--rs-address 127.0.0.1:{mute}: no robot server answers there"),
+            ("--manager 203.0.113.7", "203.0.113.7:50100 cannot be reached: "),
+            ("--rs-address nowhere.invalid:50051", "nowhere.invalid:50051 cannot be reached: "),
+        ):
+            began = time.monotonic()
+            done = run(robo_gym_python, light_client, *arguments.split())
+            assert_sentence(done, 1, f"^error: {sentence}")
+            assert time.monotonic() - began < 60.0  # five seconds, on an idle machine
+
+
+def test_missing_policy_server_policy_or_room_is_one_sentence_and_leaves_nothing(
+    robo_gym_python: Path, light_client: Path, url: str
+) -> None:
+    manager = ServerManager(port=0, servers=RobotServers(max_servers=1))
     try:
-        done = run(
-            robo_gym_python, light_client, "--url", "http://127.0.0.1:1", "--manager-port", str(manager.port),
-            "--episodes", "1",
-        )  # fmt: skip
+        to = ("--manager-port", str(manager.port), "--episodes", "1")
+        for arguments, sentence in (
+            (("--url", "http://127.0.0.1:1"), "127.0.0.1:1"),
+            (("--url", url, "--policy", "ur55"), "ur55"),
+            (("--url", url, "--policy", "mir100"), "mir100"),  # another robot's
+        ):
+            assert_sentence(run(robo_gym_python, light_client, *to, *arguments), 1, f"^error: .*{sentence}")
+            assert manager.servers.running == {}
+        manager.servers.start("roslaunch mir100_robot_server sim_robot_server.launch")
+        done = run(robo_gym_python, light_client, *to, "--url", url)
+        assert_sentence(done, 1, "could not be started: Failed 10 tentatives .* log of the server manager .* says why")
+        assert len(manager.servers.running) == 1
     finally:
         manager.close()
-    assert done.returncode == 1
-    assert "error: " in done.stderr
-    assert "Traceback" not in done.stderr
+
+
+class SlowToStart(RobotServers):
+    """A manager that takes its time, as robo-gym's own does."""
+
+    starts = 0
+
+    def start(self, line: str, *, gui: bool = False) -> int:
+        self.starts += 1
+        time.sleep(3.0)
+        return super().start(line, gui=gui)
+
+
+@pytest.mark.parametrize("during", ["start", "episodes"])
+def test_ctrl_c_ends_with_130_and_no_simulator(
+    robo_gym_python: Path, light_client: Path, url: str, during: str
+) -> None:
+    servers = SlowToStart() if during == "start" else RobotServers()
+    manager = ServerManager(port=0, servers=servers)
+    line = ["--url", url, "--manager-port", str(manager.port), "--episodes", "1000", "--json"]
+    process = subprocess.Popen(
+        [str(robo_gym_python), str(EXAMPLE), *line],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(light_client)},
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 120
+        while not (servers.starts if isinstance(servers, SlowToStart) else servers.running):
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        time.sleep(0.5 if during == "start" else 15.0)  # long enough for an episode to end
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+        assert process.returncode == 130, err
+        assert err.strip().splitlines()[-1] == "stopped"
+        assert "Traceback" not in err
+        assert servers.running == {}
+        if during == "start":
+            assert out == ""
+            assert isinstance(servers, SlowToStart) and servers.starts == 1
+        else:
+            report = json.loads(out)
+            assert report["interrupted"] and report["episodes"] == sum(report["endings"].values()) >= 1
+    finally:
+        process.kill()
+        process.wait()
+        manager.close()
