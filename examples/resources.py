@@ -44,7 +44,9 @@ class Room:
 def ray_room(name: str) -> Room:
     """Return the room of the Ray that this process is connected to."""
     nodes = [node for node in ray.nodes() if node["Alive"]]
-    return Room(name, tuple(node["Resources"] for node in nodes), any(NODE_GROUP in node["Labels"] for node in nodes))
+    return Room(
+        name, tuple(node["Resources"] for node in nodes), any(NODE_GROUP in node.get("Labels", {}) for node in nodes)
+    )
 
 
 def request_of(config: AlgorithmConfig) -> list[dict[str, float]]:
@@ -73,7 +75,7 @@ def check_room(
     """Raise UsageError when a trial, or `concurrent` of them at once, cannot ever run there.
 
     `config` is the request's: with it the message has a number of env runners that fits. A cluster that may grow is not
-    judged by what it has now; `waiting_is_said` tells what it is waited for.
+    judged by what it has now; `waiting_is_said` says what the run waits for.
     """
     if room.grows:
         return
