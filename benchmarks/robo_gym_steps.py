@@ -8,6 +8,7 @@ the client's processor time per step.
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 import time
@@ -15,7 +16,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import robo_gym  # noqa: F401 (registers the environments)
 from google.protobuf.internal import api_implementation
 
 ENVIRONMENTS = {"ur5": "EndEffectorPositioningURSim-v0", "mir100": "ObstacleAvoidanceMir100Sim-v0"}
@@ -46,6 +46,7 @@ def measure(env_id: str, port: int, seconds: float, rounds: int) -> dict[str, An
 
 
 def main() -> None:
+    importlib.import_module("robo_gym")  # registers its environments
     port, seconds, rounds = int(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
     results = {name: measure(env_id, port, seconds, rounds) for name, env_id in ENVIRONMENTS.items()}
     python = f"{sys.version_info[0]}.{sys.version_info[1]}"

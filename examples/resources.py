@@ -115,10 +115,10 @@ def _fitting(request: Sequence[Bundle], room: Room, at_most: int) -> int:
 
 
 def _advice(request: Sequence[Bundle], room: Room, name: str, config: AlgorithmConfig | None) -> str:
-    if name == "GPU":
-        return "leave --num-gpus out to learn on the CPU"
     if config is None:
         return "go on where there are as many, or start a new run"
+    if name == "GPU":
+        return "leave --num-gpus out to learn on the CPU"
     each: object = config.num_cpus_per_env_runner
     if not isinstance(each, int | float):
         return "leave the values out that ask for as many"  # it is swept

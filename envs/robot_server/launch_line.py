@@ -33,7 +33,7 @@ MIR100_KNOWN = {"world_name", "server_port"}
 _OBJECT = re.compile(r"object_([0-9]{1,3})_(model_name|frame)")
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _PORT = re.compile(r"[0-9]{1,9}")
-MAX_LINE, MAX_WORD = 10_000, 1_000  # [characters]; robo-gym's own lines have about 600, their longest word 60
+MAX_LINE, MAX_VALUE = 10_000, 1_000  # [characters]; robo-gym's own lines have about 600, their longest value 40
 
 
 def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host: str = "127.0.0.1") -> Settings:
@@ -60,8 +60,8 @@ def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host
         name, assigned, value = word.partition(":=")
         if not assigned or not _NAME.fullmatch(name):
             raise ValueError(f"{word[:200]!r} is no launch argument: expected name:=value")
-        if len(value) > MAX_WORD or not value.isprintable():  # it may stand in the log, on a line of its own
-            raise ValueError(f"{name} is {value[:200]!r}: expected at most {MAX_WORD:,} printable characters")
+        if len(value) > MAX_VALUE or not value.isprintable():  # it may stand in the log, on a line of its own
+            raise ValueError(f"{name} is {value[:200]!r}: expected at most {MAX_VALUE:,} printable characters")
         arguments[name] = value
     return read(arguments, gui, clock, host)
 

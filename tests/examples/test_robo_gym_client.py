@@ -250,14 +250,15 @@ def running(command: str, port: int) -> Iterator[None]:
     words = re.sub(r" --port \d+", "", command).split()
     assert words[0] == "rlservo"
     line = [sys.executable, "-m", "rlservo.deploy.cli", *words[1:], "--port", str(port)]
-    process = subprocess.Popen(line, stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        assert f":{port}" in process.stdout.readline()
-        yield
-    finally:
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert f":{port}" in process.stdout.readline()
+            yield
+        finally:
+            process.send_signal(signal.SIGINT)
+            ended = process.wait(60)
+        assert ended == 0
 
 
 def test_document_names_what_the_tests_install_and_serve() -> None:
