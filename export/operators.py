@@ -3,7 +3,7 @@
 torch's exporters leave out `hypot`, `searchsorted` and `copysign`, divide by zero in `atan2`, lose the remainder of
 large angles in `%`, and write double-precision `atan` for a kernel that onnxruntime does not have. While
 `exact_operators` is entered, torch's Python functions, methods and operators of these names compute what torch itself
-computes (ATen/native/cpu, torch 2.13) in steps that survive both exporters. TorchScript needs none of it: it runs torch.
+computes (ATen/native, torch 2.13) in steps that survive both exporters. TorchScript needs none of it: it runs torch.
 
 A rounding is promised where the operator itself rounds: `hypot`, `atan2` and the logarithms to a few units in the last
 place, functions without a double-precision kernel to single precision. The rest is bit by bit.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -20,7 +21,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 
-class exact_operators(TorchFunctionMode):  # noqa: N801  # entered like a function: `with exact_operators():`
+class exact_operators(TorchFunctionMode):  # entered like a function: `with exact_operators():`
     """While it is entered, the operators of EXACT compute by their exportable compositions."""
 
     def __torch_function__(
@@ -185,7 +186,7 @@ def _diff(x: Tensor, n: int = 1, dim: int = -1, prepend: Any = None, append: Any
     x = torch.cat([part for part in (prepend, x, append) if part is not None], dim)
     for _ in range(n):
         parts = torch.unbind(x, dim)
-        x = torch.stack([after - before for before, after in zip(parts, parts[1:], strict=False)], dim)
+        x = torch.stack([after - before for before, after in pairwise(parts)], dim)
     return x
 
 
@@ -284,7 +285,10 @@ def _softplus(x: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
     return torch.where(x * beta > threshold, x, _log1p(torch.exp(x * beta)) / beta)
 
 
-# Of one precision only
+# Of single precision only
+
+SINGLE_FUNCTIONS = ("sinh", "cosh", "asinh", "arcsinh", "acosh", "arccosh", "atanh", "arctanh", "erf", "det")
+SINGLE_ACTIVATIONS = ("celu", "elu", "gelu", "hardsigmoid", "hardswish", "mish", "selu", "softsign")
 
 
 def _in_single_precision(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -299,6 +303,20 @@ def _in_single_precision(function: Callable[..., Tensor]) -> Callable[..., Tenso
 
 
 _atan = _in_single_precision(torch.atan)
+
+
+def _asin(x: Tensor) -> Tensor:
+    """Of doubles through the arc tangent: near 1 the double's last bits decide."""
+    return torch.asin(x) if x.dtype != torch.float64 else _atan2(x, torch.sqrt((1.0 - x) * (1.0 + x)))
+
+
+def _acos(x: Tensor) -> Tensor:
+    return torch.acos(x) if x.dtype != torch.float64 else _atan2(torch.sqrt((1.0 - x) * (1.0 + x)), x)
+
+
+def _tan(x: Tensor) -> Tensor:
+    return torch.tan(x) if x.dtype != torch.float64 else torch.sin(x) / torch.cos(x)
+
 
 EXACT: dict[str, Callable[..., Any]] = {
     "hypot": _hypot,
@@ -350,18 +368,15 @@ EXACT: dict[str, Callable[..., Any]] = {
     "expm1": _expm1,
     "logaddexp": _logaddexp,
     "softplus": _softplus,
-    "tan": lambda x: torch.tan(x) if x.dtype != torch.float64 else torch.sin(x) / torch.cos(x),
-    **{
-        name: _in_single_precision(getattr(torch, name))
-        for name in (
-            "atan", "arctan", "asin", "arcsin", "acos", "arccos", "sinh", "cosh", "asinh", "arcsinh", "acosh", "arccosh",
-            "atanh", "arctanh", "erf", "det",
-        )
-    },
-    **{
-        name: _in_single_precision(getattr(torch.nn.functional, name))
-        for name in ("celu", "elu", "gelu", "hardsigmoid", "hardswish", "mish", "selu", "softsign")
-    },
+    "tan": _tan,
+    "asin": _asin,
+    "arcsin": _asin,
+    "acos": _acos,
+    "arccos": _acos,
+    "atan": _atan,
+    "arctan": _atan,
+    **{name: _in_single_precision(getattr(torch, name)) for name in SINGLE_FUNCTIONS},
+    **{name: _in_single_precision(getattr(torch.nn.functional, name)) for name in SINGLE_ACTIVATIONS},
 }
 """The compositions by the name of torch's function, for tensors of real numbers, with its arguments."""
 

@@ -9,7 +9,7 @@ import ast
 import re
 import traceback
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -26,12 +26,12 @@ INSTALLED = ("site-packages", "dist-packages")
 ALONE = 4  # samples that are also shown to RLlib one at a time
 INSTEAD = {
     "cummax|cummin": "take torch.maximum or torch.minimum of one column after the other and torch.stack them",
-    "complex|polar|real|imag|view_as_\\w+|fft_\\w+|stft": "keep real and imaginary parts as two tensors (torch.hypot and "
+    r"complex|polar|real|imag|view_as_\w+|fft_\w+": "keep real and imaginary parts as two tensors (torch.hypot and "
     "torch.atan2 give radius and angle, torch.cos and torch.sin the way back)",
-    "linalg_\\w+|inverse|cholesky\\w*|qr|svd|lu\\w*": "write a small matrix's solution out by its elements, or compute what "
-    "does not depend on the observation beforehand and keep it in a buffer",
-    "nonzero\\w*|masked_select|unique\\w*|_unique2": "its result's shape depends on the numbers: use torch.where and a mask",
-    "rand\\w*|normal\\w*|bernoulli\\w*|multinomial": "an exported policy is deterministic: leave the noise out in inference",
+    r"linalg_\w+|inverse|cholesky\w*|qr|svd|lu\w*": "write a small matrix's solution out by its elements, or compute "
+    "what does not depend on the observation beforehand and keep it in a buffer",
+    r"nonzero\w*|masked_select|\w*unique\w*": "its result's shape depends on the numbers: use torch.where and a mask",
+    r"rand\w*|normal\w*|bernoulli\w*|multinomial": "an exported policy does not draw numbers: leave the noise out",
 }
 """What to write instead of operators that no exporter takes, by a pattern of ATen's names."""
 OTHERWISE = "compose it of arithmetic, comparisons, torch.where, torch.cat and sums along an axis"
@@ -68,11 +68,13 @@ def why_not_onnx(graph: torch.nn.Module, example: Inputs, errors: Sequence[Excep
     `errors` are those of torch's exporters, the more thorough one's first.
     """
     places = _operators(graph, example)
-    for name in (name for error in errors for name in _named_operators(error)):
-        if name in places:
-            hint = next((hint for pattern, hint in INSTEAD.items() if re.fullmatch(pattern, name)), OTHERWISE)
-            public = re.sub(r"^(linalg|fft|special)_", r"\1.", name)
-            return f"the operator torch.{public}{places[name]} has no ONNX form that onnxruntime runs: {hint}"
+    refused = [name for error in errors for name in _refused_operators(error)]
+    if refused:
+        # The thorough one takes operators apart first, and may name a part that nobody wrote.
+        name = next((name for name in refused if name in places), refused[-1])
+        public = re.sub(r"^(linalg|fft|special)_", r"\1.", name)
+        hint = next((hint for pattern, hint in INSTEAD.items() if re.fullmatch(pattern, name)), OTHERWISE)
+        return f"the operator torch.{public}{places.get(name, '')} has no ONNX form that onnxruntime runs: {hint}"
     return f"the network cannot be written as ONNX: {first_line(_cause(errors[0]))}{raised_at(errors[0])}"
 
 
@@ -89,12 +91,9 @@ def _cause(error: BaseException) -> BaseException:
     return error
 
 
-def _named_operators(error: BaseException) -> Iterator[str]:
-    """Yield the names of ATen's operators in the texts of an exception and its causes."""
-    text = f"{_cause(error)}\n{error}"
-    yield from re.findall(r"aten(?:::|\.)(\w+)", text)
-    for kernel in re.findall(r"Could not find an implementation for (\w+)\(", text):  # onnxruntime names ONNX's own
-        yield kernel.lower()
+def _refused_operators(error: BaseException) -> list[str]:
+    """Return ATen's names of the operators that an exception of torch.onnx says it cannot write."""
+    return re.findall(r"(?:operator '|OpOverload\(op=')aten(?:::|\.)(\w+)", f"{_cause(error)}\n{error}")
 
 
 def _operators(graph: torch.nn.Module, example: Inputs) -> dict[str, str]:

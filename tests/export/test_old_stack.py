@@ -41,8 +41,8 @@ EXPORTED = [
     "pendulum", "cart_pole", "clipped", "shared", "free_std", "no_critic", "concurrent", "unbounded", "half_bounded",
     "mixed", "double", "started", "grid", "beams", "filtered_beams", "picture", "offset", "dqn", "plain_dqn",
     "distributional_dqn", "sac", "unnormalized_sac", "discrete_sac", "appo", "impala", "marwil", "cloned", "cql",
-    "user_model", "named_model", "lstm", "continuous_lstm", "user_recurrent", "choice", "shifted", "dials", "nested",
-    "filtered_nested", "camera", "levers", "limbs", "masked", "named_distribution", "tempered", "counts",
+    "user_model", "bearing", "named_model", "lstm", "continuous_lstm", "user_recurrent", "choice", "shifted", "dials",
+    "nested", "filtered_nested", "camera", "levers", "limbs", "masked", "named_distribution", "tempered", "counts",
 ]  # fmt: skip
 SEVERAL = ["several_arm", "several_cart"]
 

@@ -36,6 +36,7 @@ STATELESS = [
     "image", "byte_image", "act_multi_discrete", "act_dict", "act_tuple", "act_scalar", "masked", "autoregressive",
     "scaled", "halved", "impala", "sac_discrete", "tqc", "dqn_plain", "dqn_distributional", "dqn_distributional_plain",
     "bc", "marwil", "cql", "iql", "byte_masked", "user_distribution", "old_model_inside",
+    "polar", "bearing_module",
 ]  # fmt: skip
 # RLlib's own classes and zoo environments, on the way from a checkpoint to the contract.
 pytestmark = pytest.mark.filterwarnings("ignore:.*PPOTorchRLModule.*:DeprecationWarning")
