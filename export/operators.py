@@ -28,15 +28,23 @@ class exact_operators(TorchFunctionMode):  # entered like a function: `with exac
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
     ) -> Any:
         """Return what `func` returns; torch takes the mode off meanwhile, so a composition may use its own operator."""
-        named = dict(kwargs or {})
         name = str(getattr(func, "__name__", "")).removeprefix("linalg_").removeprefix("special_")
         in_place = name.endswith("_") and not name.endswith("__")
         name = name.removesuffix("_") if in_place else name
         composition = EXACT.get(name)
-        if composition is None or "out" in named or not _is_real(args, integers=name in OF_INTEGERS_TOO):
-            return func(*args, **named)
-        result = composition(*args, **named)
-        return args[0].copy_(result) if in_place else result
+        named = {SYNONYMS.get(key, key): value for key, value in (kwargs or {}).items()}
+        operands = (*args, *(named.pop(key) for key in OPERANDS if key in named))
+        if composition is None or "out" in named or not _is_real(operands, integers=name in OF_INTEGERS_TOO):
+            return func(*args, **(kwargs or {}))
+        result = composition(*operands, **named)
+        return operands[0].copy_(result) if in_place else result
+
+
+SYNONYMS = {"axis": "dim", "keepdims": "keepdim"}
+OPERANDS = (
+    "sorted_sequence", "input", "x", "x1", "other", "x2", "y", "values", "boundaries", "indices", "tensor1", "tensor2",
+)  # fmt: skip
+"""What torch calls tensors given by keyword, in the order of its signatures."""
 
 
 def _is_real(args: tuple[Any, ...], *, integers: bool) -> bool:
@@ -112,11 +120,13 @@ def _scaled_by(factor: float) -> Callable[[Tensor], Tensor]:
 
 
 def _pairwise_distance(a: Tensor, b: Tensor, p: float = 2.0, eps: float = 1e-6, keepdim: bool = False) -> Tensor:
-    return torch.linalg.vector_norm(a - b + eps, p, -1, keepdim)
+    length: Tensor = torch.linalg.vector_norm(a - b + eps, p, -1, keepdim)
+    return length
 
 
 def _cdist(a: Tensor, b: Tensor, p: float = 2.0, compute_mode: Any = None) -> Tensor:  # noqa: ARG001  # speed only
-    return torch.linalg.vector_norm(a.unsqueeze(-2) - b.unsqueeze(-3), p, -1)
+    lengths: Tensor = torch.linalg.vector_norm(a.unsqueeze(-2) - b.unsqueeze(-3), p, -1)
+    return lengths
 
 
 # Division and rounding

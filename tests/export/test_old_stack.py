@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
@@ -489,6 +490,14 @@ def test_what_a_users_constructor_lacks_is_not_called_a_damaged_file(
     monkeypatch.setattr(old_zoo_parts.OldModel, "__init__", build)
     with pytest.raises(CheckpointError, match=r"cannot be restored: KeyError: 'gear_ratio'"):
         load("user_model")
+
+
+def test_an_operator_inside_a_model_is_named_with_its_place(
+    export: Callable[..., ExportResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "hypot", torch.nextafter)
+    with pytest.raises(UnsupportedError, match=r"torch\.nextafter in Turned\.forward \(.*old_zoo_parts\.py:\d+\)"):
+        export("bearing")
 
 
 def test_a_truncated_policy_state_is_named(

@@ -168,6 +168,16 @@ OPERATORS: dict[str, Operator] = {
     "divide": exact(of_two(torch.divide)),
     "div_floor": exact(of_two(lambda a, b: torch.div(a, b, rounding_mode="floor"))),
     "div_trunc": exact(of_two(lambda a, b: torch.div(a, b, rounding_mode="trunc"))),
+    "keywords": rounded(
+        of_two(lambda a, b: torch.hypot(a, other=b) + torch.fmod(torch.atan2(input=a, other=b), 0.5)),
+        4,
+        atol=5e-7,
+        infinite=False,
+    ),
+    "keywords_along_axis": exact(
+        lambda o: torch.searchsorted(sorted_sequence=torch.cumsum(o.abs(), axis=1), input=o[:, :2].contiguous()),
+        infinite=False,
+    ),
     "integers_floordiv": exact(of_integers(lambda n: n // 7)),
     "integers_floor_divide": exact(of_integers(lambda n: torch.floor_divide(n, n.abs() + 3))),
     "integers_div_trunc": exact(of_integers(lambda n: torch.div(n, 7, rounding_mode="trunc"))),
