@@ -1,10 +1,12 @@
 """Robot server speed: starts, steps per second through gRPC, and many simulators at once in real time.
 
-    python benchmarks/robot_server.py [--seconds 3] [--servers 20]
+    python benchmarks/robot_server.py [--seconds 3] [--servers 20] [--robo-gym robo-gym/bin/python]
 
 A server manager and its robot servers run as processes of their own, as users run them. Steps are one UR5 command with
 its state (SendActionGetState, 1object) and one MiR100 command and its state (SendAction, GetState, lab_6x8), on one
-client. Medians of five rounds. Written to bench/robot_server.json too.
+client of our own, which sends and reads messages and computes nothing. `--robo-gym` names the Python of environments
+with robo-gym (examples/robo_gym.md), whose own environments are measured as well: observations, rewards and protobuf
+are theirs. Medians of five rounds. Written to bench/robot_server.json too.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import argparse
 import json
 import os
 import statistics
+import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -24,7 +27,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from rlservo.envs.robot_server.manager import RobotServers
+from rlservo.envs.robot_server.manager import RobotServers, ServerManager
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, Action, Empty, State, Success
 
 JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -122,6 +125,21 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def robo_gym_speed(python: Path, seconds: float) -> dict[str, Any]:
+    """Return what robo_gym_steps.py measures with that Python."""
+    manager = ServerManager(port=0, servers=RobotServers())
+    try:
+        script = Path(__file__).with_name("robo_gym_steps.py")
+        line = [str(python), "-W", "ignore", str(script), str(manager.port), str(seconds), str(ROUNDS)]
+        done = subprocess.run(line, stdout=subprocess.PIPE, text=True, timeout=60 + 10 * ROUNDS * seconds)
+    finally:
+        manager.close()
+    if done.returncode != 0:
+        raise SystemExit(f"--robo-gym {python}: its environments could not be measured; the reason stands above")
+    results: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return results
+
+
 def real_time(count: int, seconds: float) -> tuple[float, list[float]]:
     """Return how long starting `count` servers at once took, and each one's rate on the real clock [Hz]."""
     servers = RobotServers(clock="real")
@@ -163,11 +181,15 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="per round")
     parser.add_argument("--servers", type=int, default=20, help="how many at once in real time")
     parser.add_argument("--out", type=Path, default=Path("bench"))
+    parser.add_argument("--robo-gym", type=Path, nargs="*", default=[], help="Pythons that have robo-gym")
     args = parser.parse_args()
+    if missing := [str(python) for python in args.robo_gym if not python.is_file()]:
+        parser.error(f"--robo-gym {missing[0]}: there is no such file")
 
     started, killed = starts()
     ur, ur_cpu = speed(UR5 + "10", args.seconds, is_ur=True)
     mir, mir_cpu = speed(MIR100, args.seconds, is_ur=False)
+    theirs = [robo_gym_speed(python, args.seconds) for python in args.robo_gym]
     together, rates = real_time(args.servers, max(args.seconds, 5.0))
     results = {
         "start_s": started,
@@ -176,6 +198,7 @@ def main() -> None:
         "ur5_steps_per_server_cpu_s": ur_cpu,
         "mir100_steps_per_s": mir,
         "mir100_steps_per_server_cpu_s": mir_cpu,
+        "robo_gym": theirs,
         "servers": args.servers,
         "start_together_s": together,
         "real_time_hz": rates,
@@ -183,13 +206,21 @@ def main() -> None:
     table = Table(title="Robot servers")
     for column in ("what", "median", "worst", "goal"):
         table.add_column(column, justify="left" if column == "what" else "right")
-    table.add_row("start a UR5 server [s]", f"{statistics.median(started):.2f}", f"{max(started):.2f}", "2")
-    table.add_row("kill it [s]", f"{statistics.median(killed):.2f}", f"{max(killed):.2f}", "1")
-    table.add_row("UR5 steps/s, fast clock", f"{statistics.median(ur):,.0f}", f"{min(ur):,.0f}", "1,000")
+    table.add_row("start a UR5 server (s)", f"{statistics.median(started):.2f}", f"{max(started):.2f}", "2")
+    table.add_row("kill it (s)", f"{statistics.median(killed):.2f}", f"{max(killed):.2f}", "1")
+    table.add_row("UR5 steps/s, our own client", f"{statistics.median(ur):,.0f}", f"{min(ur):,.0f}", "1,000")
     table.add_row("  per second of the server's CPU", f"{statistics.median(ur_cpu):,.0f}", f"{min(ur_cpu):,.0f}", "")
-    table.add_row("MiR100 steps/s, fast clock", f"{statistics.median(mir):,.0f}", f"{min(mir):,.0f}", "500")
+    table.add_row("MiR100 steps/s, our own client", f"{statistics.median(mir):,.0f}", f"{min(mir):,.0f}", "500")
     table.add_row("  per second of the server's CPU", f"{statistics.median(mir_cpu):,.0f}", f"{min(mir_cpu):,.0f}", "")
-    table.add_row(f"start {args.servers} at once [s]", f"{together:.1f}", "", "")
+    for one in theirs:
+        for name, robot in (("ur5", "UR5"), ("mir100", "MiR100")):
+            steps, cpu_ms = one[name]["steps_per_s"], one[name]["client_cpu_ms_per_step"]
+            what = f"{robot} steps/s, robo-gym's environment (Python {one['python']}, protobuf {one['protobuf']})"
+            table.add_row(what, f"{statistics.median(steps):,.0f}", f"{min(steps):,.0f}", "")
+            table.add_row(
+                "  its client's CPU per step (ms)", f"{statistics.median(cpu_ms):.2f}", f"{max(cpu_ms):.2f}", ""
+            )
+    table.add_row(f"start {args.servers} at once (s)", f"{together:.1f}", "", "")
     table.add_row(
         f"{args.servers} UR5s at {REAL_RATE_HZ} Hz, real clock [Hz]", f"{statistics.median(rates):.2f}",
         f"{min(rates):.2f}", str(REAL_RATE_HZ),

@@ -5,111 +5,279 @@
     python examples/robo_gym_client.py    # a third, in robo-gym's environment
     python examples/robo_gym_client.py --task ObstacleAvoidanceMir100 --policy mir100_obstacle_avoidance
 
-robo-gym pins an old protobuf, so it cannot share an environment with Ray. Its own holds robo-gym and the light client:
+robo-gym pins an old protobuf, so it cannot share an environment with Ray: examples/robo_gym.md says how to make its
+own, and what must be done before `--rs-address` drives a real robot.
 
-    python3 -m venv robo-gym && robo-gym/bin/pip install robo-gym==2.0.1 'httpx>=0.27' 'pydantic>=2.6'
-    robo-gym/bin/pip install --no-deps rlservo
-
-`--rs-address` drives a robot server that is already running, the real robot's for example: read examples/robo_gym.md
-before that.
+Standard output has the report only: what robo-gym prints goes to standard error. Exit codes: 0, 1 for what failed, 2
+for a wrong argument, 130 for Ctrl-C, after which no simulator is left.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import json
+import os
+import signal
+import socket
+import sys
 import time
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, TextIO
 
+import grpc
 import gymnasium as gym
 import numpy as np
 
-from rlservo.export.errors import RlservoError
+from rlservo.export.errors import RlservoError, UnavailableError
 from rlservo.serve_app.client import PolicyClient
 
-# robo-gym's names, and the policies that README.md serves for them.
+# robo-gym's names, and the policies that examples/robo_gym.md serves for them.
 POLICIES = {
     "EndEffectorPositioningUR": "ur5",
     "NoObstacleNavigationMir100": "mir100",
     "ObstacleAvoidanceMir100": "mir100_obstacle_avoidance",
 }
+UR_MODELS = ("ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e", "ur16e")
+MANAGER_PORTS = range(50100, 50200)  # where robo-gym looks for a server manager
+ANSWER_S = 5.0  # [s] to connect, and again to answer; robo-gym itself waits 20 s for each of a hundred ports
+VERIFY = "/robo_gym_server_manager.grpc_msgs.server_manager.ServerManager/VerifyConnection"
+GET_STATE = "/robot_server.RobotServer/GetState"
+INTERRUPTED = 130  # the shell's exit code for Ctrl-C
 
 
-def main() -> None:
+def main() -> int:
+    args = parse_arguments()
+    with report_only_on_stdout() as out:
+        try:
+            import_robo_gym()
+            env_id, arguments = locate_robot(args)
+            endings: list[str] = []
+            seconds: list[float] = []  # from asking for an action to having it
+            interrupted = False
+            try:
+                with PolicyClient(args.url, args.policy or POLICIES[args.task]) as policy:
+                    _ = policy.contract  # before a simulator is started for a policy that is not there
+                    drive(env_id, arguments, policy, args.episodes, endings, seconds, None if args.json else out)
+            except KeyboardInterrupt:
+                interrupted = True
+            if endings:
+                write_report(out, summary(env_id, endings, seconds, interrupted), as_json=args.json)
+            if interrupted:
+                raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            print("stopped", file=sys.stderr)
+            return INTERRUPTED
+        except RlservoError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 1
+    return 0
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Return the arguments, or end with a sentence and exit code 2."""
     parser = argparse.ArgumentParser(description="Drive one of robo-gym's own environments with a served policy.")
     parser.add_argument("--url", default="http://127.0.0.1:8000")
     parser.add_argument("--task", choices=POLICIES, default="EndEffectorPositioningUR", help="(default: %(default)s)")
     parser.add_argument(
         "--policy", help="its name on the server (default: ur5, mir100 or mir100_obstacle_avoidance, by the task)"
     )
-    parser.add_argument("--ur-model", help="of a UR task (default: ur5)")
+    parser.add_argument("--ur-model", choices=UR_MODELS, help="of a UR task (default: ur5)")
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--manager", default="127.0.0.1", help="where rlservo server-manager runs")
     parser.add_argument("--manager-port", type=int, help="its port; without it 50100 to 50199 are searched")
     parser.add_argument("--rs-address", help="host:port of a running robot server, instead of a manager")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     args = parser.parse_args()
-    is_arm = args.task.endswith("UR")
-    if args.ur_model is not None and not is_arm:
+    if args.ur_model is not None and not args.task.endswith("UR"):
         parser.error(f"--ur-model is for UR tasks, and {args.task} has a MiR100")
+    if args.episodes < 1:
+        parser.error(f"--episodes is {args.episodes}: expected at least 1")
+    if args.manager_port is not None and not 1 <= args.manager_port <= 65535:
+        parser.error(f"--manager-port is {args.manager_port}: expected 1 to 65535")
+    if args.rs_address is not None:
+        host, colon, port = args.rs_address.rpartition(":")
+        if not (host and colon and port.isascii() and port.isdigit() and 1 <= int(port[:9]) <= 65535):
+            parser.error(f"--rs-address is {args.rs_address!r}: expected host:port, as in 127.0.0.1:50051")
+    return args
 
-    importlib.import_module("robo_gym")  # registers its environments
 
-    if args.rs_address:
-        env_id, arguments = f"{args.task}Rob-v0", {"rs_address": args.rs_address}
-    else:
-        env_id, arguments = f"{args.task}Sim-v0", {"ip": args.manager}
-        if args.manager_port is not None:
-            arguments |= {"lower_bound_port": args.manager_port, "upper_bound_port": args.manager_port + 1}
-    if is_arm:
-        arguments["ur_model"] = args.ur_model or "ur5"
-    env = gym.make(env_id, **arguments).unwrapped
-    kill_sim = getattr(env, "kill_sim", None)  # robo-gym's own; its UR environments' `close` leaves the simulator
-    endings: list[str] = []
-    seconds: list[float] = []  # from asking for an action to having it
+@contextlib.contextmanager
+def report_only_on_stdout() -> Iterator[TextIO]:
+    """Give standard output for the report; whatever else writes there, children too, goes to standard error."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    with os.fdopen(kept, "w", encoding="utf-8") as out:
+        yield out
+        # Standard output stays with standard error: robo-gym prints once more when its environment is collected.
+
+
+def import_robo_gym() -> None:
+    """Register robo-gym's environments. Raises RlservoError when it is not installed, or does not import."""
     try:
-        with PolicyClient(args.url, args.policy or POLICIES[args.task]) as policy:
-            for _ in range(args.episodes):
-                endings.append(drive_one_episode(env, policy, seconds))
-                if not args.json:
-                    print(f"episode {len(endings)}: {endings[-1]}")
-    finally:
-        if kill_sim is not None:
-            kill_sim()
+        importlib.import_module("robo_gym")
+    except ImportError as error:
+        raise RlservoError(
+            f"robo-gym cannot be imported in {sys.executable} ({error}): examples/robo_gym.md says how to make an "
+            "environment for it"
+        ) from error
+    except TypeError as error:  # protobuf's "Descriptors cannot be created directly"
+        raise RlservoError(
+            "robo-gym cannot be imported with this protobuf: it needs one below 3.21, in an environment of its own "
+            "(examples/robo_gym.md)"
+        ) from error
 
-    p50, p95, p99 = (1000.0 * np.percentile(seconds, [50, 95, 99])).tolist()
-    report = {
-        "environment": env_id,
-        "episodes": len(endings),
-        "successes": endings.count("success"),
-        "endings": {ending: endings.count(ending) for ending in sorted(set(endings))},
-        "steps": len(seconds),
-        "latency_ms": {"p50": p50, "p95": p95, "p99": p99},
-    }
-    if args.json:
-        print(json.dumps(report, indent=2))
-    else:
-        print(f"{report['successes']} of {len(endings)} at the target")
-        print(f"action latency p50 {p50:.2f} ms, p95 {p95:.2f} ms, p99 {p99:.2f} ms over {len(seconds):,} steps")
+
+def locate_robot(args: argparse.Namespace) -> tuple[str, dict[str, Any]]:
+    """Return the environment's id and arguments, for a manager or a robot server that answers.
+
+    Raises UnavailableError when none does: robo-gym would try for minutes, and not say what.
+    """
+    ur = {"ur_model": args.ur_model or "ur5"} if args.task.endswith("UR") else {}
+    if args.rs_address:
+        host, _, port = args.rs_address.rpartition(":")
+        if not answers(host.strip("[]"), int(port), GET_STATE):
+            raise UnavailableError(f"--rs-address {args.rs_address}: no robot server answers there")
+        return f"{args.task}Rob-v0", {"rs_address": args.rs_address, **ur}
+    ports = MANAGER_PORTS if args.manager_port is None else (args.manager_port,)
+    for port in ports:
+        if answers(args.manager, port, VERIFY):
+            bounds = {"lower_bound_port": port, "upper_bound_port": port + 1}
+            return f"{args.task}Sim-v0", {"ip": args.manager, **bounds, **ur}
+    where = f"{args.manager}:{ports[0]}" if len(ports) == 1 else f"{args.manager}, ports {ports[0]} to {ports[-1]}"
+    raise UnavailableError(f"no server manager answers at {where}: start one with 'rlservo server-manager'")
+
+
+def answers(host: str, port: int, method: str) -> bool:
+    """Return whether a gRPC server there answers the method. Raises UnavailableError for a host out of reach."""
+    try:
+        socket.create_connection((host, port), timeout=ANSWER_S).close()
+    except ConnectionRefusedError:
+        return False
+    except (OSError, UnicodeError) as error:  # the other ports of this host would tell the same, each as slowly
+        raise UnavailableError(f"{host}:{port} cannot be reached: {error}") from error
+    with grpc.insecure_channel(f"[{host}]:{port}" if ":" in host else f"{host}:{port}") as channel:
+        try:
+            channel.unary_unary(method)(b"", timeout=ANSWER_S)
+        except grpc.RpcError:
+            return False
+    return True
+
+
+def drive(
+    env_id: str,
+    arguments: dict[str, Any],
+    policy: PolicyClient,
+    episodes: int,
+    endings: list[str],
+    seconds: list[float],
+    out: TextIO | None,
+) -> None:
+    """Run the episodes; `endings` and `seconds` grow as they go, and a line for each is written to `out`.
+
+    The simulator is ended in any case. Raises RlservoError for what robo-gym or the policy's server reports.
+    """
+    env: Any = None
+    try:
+        with interrupts_held(), sentences(f"{env_id} could not be started"):
+            env = gym.make(env_id, disable_env_checker=True, **arguments).unwrapped
+        for number in range(1, episodes + 1):
+            endings.append(drive_one_episode(env, policy, seconds))
+            if out is not None:
+                print(f"episode {number}: {endings[-1]}", file=out, flush=True)
+    finally:
+        if hasattr(env, "kill_sim"):  # robo-gym's own; its UR environments' `close` leaves the simulator
+            with interrupts_held():
+                end_simulator(env)
 
 
 def drive_one_episode(env: gym.Env[Any, Any], policy: PolicyClient, seconds: list[float]) -> str:
     """Return how the episode ended."""
-    first = env.reset()
+    with sentences("the reset failed"):
+        first = env.reset()
     obs = first[0] if isinstance(first, tuple) else first  # robo-gym 2.0.1's obstacle avoidance gives no info
     policy.reset()
     while True:
         began = time.perf_counter()
         action = policy.act(obs)
         seconds.append(time.perf_counter() - began)
-        obs, _, terminated, truncated, info = env.step(action)
+        with sentences("a step failed"):
+            obs, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             return str(info["final_status"])
 
 
-if __name__ == "__main__":
+@contextlib.contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM wait for the end of a call: robo-gym's client swallows them and tries ten times."""
+    arrived: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda number, _frame: arrived.append(number)) for number in numbers]
     try:
-        main()
-    except RlservoError as error:
-        raise SystemExit(f"error: {error}") from None
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+    if arrived:
+        raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def sentences(what: str) -> Iterator[None]:
+    """Turn whatever robo-gym raises into one sentence. The wire has no room for reasons: the server's log has them."""
+    try:
+        yield
+    except grpc.RpcError as error:
+        reason = error.details() if isinstance(error, grpc.Call) else str(error)
+        raise UnavailableError(f"{what}: the robot server does not answer ({reason})") from error
+    except Exception as error:  # robo-gym's own tree, AssertionError, RuntimeError, Exception
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RlservoError(f"{what}: {reason}; the log of the server manager or robot server says why") from error
+
+
+def end_simulator(env: Any) -> None:
+    """End the robot server that robo-gym started."""
+    try:
+        env.kill_sim()
+    except Exception as error:  # its manager is gone, and with it the robot server
+        print(f"the robot server could not be told to end: {error}", file=sys.stderr)
+    env.expect_sim_running = False  # or `__del__` tries ten times more
+
+
+def summary(env_id: str, endings: list[str], seconds: list[float], interrupted: bool) -> dict[str, Any]:
+    """Return the report of the episodes that ended."""
+    p50, p95, p99 = (1000.0 * np.percentile(seconds, [50, 95, 99])).tolist()
+    return {
+        "environment": env_id,
+        "episodes": len(endings),
+        "successes": endings.count("success"),
+        "endings": {ending: endings.count(ending) for ending in sorted(set(endings))},
+        "steps": len(seconds),
+        "latency_ms": {"p50": p50, "p95": p95, "p99": p99},
+        "interrupted": interrupted,
+    }
+
+
+def write_report(out: TextIO, report: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(report, indent=2), file=out, flush=True)
+        return
+    latency = report["latency_ms"]
+    print(f"{report['successes']} of {report['episodes']} at the target", file=out)
+    print(
+        f"action latency p50 {latency['p50']:.2f} ms, p95 {latency['p95']:.2f} ms, p99 {latency['p99']:.2f} ms over "
+        f"{report['steps']:,} steps",
+        file=out,
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a simulator must not stay behind
+    try:
+        code = main()
+    except KeyboardInterrupt:  # before or after `main` watches for it
+        code = INTERRUPTED
+    sys.exit(code)

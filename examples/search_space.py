@@ -156,14 +156,20 @@ def validate(config: AlgorithmConfig, of: str = "this configuration") -> None:
         raise UsageError(f"RLlib refuses {of}: {' '.join(str(error).split())}") from error
 
 
-def check_combinations(config: AlgorithmConfig, space: Mapping[str, Any], at_most: int = 100) -> None:
-    """Raise UsageError for a combination of swept values that RLlib would refuse: of lists all, of ranges one value."""
+def check_combinations(config: AlgorithmConfig, space: Mapping[str, Any], at_most: int = 100) -> list[AlgorithmConfig]:
+    """Return the configuration of each combination of swept values: of lists all, of ranges one value.
+
+    Raises UsageError for one that RLlib would refuse.
+    """
+    combined = []
     axes = [_values(domain) for domain in space.values()]
     for values in itertools.islice(itertools.product(*axes), at_most) if space else ():
         combination = dict(zip(space, values, strict=True))
         one = config.copy(copy_frozen=False)
         apply(one, combination, "--sweep")
         validate(one, " ".join(f"{name}={value}" for name, value in combination.items()))
+        combined.append(one)
+    return combined
 
 
 def _values(domain: Any) -> list[Any]:

@@ -13,6 +13,7 @@ sample). `--num-cpus 0` samples in the driver. The run ends in a bundle that `rl
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,7 @@ from typing import Any, cast
 
 import episode_traces
 import numpy as np
+import resources
 import search_space
 import training_run
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
@@ -31,6 +33,7 @@ from ray.rllib.connectors.env_to_module import FlattenObservations, MeanStdFilte
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.models.utils import get_filter_config
 from ray.tune.schedulers import ASHAScheduler, FIFOScheduler, MedianStoppingRule
+from resources import Room
 from training_run import RETURN, STEPS, Run
 
 from rlservo.export.errors import UsageError
@@ -213,23 +216,19 @@ def gpus_per_learner(args: argparse.Namespace) -> float:
     return float(args.num_gpus / max(1, args.num_learners))
 
 
-def check_machine(args: argparse.Namespace, cores: int, gpus: float, where: str, *, joined: bool) -> None:
-    """Raise UsageError when the machine or cluster has too little, with numbers that fit.
+def check_machine(run: Run, config: AlgorithmConfig | None = None, concurrent: int | None = None) -> None:
+    """Raise UsageError when this machine has too little for the run, before a Ray is started.
 
-    On a machine of our own the driver may share the last core; a cluster that was joined gives no more than it has.
+    The driver may share the last core. That is also what a Ray of our own is started with.
     """
-    needed = cores_needed(args)
-    if needed > cores + (not joined):
-        raise UsageError(
-            f"--num-cpus {args.num_cpus} takes {needed} cores ({args.num_cpus} for env runners, "
-            f"{needed - 1 - args.num_cpus} for learners and evaluation, one for the driver); {where} has {cores}: "
-            f"give --num-cpus {max(0, cores - (needed - args.num_cpus))}"
-        )
-    if gpus_needed(args) > gpus:
-        raise UsageError(
-            f"{gpus_needed(args):g} GPU{'s' if gpus_needed(args) > 1 else ''} asked for; {where} has {gpus:g} that "
-            "torch can use: leave --num-gpus out to learn on the CPU"
-        )
+    gpus = training_run.local_gpus() if run.num_gpus else 0.0
+    first, *others = run.request
+    driver = {**first, "CPU": max(0.0, first.get("CPU", 0.0) - 1.0)}
+    request = [bundle for bundle in (driver, *others) if any(bundle.values())]
+    machine = Room("this machine", ({"CPU": os.cpu_count() or 1, "GPU": gpus},))
+    resources.check_room(request, machine, config=config)
+    ray_has = Room("this machine", ({"CPU": session_cores(run), "GPU": math.ceil(run.num_gpus)},))
+    resources.check_room(run.request, ray_has, config=config, concurrent=concurrent)
 
 
 def session_cores(run: Run) -> int:
@@ -360,13 +359,15 @@ def set_up(args: argparse.Namespace) -> tuple[AlgorithmConfig, Run, list[str]]:
         raise UsageError(f"{twice[0]} is given twice, by --set, --sweep or --search-space: once is enough")
     search_space.apply(config, grid, "--sweep")
     search_space.apply(config, space, "--search-space")
-    search_space.check_combinations(config, grid | space)
+    combined = search_space.check_combinations(config, grid | space) or [config]
+    request = max(map(resources.request_of, combined), key=resources.size)
+    cpus, gpus = resources.size(request)
     run = Run(
         args.run,
         args.name_env,
         env_config,
-        cores_needed(args),
-        gpus_needed(args),
+        max(cores_needed(args), math.ceil(cpus)),
+        max(gpus_needed(args), gpus),
         args.metric,
         args.mode,
         rest={
@@ -375,6 +376,7 @@ def set_up(args: argparse.Namespace) -> tuple[AlgorithmConfig, Run, list[str]]:
             "app_dir": str(args.app_dir.resolve()),
             "log_level": args.log_level,
         },
+        request=request,
     )
     return config, run, [*grid, *space]
 
@@ -404,11 +406,14 @@ def main() -> None:
     parser = argument_parser()
     args = parser.parse_args()
     check_arguments(parser, args)
+    where = "this machine" if args.address is None else f"the cluster at {args.address}"
     training_run.pickle_by_value(sys.modules[__name__], episode_traces)
     if args.resume:
         if more := sorted(explicit(sys.argv[1:]) - set(AFTER_RESUME)):
             raise UsageError(f"--resume goes on with the run as it was set up: leave --{more[0].replace('_', '-')} out")
         run, _ = training_run.read_run(args.resume)
+        if args.address is None and run.request:  # runs of before have none
+            check_machine(run)
         with training_run.ray_session(
             num_cpus=session_cores(run),
             num_gpus=run.num_gpus,
@@ -416,14 +421,13 @@ def main() -> None:
             log_level=run.rest["log_level"],
             app_dir=Path(run.rest["app_dir"]),
         ):
-            outcome = training_run.resume(args.resume)
+            outcome = training_run.resume(args.resume, where=where)
     else:
         sys.path.insert(0, str(args.app_dir.resolve()))
-        if args.address is None:
-            gpus = training_run.local_gpus() if gpus_needed(args) else 0.0
-            check_machine(args, os.cpu_count() or 1, gpus, "this machine", joined=False)
         training_run.check_storage(args.storage)
         config, run, swept = set_up(args)
+        if args.address is None:
+            check_machine(run, config, args.max_concurrent_trials)
         with training_run.ray_session(
             num_cpus=session_cores(run),
             num_gpus=run.num_gpus,
@@ -431,9 +435,6 @@ def main() -> None:
             log_level=args.log_level,
             app_dir=args.app_dir,
         ):
-            if args.address is not None:
-                cluster = f"the cluster at {args.address}"
-                check_machine(args, training_run.cores(), training_run.gpus(), cluster, joined=True)
             print(
                 f"{args.run} on {args.name_env}: {args.num_cpus} env runners with {args.num_envs_per_env_runner} "
                 f"environments each, {args.num_learners or 'the driver as'} learner, {run.num_cpus} cores"
@@ -451,6 +452,7 @@ def main() -> None:
                 max_concurrent=args.max_concurrent_trials,
                 max_failures=args.max_failures,
                 swept=swept,
+                where=where,
             )
     training_run.report(outcome, run)
     checkpoint = training_run.best_checkpoint_of(outcome)

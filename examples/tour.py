@@ -310,7 +310,7 @@ def frozen_lake(settings: Settings) -> None:
     shutil.rmtree(log, ignore_errors=True)
     log.mkdir(parents=True)
     config.debugging(seed=1)
-    with training_run.ray_session(num_cpus=1), training_run.built(config.build_algo()) as algorithm:
+    with training_run.ray_session(num_cpus=1), training_run.built(training_run.build(config)) as algorithm:
         steps, arrived = 0, False  # one episode tells: without slipping, every episode of a policy is the same
         while not (arrived and (settings.quick or steps >= EXPLORED)) and steps < 4 * EXPLORED:
             result = algorithm.train()

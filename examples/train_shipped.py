@@ -33,6 +33,7 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 import evaluate_shipped
 import ray
+import resources
 import torch
 import yaml
 from ray import cloudpickle
@@ -40,6 +41,7 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.tune.registry import get_trainable_cls
+from training_run import main_with_sentences
 
 from rlservo import Policy, export_checkpoint
 
@@ -175,7 +177,9 @@ def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
     rows: list[Row] = []
     best, reached_milestone = float("-inf"), False
     checkpoint = folder / "checkpoint"
-    algorithm = algorithm_config(settings, seed).build_algo()
+    config = algorithm_config(settings, seed)
+    resources.check_room(resources.request_of(config), resources.ray_room("the one process that trains"), config=config)
+    algorithm = config.build_algo()
     try:
         with (folder / "curve.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -293,4 +297,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main_with_sentences(main, __file__)

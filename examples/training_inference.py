@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import training_run  # before Ray  # isort: skip
+import resources
 import yaml
 from help_text import DefaultsFormatter
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from resources import Room
 from training_run import RETURN, STEPS, Run
 
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
@@ -119,20 +121,24 @@ def gpus_asked_for(parser: argparse.ArgumentParser) -> float:
 
 
 def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: float = 0.0) -> AlgorithmConfig:
-    """Return the RLlib configuration: one core for the driver and learner, the others (at least two) sample."""
+    """Return the RLlib configuration: one core for the driver and learner, the others (at least two) sample.
+
+    Sampling and learning take turns, so on one or two cores the processes share them: together they ask for no more.
+    """
     config = training_run.default_config(args.run)
     config.environment(task.env_id, env_config=task.env_config, clip_rewards=False)
     config.framework("torch")
     config.env_runners(
         num_env_runners=max(2, cpus - 1),
-        # Sampling and learning take turns, so on a small machine they may share cores. (RLlib's annotations here are
-        # narrower than what it takes: a fraction of a core, and the connector's three-argument form.)
+        # RLlib's annotations here are narrower than what it takes: a fraction of a core, and the connector's
+        # three-argument form.
         num_cpus_per_env_runner=cast(Any, 0.5 if cpus == 2 else 0.25 if cpus < 2 else 1),
         num_envs_per_env_runner=args.num_envs_per_env_runner,
         env_to_module_connector=cast(Any, _mean_std_filter),
     )
     config.resources(num_cpus_for_main_process=cast(Any, 1 if cpus >= 2 else 0.5))
-    config.learners(num_learners=0, num_gpus_per_learner=gpus)
+    # RLlib takes the larger of this and the main process's; left alone it is a whole core.
+    config.learners(num_learners=0, num_gpus_per_learner=gpus, num_cpus_per_learner=cast(Any, 1 if cpus >= 2 else 0.5))
     config.rl_module(model_config=DefaultModelConfig(**task.model, max_seq_len=20))
     config.training(gamma=task.gamma)
     if args.run == "PPO":
@@ -154,6 +160,8 @@ def run(task: Task, parser: argparse.ArgumentParser) -> None:
     training_run.pickle_by_value(sys.modules[__name__])
     if args.resume:
         described, _ = training_run.read_run(args.resume)
+        there = {"CPU": described.num_cpus or os.cpu_count() or 1, "GPU": training_run.local_gpus()}
+        resources.check_room(described.request, Room("this machine", (there,)))
         with training_run.ray_session(num_cpus=described.num_cpus, num_gpus=described.num_gpus):
             outcome = training_run.resume(args.resume)
     else:

@@ -26,13 +26,14 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any, NoReturn, cast
 
 import ray_settings  # before Ray  # isort: skip
 import ray
+import resources
 from ray import cloudpickle, tune
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.tune.registry import get_trainable_cls
@@ -73,6 +74,7 @@ class Run:
     metric: str = RETURN
     mode: str = "max"
     rest: dict[str, Any] = field(default_factory=dict)  # the script's own settings for after the training
+    request: list[dict[str, float]] = field(default_factory=list)  # the largest trial's bundles; empty: the config's
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,8 @@ def ray_session(
             else:
                 _join(address, quiet)
             take_sigterm()  # Ray has set a handler of its own
-            yield
+            with resources.waiting_is_said():
+                yield
         finally:
             with _undisturbed():
                 ray.shutdown()
@@ -221,11 +224,6 @@ def local_gpus() -> float:
     return float(torch.cuda.device_count()) if torch.cuda.is_available() else 0.0
 
 
-def gpus() -> float:
-    """Return how many GPUs the running Ray has."""
-    return float(ray.cluster_resources().get("GPU", 0.0))
-
-
 @contextlib.contextmanager
 def _sigterm_as_ctrl_c() -> Iterator[Callable[[], None]]:
     """Let SIGTERM do what Ctrl-C does; gives the function that says so again."""
@@ -255,6 +253,12 @@ def _undisturbed() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+def build(config: AlgorithmConfig) -> Any:
+    """Build an algorithm without Tune, in the Ray that runs. Raises UsageError when there is not the room for it."""
+    resources.check_room(resources.request_of(config), resources.ray_room("this machine"), config=config)
+    return config.build_algo()
 
 
 @contextlib.contextmanager
@@ -353,11 +357,14 @@ def train(
     max_failures: int = 0,
     swept: Sequence[str] = (),
     resumable: bool = True,
+    where: str = "this machine",
 ) -> Outcome:
     """Train until one of the stop criteria holds (Ray must be running); see `resume` for what is raised.
 
-    `resumable` is whether the script has a `--resume`, which it then tells of.
+    `resumable` is whether the script has a `--resume`, which it then tells of; `where` is what Ray runs on, in words.
     """
+    run = replace(run, request=run.request or resources.request_of(config))
+    resources.check_room(run.request, resources.ray_room(where), config=config, concurrent=max_concurrent)
     name = f"{run.algorithm}-{run.env_id.split('/')[-1].split(':')[-1]}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder = _new_folder(storage, name)
     (folder / RUN_FILE).write_text(json.dumps(asdict(run) | {"swept": list(swept)}, indent=2) + "\n")
@@ -443,13 +450,15 @@ def read_run(folder: Path) -> tuple[Run, list[str]]:
         ) from error
 
 
-def resume(folder: Path) -> Outcome:
+def resume(folder: Path, *, where: str = "this machine") -> Outcome:
     """Go on with a run that was interrupted or failed, each trial from its newest checkpoint (Ray must be running).
 
-    Raises UsageError when the folder is no run, Interrupted on Ctrl-C and RlservoError when a trial fails.
+    Raises UsageError when the folder is no run, or there is not the room that it needs, Interrupted on Ctrl-C and
+    RlservoError when a trial fails.
     """
     folder = folder.expanduser().resolve()
     run, swept = read_run(folder)
+    resources.check_room(run.request, resources.ray_room(where))
     default_config(run.algorithm)  # registers the algorithms, quietly
     if not tune.Tuner.can_restore(str(folder)):
         raise UsageError(f"--resume {folder}: the run was stopped before Tune saved anything; start it anew")

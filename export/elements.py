@@ -46,7 +46,10 @@ def read_elements(
         action = _elements(told.get("action", ()))
         rate = _rate(told.get("control_rate_hz"))
     except (Exception, SystemExit) as error:  # importing and asking run the user's own code
-        notify(f"environment {env_id} cannot be asked what its elements are called: {first_line(error)}")
+        notify(
+            f"the elements stay without names, which changes nothing else: environment {env_id} cannot be asked for "
+            f"them ({first_line(error)})"
+        )
         return ElementNames()
     spaces = {"observation": recipe.observation_space, "action": recipe.action_space}
     wanted = {which: math.prod(space.shape) if isinstance(space, Box) else 0 for which, space in spaces.items()}

@@ -30,6 +30,7 @@ handler in `deploy/cli.py` maps them to exit codes.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -189,7 +190,10 @@ class ForbiddenError(RlservoError):
     code = "forbidden"
 
 
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+
+
 def first_line(error: BaseException) -> str:
-    """Return the first line of an exception's text, with its type where the text alone says little."""
-    text = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
+    """Return the first line of an exception's text without colours, with its type where the text alone says little."""
+    text = (_COLOURS.sub("", str(error)).strip() or type(error).__name__).splitlines()[0][:300]
     return f"{type(error).__name__}: {text}" if isinstance(error, LookupError) else text

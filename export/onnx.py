@@ -24,10 +24,12 @@ import torch
 from numpy.typing import NDArray
 
 from rlservo.export.actor import PolicyGraph
-from rlservo.export.errors import UnsupportedError, first_line
+from rlservo.export.errors import UnsupportedError
+from rlservo.export.operators import exact_operators
 from rlservo.export.parity import Runner
 from rlservo.export.samples import Inputs
 from rlservo.export.session import open_session
+from rlservo.export.suspects import why_not_onnx
 
 TORCHSCRIPT_OPSET = 17
 DYNAMO_OPSET = 18  # its lowest
@@ -42,21 +44,25 @@ def write_onnx(graph: PolicyGraph, example: Inputs, file: Path) -> None:
     try:
         _export(graph, example, file, dynamo=False)
         _finish(file)
-    except Exception:  # torch.onnx and onnx raise several unrelated types
+    except Exception as first:  # torch.onnx, onnx and onnxruntime raise several unrelated types
         try:
             _export(graph, example, file, dynamo=True)
             _finish(file)
         except Exception as error:
-            raise UnsupportedError(f"the network cannot be written as ONNX: {first_line(error)}") from error
+            raise UnsupportedError(why_not_onnx(graph, example, [error, first])) from error
 
 
 def _finish(file: Path) -> None:
-    """Check what torch wrote, which is not always ONNX (a logarithm of integers), and give it its last form."""
+    """Check what torch wrote, which is not always ONNX (a logarithm of integers), and give it its last form.
+
+    onnxruntime opens it: it lacks kernels for some of ONNX, such as most double-precision functions.
+    """
     model = onnx.load(str(file))
     model.ir_version = IR_VERSION
     model.producer_name, model.producer_version = "rlservo", ""
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, str(file))
+    open_session(file)
 
 
 def _export(graph: PolicyGraph, example: Inputs, file: Path, *, dynamo: bool) -> None:
@@ -66,7 +72,7 @@ def _export(graph: PolicyGraph, example: Inputs, file: Path, *, dynamo: bool) ->
     if dynamo:
         how = {"dynamo": True, "opset_version": DYNAMO_OPSET, "external_data": False, "verbose": False}
         how["dynamic_shapes"] = {"inputs": tuple({0: torch.export.Dim("batch")} for _ in inputs)}
-    with _quiet():
+    with _quiet(), exact_operators():
         torch.onnx.export(
             graph,
             tuple(torch.from_numpy(example[name]) for name in inputs),

@@ -130,14 +130,15 @@ def _wide(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.float6
 
 
 def _extreme(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
-    """Corners of the space; in half of the rows some elements at zero and some a thousand times too large."""
+    """Corners of the space; in half of the rows some elements at 0.0 or -0.0 and some a thousand times too large."""
     low, high, bounded = _bounds(leaf)
     centre, spread = _centre_and_spread(leaf)
     shape = (size, *low.shape)
     corner = np.where(rng.random(shape) < 0.5, np.where(bounded, low, centre), np.where(bounded, high, centre))
     huge = rng.choice([-1.0, 1.0], shape) * EXTREME * np.maximum(spread, 1.0)
     dice = rng.random(shape)
-    spoiled = np.where(dice < 0.1, 0.0, np.where(dice < 0.3, huge, corner))
+    zero = np.copysign(0.0, huge)  # angles and divisions tell the two zeros apart
+    spoiled = np.where(dice < 0.1, zero, np.where(dice < 0.3, huge, corner))
     rows = rng.random((size, *[1] * low.ndim)) < 0.5
     return np.where(rows, spoiled, corner)
 

@@ -19,7 +19,7 @@ from rlservo.export.actor import PolicyGraph
 from rlservo.export.errors import UnsupportedError, first_line
 from rlservo.export.parity import Runner
 from rlservo.export.samples import Inputs
-from rlservo.export.suspects import frozen_by_tracing
+from rlservo.export.suspects import frozen_by_tracing, raised_at
 
 
 def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> list[str]:
@@ -39,7 +39,7 @@ def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> list[s
                 )
                 torch.jit.freeze(traced).save(str(file))
         except Exception as error:  # the network's own forward may raise anything
-            raise UnsupportedError(f"the network cannot be traced: {first_line(error)}") from error
+            raise UnsupportedError(f"the network cannot be traced: {first_line(error)}{raised_at(error)}") from error
     return frozen_by_tracing(caught)
 
 

@@ -30,7 +30,10 @@ UR_KNOWN = {
     "target_mode", "rs_mode", "action_mode", "objects_controller", "n_objects",
 }  # fmt: skip
 MIR100_KNOWN = {"world_name", "server_port"}
-_OBJECT = re.compile(r"object_(\d+)_(model_name|frame)")
+_OBJECT = re.compile(r"object_([0-9]{1,3})_(model_name|frame)")
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_PORT = re.compile(r"[0-9]{1,9}")
+MAX_LINE, MAX_VALUE = 10_000, 1_000  # [characters]; robo-gym's own lines have about 600, their longest value 40
 
 
 def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host: str = "127.0.0.1") -> Settings:
@@ -38,6 +41,8 @@ def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host
 
     Raises ValueError naming the package, launch file, argument or value that is not known or not simulated.
     """
+    if len(line) > MAX_LINE:  # before any work on it: whoever reaches the manager's port can send a line
+        raise ValueError(f"the line has {len(line):,} characters: expected at most {MAX_LINE:,}")
     try:
         words = shlex.split(line)
     except ValueError as error:
@@ -46,15 +51,17 @@ def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host
         raise ValueError(f"the line is {line[:200]!r}: expected 'roslaunch <package> <launch file> name:=value ...'")
     package, file = words[1:3]
     if package not in LAUNCH_FILES:
-        raise ValueError(f"package {package!r} is not known: expected one of {', '.join(LAUNCH_FILES)}")
+        raise ValueError(f"package {package[:200]!r} is not known: expected one of {', '.join(LAUNCH_FILES)}")
     known_file, read = LAUNCH_FILES[package]
     if file != known_file:
-        raise ValueError(f"launch file {file!r} of {package} is not known: expected {known_file}")
+        raise ValueError(f"launch file {file[:200]!r} of {package} is not known: expected {known_file}")
     arguments: dict[str, str] = {}
     for word in words[3:]:
         name, assigned, value = word.partition(":=")
-        if not assigned or not name:
-            raise ValueError(f"{word!r} is no launch argument: expected name:=value")
+        if not assigned or not _NAME.fullmatch(name):
+            raise ValueError(f"{word[:200]!r} is no launch argument: expected name:=value")
+        if len(value) > MAX_VALUE or not value.isprintable():  # it may stand in the log, on a line of its own
+            raise ValueError(f"{name} is {value[:200]!r}: expected at most {MAX_VALUE:,} printable characters")
         arguments[name] = value
     return read(arguments, gui, clock, host)
 
@@ -69,7 +76,7 @@ def _read_ur(arguments: Mapping[str, str], gui: bool, clock: str, host: str) -> 
         mode = arguments.get("target_mode", "only_robot")
     return URSettings(
         host=host,
-        port=int(_number(arguments, "server_port", 0)),
+        port=_port(arguments),
         clock=clock,
         gui=gui,
         ur_model=arguments["ur_model"],
@@ -102,7 +109,7 @@ def _read_mir100(arguments: Mapping[str, str], gui: bool, clock: str, host: str)
     _check_names(arguments, MIR100_KNOWN, MIR100_ONLY)
     return Mir100Settings(
         host=host,
-        port=int(_number(arguments, "server_port", 0)),
+        port=_port(arguments),
         clock=clock,
         gui=gui,
         world=arguments.get("world_name", "empty_world_target.world"),
@@ -116,15 +123,25 @@ LAUNCH_FILES: dict[str, tuple[str, Callable[[Mapping[str, str], bool, str, str],
 
 
 def _check_names(arguments: Mapping[str, str], known: set[str], only: Mapping[str, tuple[str, ...]]) -> None:
-    unknown = [name for name in arguments if name not in known | WINDOWS | set(only)]
+    expected = known | WINDOWS | set(only)
+    unknown = [name for name in arguments if name not in expected]
     if unknown:
+        named = ", ".join(name[:50] for name in unknown[:5]) + (f" and {len(unknown) - 5} more" if unknown[5:] else "")
         raise ValueError(
-            f"launch arguments that are not known: {', '.join(unknown)}; "
-            f"expected some of {', '.join(sorted(known | WINDOWS | set(only)))}"
+            f"launch arguments that are not known: {named}; "
+            f"expected some of {', '.join(sorted(name for name in expected if not _OBJECT.fullmatch(name)))}, "
+            "object_<i>_model_name, object_<i>_frame"
         )
     for name, allowed in only.items():
         if name in arguments and arguments[name].lower() not in allowed:
             raise ValueError(f"{name}:={arguments[name]} is not simulated: expected {name}:={allowed[0]}, the default")
+
+
+def _port(arguments: Mapping[str, str]) -> int:
+    text = arguments.get("server_port", "0")
+    if not _PORT.fullmatch(text):
+        raise ValueError(f"server_port:={text} is no port: expected a whole number, 0 (any free one) to 65535")
+    return int(text)
 
 
 def _number(arguments: Mapping[str, str], name: str, default: float) -> float:

@@ -48,7 +48,9 @@ class RobotServers:
         self._lock = threading.Lock()
         self._running: dict[int, ServerProcess] = {}
         self._starting = 0
-        self._crashed: set[int] = set()  # ports of servers that ended by themselves and that nobody has killed since
+        # Ports of servers that ended without a `kill` of their own: they crashed, or everything was killed. A client
+        # kills its own before it starts another, tries ten times, and fails if that does not succeed (robo-gym 2.0.1).
+        self._ended: set[int] = set()
         self._closed = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="watch-robot-servers", daemon=True)
         self._watcher.start()
@@ -80,7 +82,7 @@ class RobotServers:
                 self._starting -= 1
         with self._lock:
             if not self._closed.is_set():
-                self._crashed.discard(server.port)
+                self._ended.discard(server.port)
                 self._running[server.port] = server
                 log.info("%s on port %d (process %d)", _title(settings), server.port, server.pid)
                 return server.port
@@ -88,24 +90,24 @@ class RobotServers:
         raise ValueError("this server manager is ending")
 
     def kill(self, port: int) -> None:
-        """End the robot server on `port`; one that has crashed counts as ended. Raises ValueError for other ports."""
+        """End the robot server on `port`, or forgive that it has ended already. Raises ValueError for other ports."""
         with self._lock:
             server = self._running.pop(port, None)
-            crashed = port in self._crashed
-            self._crashed.discard(port)
+            has_ended = port in self._ended
+            self._ended.discard(port)
             ports = ", ".join(str(known) for known in sorted(self._running)) or "none"
         if server is not None:
             server.end()
             log.info("%s on port %d ended", _title(server.settings), port)
-        elif not crashed:
+        elif not has_ended:
             raise ValueError(f"there is no robot server on port {port}; running: {ports}")
 
     def kill_all(self) -> None:
         """End every robot server, side by side."""
         with self._lock:
             servers = list(self._running.values())
+            self._ended.update(self._running)
             self._running.clear()
-            self._crashed.clear()
         if servers:
             with futures.ThreadPoolExecutor(len(servers)) as pool:
                 list(pool.map(ServerProcess.end, servers))
@@ -119,12 +121,15 @@ class RobotServers:
         self.kill_all()
 
     def _start_off_the_managers_ports(self, settings: Settings) -> ServerProcess:
-        """Start a server, again where the system gave it a port on which clients look for a manager."""
+        """Start a server, again where the system gave it a port on which clients look for a manager.
+
+        Or one whose last client may still ask for its end: that would end the new server.
+        """
         unwanted: list[ServerProcess] = []
         try:
             while True:
                 server = ServerProcess(settings, orphan_s=self._orphan_s)
-                if settings.port or server.port not in MANAGER_PORTS:
+                if settings.port or not (server.port in MANAGER_PORTS or server.port in self._ended):
                     return server
                 unwanted.append(server)  # ended only after the next has a port, or that would be the same one
         finally:
@@ -137,7 +142,7 @@ class RobotServers:
                 ended = [(port, server) for port, server in self._running.items() if server.exit_code is not None]
                 for port, _ in ended:
                     del self._running[port]
-                    self._crashed.add(port)
+                    self._ended.add(port)
             for port, server in ended:
                 server.kill()  # collects the process and its pipes
                 log.warning("%s on port %d ended by itself: %s", _title(server.settings), port, _why(server.exit_code))

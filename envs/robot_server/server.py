@@ -8,6 +8,7 @@ when its standard input does: nothing outlives the manager, whatever becomes of 
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import queue
@@ -30,14 +31,17 @@ from rlservo.envs.robot_server.settings import Settings, URSettings, settings_fr
 THREADS = 8  # calls at a time; one of them moves the robot
 OPTIONS = [("grpc.so_reuseport", 0)]  # gRPC's default lets two servers share a port, and clients meet either
 WATCH_INTERVAL_S = 2.0
-BEFORE_FIRST_CALL = 10  # times as much patience
 READY = "ready on port "  # what a manager waits for on standard output
 FAILED = "failed: "  # or this, and the reason
 
 log = logging.getLogger("rlservo.robot_server")
 
 
-class PortInUseError(OSError):
+class CannotListenError(OSError):
+    """The address cannot be listened on; the message says why."""
+
+
+class PortInUseError(CannotListenError):
     """The port asked for is taken."""
 
 
@@ -78,22 +82,38 @@ def has_display() -> bool:
 
 
 def bind(server: grpc.Server, host: str, port: int) -> int:
-    """Bind a gRPC server and return the port it has. Raises PortInUseError naming the address."""
+    """Bind a gRPC server and return the port it has.
+
+    Raises PortInUseError when the port is taken, CannotListenError for everything else; both say what and why.
+    """
     address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    _probe(host, port, address)  # gRPC names no reason, and writes several lines to standard error
     try:
-        _probe(host, port)  # gRPC writes several lines to standard error where it fails
         return int(server.add_insecure_port(address))
-    except (OSError, RuntimeError) as error:
-        raise PortInUseError(
-            f"cannot listen on {address}: the port is taken, or the address is not this machine's"
-        ) from error
+    except RuntimeError as error:
+        _probe(host, port, address)  # what was missing may be missing still: a file descriptor, say
+        if port:
+            raise PortInUseError(f"cannot listen on {address}: the port is taken") from error
+        raise CannotListenError(f"cannot listen on {address}: gRPC could not, and did not say why") from error
 
 
-def _probe(host: str, port: int) -> None:
-    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    with socket.socket(family, kind, protocol) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind(address)
+def _probe(host: str, port: int, address: str) -> None:
+    try:
+        family, kind, protocol, _, resolved = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(resolved)
+    except (OSError, UnicodeError) as error:
+        number = error.errno if isinstance(error, OSError) and not isinstance(error, socket.gaierror) else None
+        if number == errno.EADDRINUSE and port:
+            raise PortInUseError(f"cannot listen on {address}: the port is taken") from error
+        reasons = {
+            errno.EADDRINUSE: "no port is free",
+            errno.EADDRNOTAVAIL: "the address is not this machine's",
+            errno.EACCES: "ports below 1024 are for root",
+        }
+        reason = reasons.get(number or 0) or getattr(error, "strerror", None) or str(error)
+        raise CannotListenError(f"cannot listen on {address}: {reason}") from error
 
 
 def stop_signals() -> queue.SimpleQueue[int]:
@@ -118,7 +138,11 @@ def arrives(signals: queue.SimpleQueue[int], timeout_s: float | None = None) -> 
 
 
 def serve_robot(settings: Settings, *, on_ready: Callable[[int], None], orphan_s: float | None = None) -> None:
-    """Serve until SIGTERM or SIGINT, or until nobody has been connected for `orphan_s` seconds. Main thread only."""
+    """Serve until SIGTERM or SIGINT, or until nobody has been connected for `orphan_s` seconds. Main thread only.
+
+    A server that nobody has called yet waits no longer than one that was left: robo-gym's environments connect at their
+    first `reset`, and one that is made and never reset must not keep a simulator.
+    """
     signals = stop_signals()
     server = RobotServer(settings)
     try:
@@ -128,10 +152,8 @@ def serve_robot(settings: Settings, *, on_ready: Callable[[int], None], orphan_s
             if count_connections(server.port) != 0:
                 alone_since = time.monotonic()
                 continue
-            # A client connects with its first call, which may take its time.
-            patience = (orphan_s or 0.0) * (1 if server.service.calls else BEFORE_FIRST_CALL)
-            if time.monotonic() - alone_since > patience:
-                log.warning("nobody has been connected for %g s: this server ends itself", patience)
+            if orphan_s is not None and time.monotonic() - alone_since > orphan_s:
+                log.warning("nobody has been connected for %g s: this server ends itself", orphan_s)
                 return
     finally:
         server.stop()
@@ -151,7 +173,7 @@ def main(argv: list[str]) -> None:
 
     try:
         serve_robot(settings, on_ready=ready, orphan_s=orphan_s)
-    except (PortInUseError, ValueError) as error:
+    except (CannotListenError, ValueError) as error:
         _say(f"{FAILED}{error}")
         raise SystemExit(1) from None
 

@@ -28,7 +28,6 @@ class RobotService:
         self._robot, self._clock, self._gui = robot, clock, gui
         self._state_lock = threading.Lock()  # held while the simulation runs
         self._turn = threading.Lock()  # held by a command until its cycle is over
-        self.calls = 0
 
     def handler(self) -> grpc.GenericRpcHandler:
         """Return what a gRPC server is given."""
@@ -103,7 +102,6 @@ class RobotService:
 
     def _guarded(self, name: str, call: Callable[[bytes], Any], failed: Any) -> grpc.RpcMethodHandler:
         def answer(request: bytes, _context: grpc.ServicerContext) -> bytes:
-            self.calls += 1
             try:
                 message = call(request)
             except DecodeError:

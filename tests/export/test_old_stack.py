@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
@@ -41,8 +42,8 @@ EXPORTED = [
     "pendulum", "cart_pole", "clipped", "shared", "free_std", "no_critic", "concurrent", "unbounded", "half_bounded",
     "mixed", "double", "started", "grid", "beams", "filtered_beams", "picture", "offset", "dqn", "plain_dqn",
     "distributional_dqn", "sac", "unnormalized_sac", "discrete_sac", "appo", "impala", "marwil", "cloned", "cql",
-    "user_model", "named_model", "lstm", "continuous_lstm", "user_recurrent", "choice", "shifted", "dials", "nested",
-    "filtered_nested", "camera", "levers", "limbs", "masked", "named_distribution", "tempered", "counts",
+    "user_model", "bearing", "named_model", "lstm", "continuous_lstm", "user_recurrent", "choice", "shifted", "dials",
+    "nested", "filtered_nested", "camera", "levers", "limbs", "masked", "named_distribution", "tempered", "counts",
 ]  # fmt: skip
 SEVERAL = ["several_arm", "several_cart"]
 
@@ -489,6 +490,14 @@ def test_what_a_users_constructor_lacks_is_not_called_a_damaged_file(
     monkeypatch.setattr(old_zoo_parts.OldModel, "__init__", build)
     with pytest.raises(CheckpointError, match=r"cannot be restored: KeyError: 'gear_ratio'"):
         load("user_model")
+
+
+def test_an_operator_inside_a_model_is_named_with_its_place(
+    export: Callable[..., ExportResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "hypot", torch.nextafter)
+    with pytest.raises(UnsupportedError, match=r"torch\.nextafter in Turned\.forward \(.*old_zoo_parts\.py:\d+\)"):
+        export("bearing")
 
 
 def test_a_truncated_policy_state_is_named(

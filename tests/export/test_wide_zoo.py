@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +15,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+import torch
 
 from rlservo.export.actor import PolicyGraph
 from rlservo.export.bundle import Contract, leaf_specs, load_bundle
@@ -36,6 +41,7 @@ STATELESS = [
     "image", "byte_image", "act_multi_discrete", "act_dict", "act_tuple", "act_scalar", "masked", "autoregressive",
     "scaled", "halved", "impala", "sac_discrete", "tqc", "dqn_plain", "dqn_distributional", "dqn_distributional_plain",
     "bc", "marwil", "cql", "iql", "byte_masked", "user_distribution", "old_model_inside",
+    "polar", "bearing_module",
 ]  # fmt: skip
 # RLlib's own classes and zoo environments, on the way from a checkpoint to the contract.
 pytestmark = pytest.mark.filterwarnings("ignore:.*PPOTorchRLModule.*:DeprecationWarning")
@@ -105,6 +111,52 @@ def test_what_does_not_match_leaves_nothing(
 ) -> None:
     with pytest.raises(error, match=words):
         export_checkpoint(wide_zoo / name, tmp_path / "out", app_dir=app, notify=notices.append)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["polar", "bearing_module"])
+def test_distance_and_bearing_hold_for_extreme_observations(
+    load: Callable[[str], Checkpoint], export: Callable[[str], ExportResult], name: str
+) -> None:
+    numbers = np.float32([0.0, -0.0, 1.0, -1.0, 0.5, -7.0, 1e-42, -1e-38, 1e5, -1e5, 1e15, 1e30, -1e30])
+    obs = np.array([(x, y, z) for x in numbers for y in numbers for z in (0.3, -0.0, -2.0)], np.float32)
+    expected, result = load(name).reference({"obs": obs.copy()}), export(name)
+    script = run_torchscript(result.path / "policy.ts", ["obs"], [one.name for one in result.contract.outputs])
+    for run in (run_onnx(result.path / "policy.onnx"), script):
+        for output, values in run({"obs": obs}).items():
+            if values.dtype == np.float32:
+                scale = np.maximum(1.0, np.abs(expected[output]).max(axis=tuple(range(1, values.ndim)), keepdims=True))
+                np.testing.assert_allclose(values / scale, expected[output] / scale, rtol=1e-5, atol=2e-6)
+
+
+def test_an_operator_without_an_onnx_form_is_one_sentence_on_the_command_line(
+    wide_zoo: Path, app: Path, tmp_path: Path
+) -> None:
+    changed_app = Path(shutil.copytree(app, tmp_path / "app", ignore=shutil.ignore_patterns("__pycache__")))
+    source = changed_app / "zoo_spaces.py"
+    source.write_text(source.read_text().replace("torch.hypot(x, y)", "torch.nextafter(x, y)"))
+    command = [sys.executable, "-m", "rlservo.deploy.cli", "export", str(wide_zoo / "polar")]
+    command += ["--out", str(tmp_path / "out"), "--app-dir", str(changed_app)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("rlservo: ")]
+    assert re.fullmatch(
+        rf"rlservo: the operator torch\.nextafter in Polar\.torch_forward \({re.escape(str(source))}:\d+\) has no ONNX "
+        r"form that onnxruntime runs: compose it of [\w ,.]+",
+        sentence,
+    )
+    written = done.stdout + done.stderr
+    assert not any(words in written for words in ("\x1b", "Traceback", "Next steps", "step 3/3"))
+    assert "the elements stay without names, which changes nothing else" in written
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_operator_inside_a_module_is_named_with_its_place(
+    wide_zoo: Path, app: Path, tmp_path: Path, notices: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "hypot", torch.nextafter)
+    with pytest.raises(UnsupportedError, match=r"torch\.nextafter in BearingModule\._hidden \(.*zoo_spaces\.py:\d+\)"):
+        export_checkpoint(wide_zoo / "bearing_module", tmp_path / "out", app_dir=app, notify=notices.append)
     assert not (tmp_path / "out").exists()
 
 

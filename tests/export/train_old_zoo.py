@@ -170,6 +170,7 @@ def configurations(out: Path) -> dict[str, Any]:
         "cloned": offline(MARWILConfig(), discrete, "CartPole-v1", beta=0.0),
         "cql": offline(CQLConfig(), continuous, "Pendulum-v1"),
         "user_model": user_model(old_zoo_parts.OldModel),
+        "bearing": user_model(old_zoo_parts.OldBearing),
         "named_model": user_model("named_model"),
         "batch_reader": user_model(old_zoo_parts.OldBatchReader),
         "previous_action": user_model(old_zoo_parts.OldPreviousAction),

@@ -253,6 +253,8 @@ def configurations(out: Path) -> dict[str, Any]:
         "branching": ppo("vector", "discrete", spec=RLModuleSpec(module_class=zoo_rules.BranchingModule)),
         "autoregressive": ppo("vector", "autoregressive", spec=RLModuleSpec(module_class=AutoregressiveActionsRLM)),
         "scaled": ppo("vector", "discrete", zoo_spaces.Scaled),
+        "polar": ppo("vector", "box", zoo_spaces.Polar),
+        "bearing_module": ppo("vector", "discrete", spec=RLModuleSpec(module_class=zoo_spaces.BearingModule)),
         "wrongly_scaled": ppo("vector", "discrete", zoo_spaces.WronglyScaled),
         "halved": ppo("vector", "box", after=zoo_spaces.Halved),
         "bc": offline(BCConfig(), choices, "discrete"),

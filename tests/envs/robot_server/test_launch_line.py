@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import random
+import time
+
 import pytest
 
 from rlservo.envs.robot_server.launch_line import parse_launch_line
@@ -101,6 +104,16 @@ def test_mir100_and_two_object_lines_are_understood() -> None:
             "object model 'duck' does not exist",
         ),
         (f"{UR} ur_model:=ur5 server_port:=99999", "port 99999 does not exist"),
+        *(
+            (f"{UR} ur_model:=ur5 server_port:={port}", "is no port: expected a whole number, 0 .* to 65535")
+            for port in ("inf", "-inf", "nan", "1e400", "50400.9", "50400.0", "-1", "٣", "", "9" * 400, "50_400")
+        ),
+        (f"{MIR} server_port:=inf", "server_port:=inf is no port"),
+        (f"{UR} ur_model:=ur5 'a\nb:=1'", r"'a\\nb:=1' is no launch argument: expected name:=value"),
+        (f"{UR} 'ur_model:=ur5\nERROR'", r"ur_model is 'ur5\\nERROR': expected at most 1,000 printable characters"),
+        (f"{UR} ur_model:={'u' * 2000}", "expected at most 1,000 printable characters"),
+        (f"{UR} " + " ".join(f"a{i}:=1" for i in range(400)), "not known: a0, a1, a2, a3, a4 and 395 more; expected"),
+        (f"{UR} object_{'1' * 1000}_frame:=x ur_model:=ur5", "launch arguments that are not known: object_111"),
         (f"{MIR} world_name:=moon.world", "world 'moon.world' does not exist: expected one of empty_world_target"),
         (f"{MIR} ur_model:=ur5", "launch arguments that are not known: ur_model"),
         (f"{MIR} robot_x:=1.0", "robot_x:=1.0 is not simulated"),
@@ -109,6 +122,46 @@ def test_mir100_and_two_object_lines_are_understood() -> None:
 def test_line_that_cannot_be_honoured_is_refused_by_name(line: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parse_launch_line(line)
+
+
+@pytest.mark.parametrize("filling", [" x:=" + "a" * 10**6, " a:=1" * 200_000, " " * 10**6, " '" + "a" * 10**6 + "'"])
+def test_a_line_of_a_million_characters_is_refused_before_it_is_read(filling: str) -> None:
+    began = time.process_time()
+    with pytest.raises(ValueError, match=r"the line has 1,000,\d\d\d characters: expected at most 10,000"):
+        parse_launch_line(f"{UR} ur_model:=ur5{filling}")
+    assert time.process_time() - began < 0.5  # today's answer took 39 s
+
+
+def test_whatever_a_line_holds_is_understood_or_refused_in_a_short_sentence() -> None:
+    rng = random.Random(0)
+    names = ["ur_model", "rs_mode", "server_port", "n_objects", "objects_controller", "action_cycle_rate", "world_name"]
+    names += ["max_velocity_scale_factor", "object_0_model_name", "reference_frame", "z", "gui", "colour"]
+    values = [
+        "ur5",
+        "1object",
+        "inf",
+        "-inf",
+        "nan",
+        "1e308",
+        "1e-308",
+        "-0",
+        "50400.9",
+        "9" * 50,
+        "true",
+        "",
+        "sphere50",
+    ]
+    values += ["\x00", "\ud800", "\u2028", "'", '"', "\\", "a b", "$(rm)", "%n", "\x1b[31m", "0x10", "٣"]
+    began = time.process_time()
+    for _ in range(3_000):
+        words = [f"{rng.choice(names)}{rng.choice((':=', ':=', ':=', '=', ''))}{rng.choice(values)}" for _ in range(6)]
+        line = f"{rng.choice((UR, UR, MIR, 'roslaunch'))} {' '.join(words)}"
+        try:
+            parse_launch_line(line)
+        except ValueError as error:
+            assert len(str(error)) < 1_000
+            assert str(error).isprintable(), line
+    assert time.process_time() - began < 30.0
 
 
 @pytest.mark.parametrize(

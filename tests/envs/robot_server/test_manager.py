@@ -12,6 +12,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent import futures
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -20,7 +22,7 @@ import pytest
 from rlservo.envs.robot_server.connections import count_connections
 from rlservo.envs.robot_server.manager import MANAGER_PORTS, RobotServers, ServerManager
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, SERVER_MANAGER, Empty, ManagerStatus, State
-from rlservo.envs.robot_server.server import PortInUseError
+from rlservo.envs.robot_server.server import CannotListenError, PortInUseError, bind
 from rlservo.serve_app.processes import check_port, free_ports
 
 UR = "roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur5"
@@ -131,6 +133,38 @@ def test_killed_robot_server_is_noticed_and_its_client_gets_an_error(
     assert client.start(UR).success
 
 
+def test_clients_of_servers_that_kill_all_ended_kill_theirs_and_go_on(manager: ServerManager, client: Any) -> None:
+    ports = [client.start(UR).port, client.start(MIR).port]
+    assert client.kill_all().success
+    # robo-gym's `kill_sim` asserts that this succeeds, and its `restart_sim` begins with it.
+    assert client.kill(ports[0]).success
+    assert client.kill(ports[1]).success
+    assert not client.kill(ports[0]).success  # once
+    assert client.start(UR).success
+
+
+@pytest.mark.slow
+def test_robo_gyms_own_client_goes_on_after_kill_all(manager: ServerManager, robo_gym_python: Path) -> None:
+    code = (
+        "import sys, gymnasium, robo_gym\n"
+        "port = int(sys.argv[1])\n"
+        "make = lambda: gymnasium.make('EmptyEnvironmentURSim-v0', ip='127.0.0.1', lower_bound_port=port,"
+        " upper_bound_port=port + 1, disable_env_checker=True).unwrapped\n"
+        "killed, restarted = make(), make()\n"
+        "assert killed.sm_client.kill_all()\n"
+        "killed.kill_sim()\n"
+        "restarted.restart_sim()\n"
+        "restarted.reset()\n"
+        "restarted.kill_sim()\n"
+    )
+    done = subprocess.run(
+        [str(robo_gym_python), "-c", code, str(manager.port)], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Tentative 2" not in done.stdout
+    assert manager.servers.running == {}
+
+
 def test_stopped_process_that_does_not_listen_to_sigterm_is_killed_within_a_second(
     manager: ServerManager, client: Any
 ) -> None:
@@ -156,6 +190,51 @@ def test_limit_of_servers_is_kept_and_freed_by_a_kill() -> None:
     assert servers.running == {}
     with pytest.raises(ValueError, match="this server manager is ending"):
         servers.start(UR)
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "reason"),
+    [
+        ("203.0.113.7", 0, "the address is not this machine's"),
+        ("no-such-host.invalid", 0, "Name or service not known|Temporary failure in name resolution|No address"),
+        ("127.0.0.1", None, "the port is taken"),
+    ],
+)
+def test_address_that_cannot_be_listened_on_is_named_with_its_true_reason(
+    host: str, port: int | None, reason: str
+) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1] if port is None else port
+        with pytest.raises(CannotListenError) as caught:
+            bind(grpc.server(futures.ThreadPoolExecutor(1)), host, port)
+    assert re.fullmatch(rf"cannot listen on {host}:{port}: ({reason}).*", str(caught.value))
+    assert isinstance(caught.value, PortInUseError) == (reason == "the port is taken")
+
+
+OUT_OF_FILES = """
+import resource, grpc
+from concurrent import futures
+from rlservo.envs.robot_server.server import CannotListenError, bind
+server, held = grpc.server(futures.ThreadPoolExecutor(1)), []
+resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
+try:
+    while True:
+        held.append(open("/dev/null"))
+except OSError:
+    pass
+try:
+    bind(server, "127.0.0.1", 0)
+except CannotListenError as error:
+    held.clear()
+    print(error)
+"""
+
+
+def test_out_of_file_descriptors_is_not_called_a_taken_port() -> None:
+    done = subprocess.run([sys.executable, "-c", OUT_OF_FILES], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "cannot listen on 127.0.0.1:0: Too many open files", done.stderr
 
 
 @pytest.mark.slow
@@ -314,18 +393,20 @@ def test_impossible_options_are_one_sentence(arguments: tuple[str, ...], message
 # -- orphans
 
 
-def test_robot_server_without_a_client_ends_itself_and_one_with_a_client_stays() -> None:
-    servers = RobotServers(orphan_s=0.5)
+def test_robot_server_without_a_client_ends_itself_called_or_not_and_one_with_a_client_stays() -> None:
+    servers = RobotServers(orphan_s=1.0)
     try:
         left, kept = servers.start(UR), servers.start(UR)
         get_state(left)  # comes and goes
+        never_called = servers.start(UR)
         with grpc.insecure_channel(f"127.0.0.1:{kept}") as channel:
             call = channel.unary_unary(f"/{ROBOT_SERVER}/GetState", response_deserializer=State.FromString)
             call(Empty().SerializeToString(), timeout=5)
             assert count_connections(kept) == 1
-            assert wait_for(lambda: left not in servers.running, 8.0)
+            assert wait_for(lambda: left not in servers.running, 20.0)
+            assert wait_for(lambda: never_called not in servers.running, 20.0)
             assert kept in servers.running
-        assert wait_for(lambda: kept not in servers.running, 8.0)
+        assert wait_for(lambda: kept not in servers.running, 20.0)
     finally:
         servers.close()
 

@@ -156,6 +156,22 @@ class OldRecurrent(RecurrentNetwork, nn.Module):
         return self.values(self.features).reshape(-1)
 
 
+class Turned(nn.Module):
+    """The first two numbers as a distance and a bearing, with operators that torch's exporters lack or get wrong."""
+
+    def forward(self, obs: Any) -> Any:
+        x, y = obs[:, 0], obs[:, 1]
+        return torch.cat((torch.stack((torch.hypot(x, y), torch.atan2(y, x) % 1.5), dim=-1), obs[:, 2:]), dim=-1)
+
+
+class OldBearing(OldModel):
+    """A network that turns its observation itself."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self.trunk = nn.Sequential(Turned(), *self.trunk)
+
+
 class OldNamedModel(OldModel):
     """Registered by name only: see old_zoo_registry.py."""
 

@@ -177,6 +177,46 @@ class WronglyScaled(Scaled):
         return torch.cat((obs * 3.0, (obs[:, :1] > 0.9).float()), dim=-1)
 
 
+class Polar(SingleAgentObservationPreprocessor):
+    """What a mobile robot's environment sees, as the goal's distance, bearing and heading error [rad]."""
+
+    def recompute_output_observation_space(self, input_observation_space: Any, input_action_space: Any) -> Any:
+        return Box(-np.inf, np.inf, (4,), np.float32)
+
+    def preprocess(self, observation: Any, episode: Any) -> Any:
+        x, y, turn = observation
+        bearing = np.arctan2(y, x)
+        error = (turn - bearing + np.float32(np.pi)) % np.float32(2 * np.pi) - np.float32(np.pi)
+        return np.array([np.hypot(x, y), bearing, np.sin(error), np.cos(error)], np.float32)
+
+    def torch_forward(self, obs: Any) -> Any:
+        x, y, turn = torch.unbind(obs, dim=-1)
+        bearing = torch.atan2(y, x)
+        error = (turn - bearing + np.pi) % (2 * np.pi) - np.pi
+        return torch.stack((torch.hypot(x, y), bearing, torch.sin(error), torch.cos(error)), dim=-1)
+
+
+class BearingModule(TorchRLModule, ValueFunctionAPI):
+    """A module that turns its observation itself, with operators that torch's exporters lack or get wrong."""
+
+    def setup(self) -> None:
+        self.register_buffer("sectors", torch.tensor([-2.0, -0.5, 0.0, 0.5, 2.0]))
+        self.policy = nn.Linear(5, self.action_space.n)
+        self.values = nn.Linear(5, 1)
+
+    def _hidden(self, batch: dict[str, Any]) -> Any:
+        x, y, z = torch.unbind(batch[Columns.OBS], dim=-1)
+        bearing = torch.atan2(y, x)
+        sector = torch.searchsorted(self.sectors, bearing.contiguous()).float() / 5.0
+        return torch.stack((torch.hypot(x, y), bearing, sector, torch.copysign(z, x), z * 7.0 // 2.0), dim=-1)
+
+    def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        return {Columns.ACTION_DIST_INPUTS: self.policy(self._hidden(batch))}
+
+    def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Any:
+        return self.values(self._hidden(batch)).squeeze(-1)
+
+
 class Halved(ConnectorV2):
     """A user's own module-to-env connector."""
 
