@@ -38,7 +38,7 @@ class UnloadCommand(_Command):
 
 
 class AliasCommand(_Command):
-    alias: Alias = Field(description="`production` is the default version.")
+    alias: Alias = Field(description="`production` is the default version; it can be moved, not removed.")
     version: Version | None = Field(description="A loaded version; null removes the alias.")
 
 
@@ -103,7 +103,7 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
         replies = [listing.describe(core)] if control.gather is None else await control.gather()
         return Response(orjson.dumps(replies), media_type="application/json")
 
-    @command("load", "Load a version, prove it, and keep it ready")
+    @command("load", "Load a version, prove it, and keep it ready: not in use until an alias leads to it")
     async def load(name: str, given: LoadCommand) -> Response:
         return await changed(name, f"load {name} {given.version or 'newest'}", _load(control, name, given.version))
 
@@ -119,16 +119,8 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
 
     @command("rollback", "Let an alias lead where it led before")
     async def rollback(name: str, given: RollbackCommand) -> Response:
-        def change(before: Plan) -> dict[str, PolicyPlan]:
-            return plan.roll_back(
-                before,
-                name,
-                given.alias,
-                lambda n, v: digest_of(control.repository.find(n, v)[1]),
-                expected=given.expected,
-            )
-
-        return await changed(name, f"rollback {name} {given.alias}", change)
+        what = f"rollback {name} {given.alias}"
+        return await changed(name, what, lambda p: plan.roll_back(p, name, given.alias, expected=given.expected))
 
     @command("canary", "Send a share of the sessions to another version")
     async def canary(name: str, given: CanaryCommand) -> Response:
@@ -153,7 +145,9 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             responses=errors,
         )
 
-    @repository("load", "Load a model's newest version")
+    # As a Triton that serves what its configuration pins: loading changes what clients get only where the model was not
+    # there at all. Moving `production` is /v1/admin's, with a way back.
+    @repository("load", "Load a model's newest version; in use at once only if the model was not served")
     async def load_model(name: str, _given: RepositoryCommand | None = Body(None)) -> Response:  # noqa: B008  # FastAPI's way
         await control.change(_load(control, name, None), what=f"load {name} newest")
         return Response(b"{}", media_type="application/json")

@@ -25,7 +25,7 @@ from rlservo.export.errors import (
 )
 from rlservo.serve_app.acting import Observation
 from rlservo.serve_app.options import DEFAULT_OPTIONS, PolicyOptions
-from rlservo.serve_app.plan import PolicyPlan
+from rlservo.serve_app.plan import PRODUCTION, PolicyPlan
 from rlservo.serve_app.policy import Policy
 
 
@@ -69,7 +69,7 @@ class Shadow:
 
 
 class PolicyStore:
-    """Several policies in several versions; a name's default is its `production` alias, else its newest version."""
+    """Several policies in several versions; a name's default is its `production` alias, without plans the newest."""
 
     def __init__(
         self,
@@ -80,8 +80,9 @@ class PolicyStore:
     ) -> None:
         """Take loaded policies, and by name which are to do what; those `changed` were served otherwise before.
 
-        A plan may name versions that are not among the policies; where it leads to one, that part of it is left out.
-        Raises UsageError when two have the same name and version, or, without plans, when there is none.
+        A plan may name versions that are not among the policies; an alias, canary or shadow that leads to one is left
+        out. Raises UsageError when two have the same name and version, when the default version is not there (no other
+        takes its place), or, without plans, when there is no policy.
         """
         self._policies: dict[str, dict[str, Policy]] = {}
         self._changed = frozenset(changed)
@@ -105,7 +106,7 @@ class PolicyStore:
         self._canary: dict[str, _Canary] = {}
         self._shadow: dict[str, Shadow] = {}
         for name, versions in self._policies.items():
-            self._arrange(name, versions, (plans or {}).get(name) or PolicyPlan(versions=dict.fromkeys(versions, "")))
+            self._arrange(name, versions, (plans or {}).get(name) or _newest(versions))
         self.batches = any(policy.batcher for versions in self._policies.values() for policy in versions.values())
         """Whether some policy computes together what comes at the same time."""
 
@@ -266,9 +267,11 @@ class PolicyStore:
                 policy.close()
 
     def _arrange(self, name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> None:
-        self._aliases[name] = {alias: versions[v] for alias, v in sorted(plan.aliases.items()) if v in versions}
-        default = versions.get(plan.default or "") or list(versions.values())[-1]
+        default = versions.get(plan.default or "")
+        if default is None:
+            raise UsageError(f"policy '{name}' is to be served as version {plan.default}, which is not loaded")
         self._default[name] = default
+        self._aliases[name] = {alias: versions[v] for alias, v in sorted(plan.aliases.items()) if v in versions}
         canary = plan.canary and versions.get(plan.version_of(plan.canary.version) or "")
         if canary and plan.canary:
             self._canary[name] = _Canary(canary, plan.canary.share, canary.episodic)
@@ -290,6 +293,10 @@ class PolicyStore:
                 {"policies": list(self.names)},
             )
         return versions
+
+
+def _newest(versions: Mapping[str, Policy]) -> PolicyPlan:
+    return PolicyPlan(versions=dict.fromkeys(versions, ""), aliases={PRODUCTION: list(versions)[-1]})
 
 
 def _act(policy: Policy, obs: Observation, explore: bool = False, seed: int | None = None) -> Decision:
