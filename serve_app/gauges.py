@@ -39,6 +39,17 @@ def queue(core: Core, replica: str) -> Iterator[Metric]:
     yield turned_away
 
 
+def keys(core: Core, replica: str) -> Iterator[Metric]:
+    """Yield whether the API keys in use are those of their file."""
+    current = GaugeMetricFamily(
+        "rlservo_api_keys_current",
+        "1 while the API keys in use are those of their file; 0: the file cannot be used, and older keys stay",
+        labels=["replica"],
+    )
+    current.add_metric([replica], core.keys.current)
+    yield current
+
+
 def batches(core: Core, replica: str) -> Iterator[Metric]:
     """Yield how many observations were computed together, of the policies whose options ask for it."""
     labels = ["replica", "policy", "version"]

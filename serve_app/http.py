@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -27,7 +28,7 @@ from rlservo.serve_app.docs import add_docs
 from rlservo.serve_app.edge import JSON, JSON_HEADERS, BareRoute, Body, Endpoint, Headers
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import Decision
-from rlservo.serve_app.stream import STREAM_PATTERN, Stream, refuse
+from rlservo.serve_app.stream import CHECK_KEY, STREAM_PATTERN, Stream, refuse
 
 CODES = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "wrong-media-type"}
 ACT_PATH = "/v1/policies/{name}/act"
@@ -132,6 +133,7 @@ class PolicyApp(FastAPI):
                     await endpoint(scope, receive, send)
                     return
         elif scope["type"] == "websocket":
+            scope[CHECK_KEY] = partial(self._core.guard.check, scope, path)
             await self._stream(scope, receive, send)
             return
         await super().__call__(scope, receive, send)

@@ -100,15 +100,15 @@ class PolicyPlan(_Model):
     """One policy of a plan."""
 
     versions: dict[Version, str]
-    """The version's bundle, as the SHA-256 of its SHA256SUMS. None at all: the policy was unloaded, and only its history
-    is kept, for when it is loaded again."""
+    """The version's bundle, as the SHA-256 of its SHA256SUMS. None at all: the policy was unloaded, and its
+    history is kept for when it is loaded again."""
 
     aliases: dict[Alias, Version] = {}
     history: dict[Alias, tuple[Version, ...]] = {}
     """Where an alias led before, the last one last."""
 
     unloaded: dict[Version, str] = {}
-    """The bundles of versions that the history names and that are not loaded: a rollback leads back to the same ones."""
+    """The bundles of the history's versions that are not loaded: a rollback leads back to the same ones."""
 
     canary: Canary | None = None
     shadow: Reference | None = None

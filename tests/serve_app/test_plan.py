@@ -111,7 +111,7 @@ def test_what_is_in_use_at_the_start_is_written_down_and_a_load_never_changes_it
 
 def test_production_is_moved_but_neither_removed_nor_unloaded_nor_exchanged() -> None:
     now = made(planned({}))
-    with pytest.raises(ConflictError, match="says what clients get .* point it elsewhere, or unload the policy"):
+    with pytest.raises(ConflictError, match=r"says what clients get .* point it elsewhere, or unload the policy"):
         plan.set_alias(now, "ur5", "production", None)
     with pytest.raises(ConflictError, match="version 10 is in use by the alias 'production'"):
         plan.unload(now, "ur5", "10")
@@ -133,7 +133,7 @@ def test_unloading_a_policy_and_loading_another_version_leaves_the_way_back() ->
     now = made(planned({"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}}}}))
     now = now.after(plan.set_alias(now, "ur5", "production", "2"), "alias")
     now = now.after(plan.unload(now, "ur5", None), "unload")
-    with pytest.raises(UnknownPolicyError, match="no policy 'ur5' is loaded: this server has mir$"):
+    with pytest.raises(UnknownPolicyError, match=r"no policy 'ur5' is loaded: this server has mir$"):
         now.policy("ur5")
     again = now.after(plan.load(now, "ur5", "2", "b"), "load")
     assert again.policies["ur5"].history == {"production": ("1",)}  # what is in use is not its own way back
