@@ -23,11 +23,15 @@ class NotReadableError(OSError):
         return str(self.args[0])
 
 
+class FileTooLargeError(NotReadableError):
+    """A file that is larger than its limit."""
+
+
 @contextmanager
 def open_regular(file: Path, max_bytes: int | None = None) -> Iterator[BinaryIO]:
     """Open a regular file, or what a symbolic link to one leads to, for reading.
 
-    Raises NotReadableError when it is something else or larger than `max_bytes`, and OSError.
+    Raises NotReadableError when it is something else, FileTooLargeError beyond `max_bytes`, and OSError.
     """
     _check(file.stat(), max_bytes)  # before opening: opening a device can do something
     # It may have been exchanged for a FIFO since: without O_NONBLOCK, opening one waits for its writer.
@@ -47,12 +51,12 @@ def read_regular(file: Path, max_bytes: int) -> bytes:
 
 
 def blocks(stream: BinaryIO, max_bytes: int | None = None) -> Iterator[bytes]:
-    """Yield the rest of a file. Raises NotReadableError when it is longer than `max_bytes`, and OSError."""
+    """Yield the rest of a file. Raises FileTooLargeError when it is longer than `max_bytes`, and OSError."""
     length = 0
     for block in iter(lambda: stream.read(BLOCK), b""):
         length += len(block)
         if max_bytes is not None and length > max_bytes:
-            raise _too_large(max_bytes)
+            raise FileTooLargeError(f"is larger than {max_bytes:,} bytes")
         yield block
 
 
@@ -60,12 +64,7 @@ def _check(status: os.stat_result, max_bytes: int | None) -> None:
     if not stat.S_ISREG(status.st_mode):
         raise NotReadableError(f"is {_kind(status.st_mode)}, not a regular file")
     if max_bytes is not None and status.st_size > max_bytes:
-        raise _too_large(max_bytes, status.st_size)
-
-
-def _too_large(max_bytes: int, size: int | None = None) -> NotReadableError:
-    of = "" if size is None else f" of {size:,} bytes"
-    return NotReadableError(f"is too large{of}: at most {max_bytes:,} are read")
+        raise FileTooLargeError(f"is larger than {max_bytes:,} bytes: it has {status.st_size:,}")
 
 
 def _kind(mode: int) -> str:

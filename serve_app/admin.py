@@ -19,7 +19,6 @@ from rlservo.serve_app import listing, plan, wire
 from rlservo.serve_app.control import Change, Control
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import error_models
-from rlservo.serve_app.library import digest_of
 from rlservo.serve_app.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
 
 Route = TypeVar("Route", bound=Callable[..., Any])
@@ -105,7 +104,8 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
 
     @command("load", "Load a version, prove it, and keep it ready: not in use until an alias leads to it")
     async def load(name: str, given: LoadCommand) -> Response:
-        return await changed(name, f"load {name} {given.version or 'newest'}", _load(control, name, given.version))
+        what = f"load {name} {given.version or 'newest'}"
+        return _answer(name, await control.load(name, given.version, what=what))
 
     @command("unload", "Drop a version, or the policy")
     async def unload(name: str, given: UnloadCommand) -> Response:
@@ -149,21 +149,13 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
     # there at all. Moving `production` is /v1/admin's, with a way back.
     @repository("load", "Load a model's newest version; in use at once only if the model was not served")
     async def load_model(name: str, _given: RepositoryCommand | None = Body(None)) -> Response:  # noqa: B008  # FastAPI's way
-        await control.change(_load(control, name, None), what=f"load {name} newest")
+        await control.load(name, None, what=f"load {name} newest")
         return Response(b"{}", media_type="application/json")
 
     @repository("unload", "Unload a model, all its versions")
     async def unload_model(name: str, _given: RepositoryCommand | None = Body(None)) -> Response:  # noqa: B008
         await control.change(lambda p: plan.unload(p, name, None), what=f"unload {name}")
         return Response(b"{}", media_type="application/json")
-
-
-def _load(control: Control, name: str, version: str | None) -> Change:
-    def change(before: Plan) -> dict[str, PolicyPlan]:
-        found, folder = control.repository.find(name, version)
-        return plan.load(before, name, found, digest_of(folder))
-
-    return change
 
 
 def _answer(name: str, after: Plan) -> Response:

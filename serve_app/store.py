@@ -14,7 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.bundle import DictSpec, SpaceSpec, TupleSpec, find_bundles, read_contract, version_key
+from rlservo.export.bundle import (
+    DEFAULT_LIMITS,
+    BundleLimits,
+    DictSpec,
+    SpaceSpec,
+    TupleSpec,
+    find_bundles,
+    read_contract,
+    version_key,
+)
 from rlservo.export.errors import (
     BundleError,
     RequestError,
@@ -347,9 +356,16 @@ def take_notices(policy: Policy) -> tuple[str, ...]:
     return taken
 
 
-def load_policy(folder: Path, *, threads: int = 1, options: Mapping[str, PolicyOptions] | None = None) -> Policy:
+def load_policy(
+    folder: Path,
+    *,
+    threads: int = 1,
+    options: Mapping[str, PolicyOptions] | None = None,
+    limits: BundleLimits = DEFAULT_LIMITS,
+) -> Policy:
     """Load and prove a bundle; `options` are by policy name, '*' is for those not named. Raises BundleError."""
     if not options:
-        return Policy.load(folder, threads=threads)
-    name = read_contract(folder).name
-    return Policy.load(folder, threads=threads, options=options.get(name, options.get("*", DEFAULT_OPTIONS)))
+        return Policy.load(folder, threads=threads, limits=limits)
+    name = read_contract(folder, limits).name
+    chosen = options.get(name, options.get("*", DEFAULT_OPTIONS))
+    return Policy.load(folder, threads=threads, options=chosen, limits=limits)

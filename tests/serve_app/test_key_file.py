@@ -155,7 +155,7 @@ def restore(file: Path) -> None:
     ("how", "sentence"),
     [("deleted", "cannot be read"), ("empty", "name no key"), ("world-writable", "written by every user"),
      ("malformed", "line 2: expected"), ("a folder", "is a folder"), ("a FIFO", "is a FIFO, not a regular file"),
-     ("no text", "cannot be read"), ("endless", "is too large")],
+     ("no text", "cannot be read"), ("endless", "is larger than")],
 )  # fmt: skip
 def test_a_file_that_cannot_be_used_changes_nothing_and_is_said_once(
     file: Path, how: str, sentence: str, caplog: pytest.LogCaptureFixture
