@@ -38,7 +38,7 @@ def open_regular(file: Path, max_bytes: int | None = None) -> Iterator[BinaryIO]
     descriptor = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with os.fdopen(descriptor, "rb", buffering=0) as stream:
         _check(os.fstat(stream.fileno()), max_bytes)
-        yield stream  # type: ignore[misc]  # a FileIO reads as a BinaryIO does
+        yield stream
 
 
 def read_regular(file: Path, max_bytes: int) -> bytes:
