@@ -45,6 +45,7 @@ CONTRACT_KEY = "rlservo.contract"
 """Where the graph's own metadata repeat the contract."""
 
 MAX_SUMS_BYTES = 1 << 16
+MAX_FILES = 16  # the four, and what a user may have added
 DESCRIPTORS = Path("/proc/self/fd")  # Linux: a file that this process has open, whether it has a name or not
 BAD_ARCHIVE = (OSError, ValueError, EOFError, RuntimeError, KeyError, MemoryError, zlib.error, zipfile.BadZipFile)
 """What zipfile and numpy raise on archives that are none."""
@@ -434,6 +435,8 @@ def load_bundle(path: str | Path, limits: BundleLimits = DEFAULT_LIMITS) -> Bund
     for name in (ONNX_FILE, TORCHSCRIPT_FILE, CONTRACT_FILE, GOLDEN_FILE):
         if name not in sums:
             raise BundleError(f"{folder / SUMS_FILE} does not list {name}: the bundle is incomplete")
+    if len(sums) > MAX_FILES:  # each may be as large as a policy, and all of them are hashed
+        raise BundleError(f"{folder / SUMS_FILE} lists {len(sums)} files: at most {MAX_FILES}")
     contract = b""
     for name, recorded in sums.items():
         content = _verified(folder / name, recorded, limits)

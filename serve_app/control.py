@@ -418,7 +418,7 @@ class Control:
                 )
             serving[name] = wanted
             kept.update(loaded)
-        self._library.keep(set(kept).union(*self._proposed))
+        self._library.keep(kept, set().union(*self._proposed))
         policies = [loaded.policy for loaded in kept.values()]
         for policy in policies:
             self._served.setdefault(policy.contract.name, set()).add(policy.identity)

@@ -7,7 +7,7 @@ Everything here blocks (hashing, onnxruntime, golden vectors), and may do so for
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -184,7 +184,9 @@ class Library:
                 policy = self._load(folder)
             except MemoryError:
                 raise BundleError(f"{folder} needs more memory than there is") from None
-            if policy.digest == digest:  # it was not exchanged meanwhile
+            contract = policy.contract
+            # It was not exchanged meanwhile, neither now nor when its name was read and its hash accepted.
+            if (contract.name, contract.version, policy.digest) == (name, version, digest):
                 loaded = self._loaded[name, version, digest] = Loaded(policy, digest, now())
                 return loaded
         raise BundleTamperedError(
@@ -192,10 +194,15 @@ class Library:
             "export changes under a new version, or load this one again"
         )
 
-    def keep(self, keys: Iterable[tuple[str, str, str]]) -> None:
-        """Let all others go; whoever still computes with one of those is not disturbed."""
-        wanted = set(keys)
-        self._loaded = {key: loaded for key, loaded in list(self._loaded.items()) if key in wanted}
+    def keep(self, served: Mapping[tuple[str, str, str], Loaded], proposed: Collection[tuple[str, str, str]]) -> None:
+        """Hold what is served, keep what is proposed, and let all others go; who computes with one is not disturbed.
+
+        In place: a thread may be adding one at this moment.
+        """
+        for key in list(self._loaded):
+            if key not in served and key not in proposed:
+                self._loaded.pop(key, None)
+        self._loaded.update(served)
 
 
 def raise_all(errors: Sequence[RlservoError]) -> None:

@@ -193,6 +193,14 @@ def test_the_limits_are_settings(root: Path) -> None:
             load_served([root / "ur5"], ServedConfig(), settings)
 
 
+def test_more_files_than_a_bundle_has_are_not_hashed(root: Path) -> None:
+    folder = root / "ur5" / "2"
+    with (folder / "SHA256SUMS").open("a") as sums:
+        sums.writelines(f"{'0' * 64}  more{number}\n" for number in range(13))
+    with pytest.raises(BundleError, match="lists 17 files: at most 16"):
+        Policy.load(folder)
+
+
 def golden_of(folder: Path, members: dict[str, bytes]) -> None:
     """Write a golden.npz of these members, with valid hashes."""
     with zipfile.ZipFile(folder / "golden.npz", "w", zipfile.ZIP_DEFLATED) as archive:
