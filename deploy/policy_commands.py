@@ -61,7 +61,9 @@ def load(
     key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:
-    """Load a version and prove it, so that an alias may lead there.
+    """Load a version and prove it; what clients get stays as it is until an alias leads there.
+
+    Of a policy that is not served at all, the version loaded first is in use at once.
 
     Example: `rlservo policy load ur5 4`
     """
@@ -88,7 +90,7 @@ def unload(
 @policy.command()
 def alias(
     name: Name,
-    pair: Annotated[str, typer.Argument(metavar="ALIAS=VERSION", help="ALIAS= removes it.")],
+    pair: Annotated[str, typer.Argument(metavar="ALIAS=VERSION", help="ALIAS= removes it; production= cannot be.")],
     url: Url = LOCAL,
     key_file: KeyFile = None,
     as_json: Json = False,
@@ -162,7 +164,12 @@ VersionsOption = Annotated[
     typer.Option("--versions", metavar="NAME=VERSION,...", help="Versions to load; all of the repository by default."),
 ]
 AliasOption = Annotated[
-    list[str] | None, typer.Option("--alias", metavar="NAME:ALIAS=VERSION", help="ur5:production=3, say; repeat it.")
+    list[str] | None,
+    typer.Option(
+        "--alias",
+        metavar="NAME:ALIAS=VERSION",
+        help="ur5:production=3, say; repeat it. Without one the newest version is production, and stays it.",
+    ),
 ]
 CanaryOption = Annotated[
     list[str] | None,
@@ -288,8 +295,6 @@ def _table(replica: dict[str, Any]) -> Table:
     for each in replica["policies"]:
         for version in each["version_states"]:
             marks = [*version["aliases"]]
-            if version["version"] == each["version"] and "production" not in marks:
-                marks.append("(default)")
             state = (version["version"], version["state"], ", ".join(marks), _when(version["loaded_at"]))
             table.add_row(each["name"], *state, str(version["requests"]), version["reason"])
     return table

@@ -9,27 +9,32 @@ A bundle is a folder `<name>/<version>/` holding
     SHA256SUMS      a hash of each of the files above (`sha256sum -c SHA256SUMS` checks them too)
 
 This module reads and writes those files. It needs numpy and pydantic; it knows nothing of torch, ray, gymnasium,
-onnx or onnxruntime, and never unpickles.
+onnx or onnxruntime, and never unpickles. A bundle may come from anybody who can write into a folder: only regular files
+are read, sizes are bounded before anything is read, and what is used of a file is what its hash was checked on.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 import re
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import IO, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from rlservo.export.errors import BundleError, BundleTamperedError
+from rlservo.export.regular_files import FileTooLargeError, NotReadableError, blocks, open_regular
 
 ONNX_FILE = "policy.onnx"
 TORCHSCRIPT_FILE = "policy.ts"
@@ -40,6 +45,11 @@ CONTRACT_KEY = "rlservo.contract"
 """Where the graph's own metadata repeat the contract."""
 
 REWARD = "reward"  # the graph's input for what the last action brought, of a policy that was trained to see it
+MAX_SUMS_BYTES = 1 << 16
+MAX_FILES = 16  # the four, and what a user may have added
+DESCRIPTORS = Path("/proc/self/fd")  # Linux: a file that this process has open, whether it has a name or not
+BAD_ARCHIVE = (OSError, ValueError, EOFError, RuntimeError, KeyError, MemoryError, zlib.error, zipfile.BadZipFile)
+"""What zipfile and numpy raise on archives that are none."""
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
@@ -332,11 +342,40 @@ class Contract(_Model):
 
 
 @dataclass(frozen=True)
+class BundleLimits:
+    """How large a bundle's files may be; larger ones are refused before they are read. A server sets its own."""
+
+    max_policy_bytes: int | None = None
+    """Of each file but the two below; None is no limit."""
+
+    max_golden_bytes: int = 512 << 20
+    """Of golden.npz, packed and unpacked."""
+
+    max_contract_bytes: int = 16 << 20
+
+    def of(self, name: str) -> tuple[int | None, str]:
+        """Return (bytes, name of the limit) for a file of a bundle."""
+        if name == CONTRACT_FILE:
+            return self.max_contract_bytes, "max_contract_bytes"
+        if name == GOLDEN_FILE:
+            return self.max_golden_bytes, "max_golden_bytes"
+        return self.max_policy_bytes, "max_policy_bytes"
+
+
+DEFAULT_LIMITS = BundleLimits()
+
+
+@dataclass(frozen=True)
 class Bundle:
     """A bundle folder whose hashes have been checked, and its contract."""
 
     path: Path
     contract: Contract
+    sums: Mapping[str, str]
+    """The SHA-256 of each file, as recorded."""
+    digest: str
+    """What tells this bundle from every other: the hash of its hashes."""
+    limits: BundleLimits = DEFAULT_LIMITS
 
     @property
     def onnx(self) -> Path:
@@ -347,20 +386,43 @@ class Bundle:
         return self.path / TORCHSCRIPT_FILE
 
     def golden(self) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
-        """Return the golden (inputs, outputs) by tensor name; all share the leading batch axis."""
+        """Return the golden (inputs, outputs) by tensor name; all share the leading batch axis.
+
+        Raises BundleError, and BundleTamperedError where the file is no longer the one that was checked.
+        """
         inputs: dict[str, NDArray[Any]] = {}
         outputs: dict[str, NDArray[Any]] = {}
+        file = self.path / GOLDEN_FILE
+        content = io.BytesIO(b"".join(_verified(file, self.sums[GOLDEN_FILE], self.limits)))
         try:
-            with np.load(self.path / GOLDEN_FILE, allow_pickle=False) as archive:
+            _check_unpacked(file, content, self.limits.max_golden_bytes)
+            with np.load(content, allow_pickle=False) as archive:
                 for key in archive.files:
                     side, _, name = key.partition("/")
                     (inputs if side == "input" else outputs)[name] = archive[key]
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise BundleError(f"{self.path / GOLDEN_FILE} cannot be read: {error}") from error
+        except BAD_ARCHIVE as error:
+            raise BundleError(f"{file} cannot be read: {error}") from error
         return inputs, outputs
 
+    @contextmanager
+    def verified_copy(self, name: str) -> Iterator[Path]:
+        """Give the path of a copy of a file which nobody else can change: the very bytes whose hash was compared.
 
-def load_bundle(path: str | Path) -> Bundle:
+        On Linux it is in no folder and gone with this process. Raises BundleError, BundleTamperedError.
+        """
+        with _private_file() as (copy, path):
+            try:
+                for block in _verified(self.path / name, self.sums[name], self.limits):
+                    copy.write(block)
+                copy.flush()
+            except OSError as error:  # of writing: BundleError is none
+                raise BundleError(
+                    f"{self.path / name} cannot be copied to {tempfile.gettempdir()}: {error.strerror}"
+                ) from error
+            yield path
+
+
+def load_bundle(path: str | Path, limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:
     """Read and check one bundle.
 
     `path` may be the bundle folder itself, a policy folder `<name>/` (its newest version) or a repository that holds
@@ -370,8 +432,21 @@ def load_bundle(path: str | Path) -> Bundle:
     BundleTamperedError when a file differs from its recorded hash.
     """
     folder = resolve_bundle(path)
-    check_hashes(folder)
-    return Bundle(folder, read_contract(folder))
+    digest, sums = _read_sums(folder)
+    for name in (ONNX_FILE, TORCHSCRIPT_FILE, CONTRACT_FILE, GOLDEN_FILE):
+        if name not in sums:
+            raise BundleError(f"{folder / SUMS_FILE} does not list {name}: the bundle is incomplete")
+    if len(sums) > MAX_FILES:  # each may be as large as a policy, and all of them are hashed
+        raise BundleError(f"{folder / SUMS_FILE} lists {len(sums)} files: at most {MAX_FILES}")
+    contract = b""
+    for name, recorded in sums.items():
+        content = _verified(folder / name, recorded, limits)
+        if name == CONTRACT_FILE:
+            contract = b"".join(content)
+        else:
+            for _ in content:
+                pass
+    return Bundle(folder, _parse_contract(folder / CONTRACT_FILE, contract), sums, digest, limits)
 
 
 def resolve_bundle(path: str | Path) -> Path:
@@ -424,47 +499,35 @@ def version_key(version: str) -> tuple[int, ...]:
     return parts + (0,) * (3 - len(parts))
 
 
-def read_contract(folder: Path) -> Contract:
+def read_contract(folder: Path, limits: BundleLimits = DEFAULT_LIMITS) -> Contract:
     """Parse `contract.json`; say in one sentence which field is wrong."""
     file = folder / CONTRACT_FILE
+    return _parse_contract(file, b"".join(_blocks(file, *limits.of(CONTRACT_FILE))))
+
+
+def _parse_contract(file: Path, content: bytes) -> Contract:
     try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        return Contract.model_validate_json(content.decode("utf-8"))
+    except UnicodeDecodeError as error:
         raise BundleError(f"{file} cannot be read: {error}") from error
-    try:
-        return Contract.model_validate_json(text)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"]) or "the document"
         raise BundleError(f"{file}: {where}: {first['msg']}") from error
 
 
-def check_hashes(folder: Path) -> None:
-    """Compare every file of the bundle with SHA256SUMS."""
-    recorded = _read_sums(folder)
-    for name in (ONNX_FILE, TORCHSCRIPT_FILE, CONTRACT_FILE, GOLDEN_FILE):
-        if name not in recorded:
-            raise BundleError(f"{folder / SUMS_FILE} does not list {name}: the bundle is incomplete")
-    for name, digest in recorded.items():
-        file = folder / name
-        if not file.is_file():
-            raise BundleError(f"{file} is missing: the bundle is incomplete")
-        actual = sha256(file)
-        if actual != digest:
-            raise BundleTamperedError(
-                f"{file} is not the file that was exported: its sha256 is {actual[:12]}..., "
-                f"{SUMS_FILE} records {digest[:12]}...",
-                {"file": name, "expected": digest, "actual": actual},
-            )
+def digest_of(folder: Path) -> str:
+    """Return what tells a bundle from every other: the hash of its hashes. Raises BundleError."""
+    return _read_sums(folder)[0]
 
 
-def _read_sums(folder: Path) -> dict[str, str]:
+def _read_sums(folder: Path) -> tuple[str, dict[str, str]]:
+    """Return (the hash of SHA256SUMS, what it records by file name)."""
     file = folder / SUMS_FILE
+    content = b"".join(_blocks(file, MAX_SUMS_BYTES))
     try:
-        lines = file.read_text(encoding="ascii").splitlines()
-    except FileNotFoundError as error:
-        raise BundleError(f"{file} is missing: the bundle is incomplete") from error
-    except (OSError, UnicodeDecodeError) as error:
+        lines = content.decode("ascii").splitlines()
+    except UnicodeDecodeError as error:
         raise BundleError(f"{file} cannot be read: {error}") from error
     sums: dict[str, str] = {}
     for number, line in enumerate(lines, start=1):
@@ -472,7 +535,63 @@ def _read_sums(folder: Path) -> dict[str, str]:
         if match is None:
             raise BundleError(f"{file}, line {number}: expected '<sha256>  <file name>'")
         sums[match[2]] = match[1]
-    return sums
+    return hashlib.sha256(content).hexdigest(), sums
+
+
+def _verified(file: Path, recorded: str, limits: BundleLimits) -> Iterator[bytes]:
+    """Yield a file's content; after the last of it raise BundleTamperedError where its hash is not the recorded one."""
+    actual = hashlib.sha256()
+    for block in _blocks(file, *limits.of(file.name)):
+        actual.update(block)
+        yield block
+    if actual.hexdigest() != recorded:
+        raise BundleTamperedError(
+            f"{file} is not the file that was exported: its sha256 is {actual.hexdigest()[:12]}..., "
+            f"{SUMS_FILE} records {recorded[:12]}...",
+            {"file": file.name, "expected": recorded, "actual": actual.hexdigest()},
+        )
+
+
+def _blocks(file: Path, max_bytes: int | None, limit: str = "") -> Iterator[bytes]:
+    """Yield a file's content; `limit` is what `max_bytes` is called. Raises BundleError."""
+    try:
+        with open_regular(file, max_bytes) as stream:
+            yield from blocks(stream, max_bytes)
+    except FileNotFoundError as error:
+        raise BundleError(f"{file} is missing: the bundle is incomplete") from error
+    except FileTooLargeError as error:
+        raise BundleError(f"{file} {error}{f' ({limit})' if limit else ''}") from error
+    except NotReadableError as error:
+        raise BundleError(f"{file} {error}") from error
+    except OSError as error:
+        raise BundleError(f"{file} cannot be read: {error.strerror}") from error
+
+
+def _check_unpacked(file: Path, content: io.BytesIO, max_bytes: int) -> None:
+    """Refuse an archive whose arrays are larger than they may be, or than what is packed of them."""
+    with zipfile.ZipFile(content) as archive:
+        size = sum(member.file_size for member in archive.infolist())
+        if size > max_bytes:
+            raise BundleError(f"{file} unpacks to {size:,} bytes: at most {max_bytes:,} (max_golden_bytes)")
+        for member in archive.infolist():
+            with archive.open(member) as stream:
+                version = np.lib.format.read_magic(stream)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(stream)
+            if math.prod(shape) * dtype.itemsize > member.file_size:
+                raise BundleError(f"{file}: '{member.filename}' says that it is of shape {shape} and holds less")
+    content.seek(0)
+
+
+@contextmanager
+def _private_file() -> Iterator[tuple[IO[bytes], Path]]:
+    """Give an empty file for this process alone, and the path under which this process can open it."""
+    if DESCRIPTORS.is_dir():
+        with tempfile.TemporaryFile() as unnamed:
+            yield unnamed, DESCRIPTORS / str(unnamed.fileno())
+    else:
+        with tempfile.TemporaryDirectory(prefix="rlservo-") as folder, (Path(folder) / "copy").open("wb") as named:
+            yield named, Path(folder) / "copy"
 
 
 def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapping[str, NDArray[Any]]) -> None:

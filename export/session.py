@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 def open_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSession:
     """Return a session on the CPU with so many threads; one is fastest for networks of a policy's size.
 
+    The file is not needed afterwards. A graph can make onnxruntime read further files from the file's folder: one of
+    unknown origin is opened as `Bundle.verified_copy`, which is in no folder.
+
     Raises onnxruntime's own exceptions, which share no base but Exception.
     """
     # onnxruntime 1.31's Linux wheels report use to Microsoft from the moment they are imported unless this is set
@@ -30,5 +33,8 @@ def open_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSession:
     options.log_severity_level = 4  # what goes wrong arrives as an exception; onnxruntime would print it as well
     # A second thread spinning for work burns a core that a robot's control loop wants.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # From bytes, not from the path: a graph cannot make onnxruntime read other files that way.
-    return onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
+    # From the path: from bytes onnxruntime 1.31 parses with the interpreter's lock held (0.3 s for 200 MB, in which
+    # nobody acts), keeps them for ever, and takes twice the memory.
+    session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    session.disable_fallback()  # it would open the file again
+    return session

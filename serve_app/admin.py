@@ -6,7 +6,7 @@ without an admin key. The Open Inference Protocol's `load` and `unload` are two 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, TypeVar
 
@@ -21,7 +21,6 @@ from rlservo.serve_app.control import Change, Control
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.edge import KEY, error_models, json_only, peer_of, request_id
 from rlservo.serve_app.keys import Access, grant
-from rlservo.serve_app.library import digest_of
 from rlservo.serve_app.logs import administered
 from rlservo.serve_app.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
 
@@ -41,7 +40,7 @@ class UnloadCommand(_Command):
 
 
 class AliasCommand(_Command):
-    alias: Alias = Field(description="`production` is the default version.")
+    alias: Alias = Field(description="`production` is the default version; it can be moved, not removed.")
     version: Version | None = Field(description="A loaded version; null removes the alias.")
 
 
@@ -87,7 +86,7 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             dependencies=[Depends(json_only)],
         )
 
-    async def apply(request: Request, what: str, change: Change) -> Plan:
+    async def apply(request: Request, what: str, command: Awaitable[Plan]) -> Plan:
         key = request.scope.get(KEY)
         log = partial(
             administered,
@@ -97,7 +96,7 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             request_id=request_id(request.scope),
         )
         try:
-            after = await control.change(change, what=what)
+            after = await command
         except RlservoError as error:
             log(error.code)
             raise
@@ -105,7 +104,7 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
         return after
 
     async def changed(request: Request, name: str, what: str, change: Change) -> Response:
-        return _answer(name, await apply(request, what, change))
+        return _answer(name, await apply(request, what, control.change(change, what=what)))
 
     @app.get(
         "/v1/admin/policies",
@@ -119,12 +118,11 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
         replies = [listing.describe(core)] if control.gather is None else await control.gather()
         return Response(orjson.dumps(replies), media_type="application/json")
 
-    @command("load", "Load a version, prove it, and keep it ready")
+    @command("load", "Load a version, prove it, and keep it ready: not in use until an alias leads to it")
     @grant(Access.admin)
     async def load(request: Request, name: str, given: LoadCommand) -> Response:
-        return await changed(
-            request, name, f"load {name} {given.version or 'newest'}", _load(control, name, given.version)
-        )
+        what = f"load {name} {given.version or 'newest'}"
+        return _answer(name, await apply(request, what, control.load(name, given.version, what=what)))
 
     @command("unload", "Drop a version, or the policy")
     @grant(Access.admin)
@@ -141,16 +139,9 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
     @command("rollback", "Let an alias lead where it led before")
     @grant(Access.admin)
     async def rollback(request: Request, name: str, given: RollbackCommand) -> Response:
-        def change(before: Plan) -> dict[str, PolicyPlan]:
-            return plan.roll_back(
-                before,
-                name,
-                given.alias,
-                lambda n, v: digest_of(control.repository.find(n, v)[1]),
-                expected=given.expected,
-            )
-
-        return await changed(request, name, f"rollback {name} {given.alias}", change)
+        what = f"rollback {name} {given.alias}"
+        alias, expected = given.alias, given.expected
+        return await changed(request, name, what, lambda p: plan.roll_back(p, name, alias, expected=expected))
 
     @command("canary", "Send a share of the sessions to another version")
     @grant(Access.admin)
@@ -179,25 +170,21 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             dependencies=[Depends(oip.media_type)],
         )
 
-    @repository("load", "Load a model's newest version")
+    # As a Triton that serves what its configuration pins: loading changes what clients get only where the model was not
+    # there at all. Moving `production` is /v1/admin's, with a way back.
+    @repository("load", "Load a model's newest version; in use at once only if the model was not served")
     @grant(Access.admin)
     async def load_model(request: Request, name: str) -> Response:
-        await apply(request, f"load {name} newest", _load(control, name, None))
+        what = f"load {name} newest"
+        await apply(request, what, control.load(name, None, what=what))
         return Response(b"{}", media_type="application/json")
 
     @repository("unload", "Unload a model, all its versions")
     @grant(Access.admin)
     async def unload_model(request: Request, name: str) -> Response:
-        await apply(request, f"unload {name}", lambda p: plan.unload(p, name, None))
+        what = f"unload {name}"
+        await apply(request, what, control.change(lambda p: plan.unload(p, name, None), what=what))
         return Response(b"{}", media_type="application/json")
-
-
-def _load(control: Control, name: str, version: str | None) -> Change:
-    def change(before: Plan) -> dict[str, PolicyPlan]:
-        found, folder = control.repository.find(name, version)
-        return plan.load(before, name, found, digest_of(folder))
-
-    return change
 
 
 def _answer(name: str, after: Plan) -> Response:

@@ -122,8 +122,14 @@ class PolicyServer(InferenceService):
             configure(self._settings, replica=self._replica)
             self._host = _listening_host()
             check_exposure(self._host, self._settings)
-            load = partial(load_policy, threads=self._settings.threads, options=self._settings.policy_options)
-            library = Library(Repository(folders), load)
+            limits = self._settings.bundle_limits
+            load = partial(
+                load_policy,
+                threads=self._settings.threads,
+                options=self._settings.policy_options,
+                limits=limits,
+            )
+            library = Library(Repository(folders, limits), load)
         except RlservoError as error:
             raise _plain(error) from None
         self._control = Control(
@@ -133,6 +139,8 @@ class PolicyServer(InferenceService):
             broadcast=self._tell_all,
             gather=self._ask_all,
             is_current=self._is_current,
+            scan_timeout_s=self._settings.scan_timeout_s,
+            load_timeout_s=self._settings.load_timeout_s,
         )
 
     def __serve_build_asgi_app__(self) -> PolicyApp:  # Serve's hook: the app is built in the replica

@@ -46,8 +46,8 @@ class PolicyClient:
         action = policy.act(obs)
     ```
 
-    The version is settled at the first contact (the newest, unless `version` names one) and stays: a newer one that
-    the server loads meanwhile does not change a running loop.
+    The version is settled at the first contact (the server's default, unless `version` names one) and stays: what
+    `production` is moved to meanwhile does not change a running loop.
 
     Thread-safe for stateless policies: threads share the connections and each gets the answer to its own request.
     A recurrent policy's state is kept here and sent along, and so is the last action where the server limits the step

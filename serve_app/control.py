@@ -2,7 +2,8 @@
 
 The plans stand in a ledger that all replicas share; whoever makes a change proves it first, appends it under the next
 number, and tells the others. A replica swaps one store for the next and keeps the old one where it cannot follow.
-Loading happens in a thread of its own, so that requests go on meanwhile. It knows nothing of ray or HTTP.
+Whatever touches the bundles happens in threads, with a time-out, and nothing is locked meanwhile: requests and other
+changes go on, also where a file system hangs. It knows nothing of ray or HTTP.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, NoReturn, Protocol, TypeVar
 
 from rlservo.export.bundle import Contract, version_key
 from rlservo.export.errors import (
@@ -25,7 +26,8 @@ from rlservo.export.errors import (
     UnavailableError,
     UsageError,
 )
-from rlservo.serve_app.library import Key, Library, Loaded, Repository, raise_all
+from rlservo.serve_app.blocking_calls import BlockingCalls
+from rlservo.serve_app.library import Key, Library, Loaded, raise_all
 from rlservo.serve_app.plan import (
     FailedVersion,
     Plan,
@@ -36,6 +38,7 @@ from rlservo.serve_app.plan import (
     now,
     plan_of,
 )
+from rlservo.serve_app.plan import load as add_version
 from rlservo.serve_app.store import PolicyStore
 
 logger = logging.getLogger(__name__)
@@ -43,8 +46,10 @@ logger = logging.getLogger(__name__)
 ATTEMPTS = 10  # at a number in the ledger, before a change gives up
 WATCH_PERIOD_S = 2.0  # [s] between looks at the ledger, for a replica that nobody told
 RETRY_PERIOD_S = 30.0  # [s] between attempts of a replica that could not follow
+REFUSALS = (BundleError, RefusedError, UsageError)  # of the repository, of the proof
 
 Result = TypeVar("Result")
+Loadable = tuple[str, str, str]  # (name, version, hash)
 Change = Callable[[Plan], dict[str, PolicyPlan]]
 
 
@@ -99,10 +104,13 @@ class Control:
         broadcast: Broadcast | None = None,
         gather: Gather | None = None,
         is_current: IsCurrent | None = None,
+        scan_timeout_s: float = 10.0,
+        load_timeout_s: float = 30.0,
     ) -> None:
         """`broadcast` tells every replica of a number and returns what they answer, `gather` returns every replica's
         listing, and `is_current` says whether a configuration is the one that the deployment has now, since a replica
-        may be started with the one before. Without them this replica is the only one.
+        may be started with the one before. Without them this replica is the only one. The time-outs are for one look
+        through the repository, and for loading and proving one version.
         """
         self.store: PolicyStore | None = None
         self.plan: Plan | None = None
@@ -114,12 +122,17 @@ class Control:
         self._is_current = is_current
         self._serving: dict[str, PolicyPlan] = {}
         self._served: dict[str, set[str]] = {}  # every identity that was ever served here, by name
-        self._loading: set[Key] = set()
+        self._loading: dict[Loadable, asyncio.Task[Loaded]] = {}
+        self._given_up: dict[Loadable, UnavailableError] = {}
+        self._proposed: list[set[Loadable]] = []  # what changes that are under way have loaded, and no plan has yet
+        self._calls = BlockingCalls()
+        self._scan_timeout_s = scan_timeout_s
+        self._load_timeout_s = load_timeout_s
         self._failed: dict[Key, str] = {}
         self._behind: tuple[str, ...] = ()
         self._tried_at = 0.0
-        self._lock = asyncio.Lock()
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="policies")
+        self._writing = asyncio.Lock()  # held while a change that has been proven is written down
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="ledger")
 
     async def configure(self, document: Any) -> None:
         """Serve what a configuration says, unless the ledger says something later.
@@ -127,48 +140,51 @@ class Control:
         A replica's first configuration has to be right: raises UsageError or BundleError. A later one that is not is
         written down as refused, and what ran before goes on.
         """
-        async with self._lock:
-            digest = config_hash(document)
-            for _ in range(ATTEMPTS):
-                before = await self._newest()
-                if before is not None and (before.config == digest or await self._is_late(document)):
-                    await self._apply(before)
-                    return
-                plan = await self._proposed(document, digest, before)
-                if await self._append(plan):
-                    await self._apply(plan)
-                    return
+        digest = config_hash(document)
+        for _ in range(ATTEMPTS):
+            before = await self._newest()
+            if before is not None and (before.config == digest or await self._is_late(document)):
+                await self._apply(before)
+                return
+            plan = await self._configured(document, digest, before)
+            if await self._append(plan):
+                await self._apply(plan)
+                return
         raise UnavailableError("the other replicas keep changing what is served: configure again")
+
+    async def load(self, name: str, version: str | None, *, what: str) -> Plan:
+        """Find a version in the repository (None: the newest), and add it as `change` does.
+
+        Raises what `Repository.find` and `change` raise, and UnavailableError where the repository does not answer.
+        """
+        try:
+            found, digest = await self._look(self._library.repository.find_digest, name, version)
+        except REFUSALS as error:
+            await self._refuse(what, error)
+        return await self.change(lambda before: add_version(before, name, found, digest), what=what)
 
     async def change(self, change: Change, *, what: str) -> Plan:
         """Make a change and return the plan when every replica serves it.
 
-        `change` may block and runs in the loading thread. `what` is kept as who did what. Raises what `change` raises,
-        RefusedError when a version cannot be served (then nothing has changed), and PartlyAppliedError when some
-        replicas could not follow (the change stands).
+        `change` must not block. `what` is kept as who did what. Raises what `change` raises, RefusedError when a
+        version cannot be served (then nothing has changed), and PartlyAppliedError when some replicas could not follow
+        (the change stands).
         """
-        refused: RefusedError | None = None
-        async with self._lock:
-            for _ in range(ATTEMPTS):
-                before = await self._newest()
-                if before is None or self.store is None:
-                    raise UnavailableError("the policies are still being loaded: try again shortly")
-                try:
-                    policies = await self._in_thread(change, before)
-                    await self._prove(policies, before.policies)
-                    plan, refused = before.after(policies, what), None
-                except (BundleError, RefusedError, UsageError) as error:  # of the repository, of the proof
-                    refused = RefusedError(f"refused, and nothing has changed: {error.message}", error.details)
-                    plan = before.refusing(_refusal(what, error))
-                if await self._append(plan):
-                    break
-            else:
-                raise UnavailableError("others keep changing what is served: try again")
+        before = await self._newest()
+        if before is None or self.store is None:
+            raise UnavailableError("the policies are still being loaded: try again shortly")
+        policies = change(before)
+        proposed = _loadables(policies)
+        self._proposed.append(proposed)
+        try:
+            try:
+                await self._prove(policies, before.policies)  # takes its time, while others change what they want
+                plan = await self._write(change, what)
+            except REFUSALS as error:
+                await self._refuse(what, error)
             await self._apply(plan)
-        if refused is not None:
-            with contextlib.suppress(PartlyAppliedError):  # who was not told looks for himself
-                await self._tell(plan.generation)
-            raise refused
+        finally:
+            self._proposed.remove(proposed)
         behind = await self._tell(plan.generation)
         if behind:
             sentences = "; ".join(f"{each.replica}: {'; '.join(each.behind)}" for each in behind)
@@ -179,14 +195,38 @@ class Control:
             )
         return plan
 
-    async def follow(self, generation: int = 0) -> Following:
-        """Serve the newest plan; return whether this replica could."""
-        async with self._lock:
-            reached = self.plan.generation if self.plan is not None else 0
-            if self._behind or reached < generation or reached < await self._in_thread(self._ledger.newest):
-                plan = await self._newest()
-                if plan is not None:
-                    await self._apply(plan)
+    async def _write(self, change: Change | Refusal, what: str) -> Plan:
+        """Append a change of the newest plan, or the refusal of one, to the ledger."""
+        async with self._writing:
+            for _ in range(ATTEMPTS):
+                before = await self._newest()
+                if before is None:
+                    raise UnavailableError("the policies are still being loaded: try again shortly")
+                if isinstance(change, Refusal):
+                    plan = before.refusing(change)
+                else:
+                    policies = change(before)
+                    await self._prove(policies, before.policies)  # loaded by now, unless others changed the same policy
+                    plan = before.after(policies, what)
+                if await self._append(plan):
+                    return plan
+        raise UnavailableError("others keep changing what is served: try again")
+
+    async def _refuse(self, what: str, error: RlservoError) -> NoReturn:
+        """Write down for all that a change was refused, and why; raise RefusedError."""
+        plan = await self._write(_refusal(what, error), what)
+        await self._apply(plan)
+        with contextlib.suppress(PartlyAppliedError):  # who was not told looks for himself
+            await self._tell(plan.generation)
+        raise RefusedError(f"refused, and nothing has changed: {error.message}", error.details) from None
+
+    async def follow(self, generation: int = 0, *, again: bool = False) -> Following:
+        """Serve the newest plan; return whether this replica could. `again`: try also what was given up before."""
+        reached = self.plan.generation if self.plan is not None else 0
+        if self._behind or reached < generation or reached < await self._in_thread(self._ledger.newest):
+            plan = await self._newest()
+            if plan is not None:
+                await self._apply(plan, again=again)
         return self.following()
 
     def following(self) -> Following:
@@ -199,16 +239,11 @@ class Control:
             await asyncio.sleep(WATCH_PERIOD_S)
             try:
                 newest = await self._in_thread(self._ledger.newest)
-                late = self._behind and time.monotonic() - self._tried_at > RETRY_PERIOD_S
+                late = bool(self._behind) and time.monotonic() - self._tried_at > RETRY_PERIOD_S
                 if late or newest > (self.plan.generation if self.plan is not None else 0):
-                    await self.follow()
+                    await self.follow(again=late)
             except Exception as error:  # the ledger may be out of reach for a while; what is served goes on
                 logger.warning("the ledger of policies could not be followed: %s", error)
-
-    @property
-    def repository(self) -> Repository:
-        """Where the bundles are."""
-        return self._library.repository
 
     def arranged(self, name: str) -> PolicyPlan | None:
         """Return the plan by which this replica serves a policy."""
@@ -227,21 +262,22 @@ class Control:
                 if loaded is not None:
                     reason = states[name, version].reason if (name, version) in states else ""
                     states[name, version] = VersionState("ready", reason, loaded.loaded_at)
-        states.update({key: VersionState("loading") for key in self._loading if key not in states})
+        loading = {(name, version) for name, version, _ in self._loading}
+        states.update({key: VersionState("loading") for key in loading if key not in states})
         by_name: dict[str, dict[str, VersionState]] = {}
         for (name, version), state in sorted(states.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
             by_name.setdefault(name, {})[version] = state
         return by_name
 
     def close(self) -> None:
-        """End the loading thread."""
+        """End the ledger's thread."""
         self._thread.shutdown(wait=False, cancel_futures=True)
 
-    async def _proposed(self, document: Any, digest: str, before: Plan | None) -> Plan:
+    async def _configured(self, document: Any, digest: str, before: Plan | None) -> Plan:
         """Return the plan that a configuration means, or the one that refuses it."""
         try:
             config = ServedConfig.read(document)
-            available = await self._in_thread(self._library.repository.available, config)
+            available = await self._look(self._library.repository.available, config)
             policies = plan_of(config, available, before)
             await self._prove(policies, {} if before is None else before.policies)
         except RlservoError as error:
@@ -301,35 +337,72 @@ class Control:
                     f"policy '{name}' version {version} remembers its episode: a shadow computes on single observations"
                 )
 
-    async def _load(self, name: str, version: str, digest: str) -> Loaded:
+    async def _look(self, function: Callable[..., Result], *arguments: Any) -> Result:
+        what = "looking through the policies' folders"
+        return await self._calls.run(function, *arguments, timeout_s=self._scan_timeout_s, what=what)
+
+    async def _load(self, name: str, version: str, digest: str, *, again: bool = True) -> Loaded:
+        """Load a version unless it is in memory; not `again`: one that was given up is not waited for another time."""
         loaded = self._library.get(name, version, digest)
         if loaded is not None:
             return loaded
-        self._loading.add((name, version))
-        try:
-            return await self._in_thread(self._library.load, name, version, digest)
-        finally:
-            self._loading.discard((name, version))
+        key = (name, version, digest)
+        if key in self._given_up and not again:
+            raise self._given_up[key]
+        task = self._loading.get(key)
+        if task is None:  # whoever else wants it meanwhile waits for the same
+            task = self._loading[key] = asyncio.create_task(self._load_now(key))
+            task.add_done_callback(lambda done: self._loaded(key, done))
+        return await asyncio.shield(task)
 
-    async def _apply(self, plan: Plan) -> None:
+    async def _load_now(self, key: Loadable) -> Loaded:
+        what = f"loading policy '{key[0]}' version {key[1]}"
+        try:
+            loaded = await self._calls.run(self._library.load, *key, timeout_s=self._load_timeout_s, what=what)
+        except UnavailableError as given_up:
+            self._given_up[key] = given_up
+            raise
+        self._given_up.pop(key, None)
+        return loaded
+
+    def _loaded(self, key: Loadable, done: asyncio.Task[Loaded]) -> None:
+        del self._loading[key]
+        if not done.cancelled():
+            done.exception()  # who waited has it; if nobody did any more, asyncio would complain
+
+    async def _apply(self, plan: Plan, *, again: bool = False) -> None:
         """Serve a plan: policy by policy as a whole, so that one which cannot be loaded stays as it was.
 
         Raises BundleError when this replica serves nothing yet and a default version cannot be loaded.
         """
         self._tried_at = time.monotonic()
+        found: dict[Loadable, Loaded | RlservoError] = {}
+        for name, wanted in plan.policies.items():
+            for version, digest in wanted.versions.items():
+                try:
+                    found[name, version, digest] = await self._load(name, version, digest, again=again)
+                except RlservoError as error:
+                    found[name, version, digest] = error
+        self._arrange(plan, found)
+
+    def _arrange(self, plan: Plan, found: Mapping[Loadable, Loaded | RlservoError]) -> None:
+        """Serve a plan with what of it could be loaded. Nothing waits here: who asks sees all of the old or the new."""
+        if self.plan is not None and plan.generation < self.plan.generation:
+            return  # while this one was being loaded, a later one has been served
         serving: dict[str, PolicyPlan] = {}
-        kept: dict[tuple[str, str, str], Loaded] = {}
+        kept: dict[Loadable, Loaded] = {}
         failed: dict[Key, str] = {}
         behind: list[str] = []
         for name, wanted in plan.policies.items():
-            loaded: dict[tuple[str, str, str], Loaded] = {}
+            loaded: dict[Loadable, Loaded] = {}
             errors: dict[str, RlservoError] = {}
             for version, digest in wanted.versions.items():
-                try:
-                    loaded[name, version, digest] = await self._load(name, version, digest)
-                except RlservoError as error:
-                    errors[version] = error
-                    failed[name, version] = error.message
+                one = found[name, version, digest]
+                if isinstance(one, RlservoError):
+                    errors[version] = one
+                    failed[name, version] = one.message
+                else:
+                    loaded[name, version, digest] = one
             behind += [error.message for error in errors.values()]
             was = self._serving.get(name)
             if errors and was is not None:
@@ -345,13 +418,13 @@ class Control:
                 )
             serving[name] = wanted
             kept.update(loaded)
-        self._library.keep(kept)
-        # From here on nothing waits: whoever asks sees all of the old or all of the new.
+        self._library.keep(kept, set().union(*self._proposed))
         policies = [loaded.policy for loaded in kept.values()]
         for policy in policies:
             self._served.setdefault(policy.contract.name, set()).add(policy.identity)
         changed = [name for name, identities in self._served.items() if len(identities) > 1]
         self.store = PolicyStore(policies, serving, changed=changed, replaces=self.store)
+        self._given_up = {key: error for key, error in self._given_up.items() if key in found}
         self.plan, self._serving, self._failed, self._behind = plan, serving, failed, tuple(behind)
         if behind:
             logger.error("generation %d cannot be served as it should: %s", plan.generation, "; ".join(behind))
@@ -381,6 +454,10 @@ class Control:
 
     async def _in_thread(self, function: Callable[..., Result], *arguments: Any) -> Result:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function, *arguments)
+
+
+def _loadables(policies: Mapping[str, PolicyPlan]) -> set[Loadable]:
+    return {(name, version, digest) for name, each in policies.items() for version, digest in each.versions.items()}
 
 
 def _interface(contract: Contract) -> tuple[Any, ...]:

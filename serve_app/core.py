@@ -18,7 +18,8 @@ from rlservo.export.errors import DeadlineError, RlservoError, TooLargeError, Un
 from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.control import Control
 from rlservo.serve_app.episodes import Episode, Episodes
-from rlservo.serve_app.keys import Guard, Keys
+from rlservo.serve_app.key_file import CurrentKeys
+from rlservo.serve_app.keys import Guard
 from rlservo.serve_app.logs import RequestLog
 from rlservo.serve_app.metrics import Metrics
 from rlservo.serve_app.policy import Policy
@@ -53,7 +54,8 @@ class Core:
         self.is_alone = alone
         self.shadows = Shadows()
         self.settings = settings
-        self.guard = Guard(Keys.from_settings(settings))
+        self.keys = CurrentKeys(settings)
+        self.guard = Guard(self.keys)
         self.metrics = Metrics(replica)
         self.metrics.sources.append(partial(self.shadows.families, replica))
         self.log = RequestLog(settings)

@@ -21,7 +21,7 @@ LARGEST = "largest"
 
 def gauges_of(core: Core) -> list[Callable[[], Iterator[Metric]]]:
     """Return the gauges of a core, for its `metrics.sources`."""
-    return [partial(families, core, core.replica) for families in (queue, batches, drift, sessions)]
+    return [partial(families, core, core.replica) for families in (queue, batches, drift, sessions, keys)]
 
 
 def queue(core: Core, replica: str) -> Iterator[Metric]:
@@ -41,6 +41,17 @@ def queue(core: Core, replica: str) -> Iterator[Metric]:
     )
     turned_away.add_metric([replica], admission.turned_away)
     yield turned_away
+
+
+def keys(core: Core, replica: str) -> Iterator[Metric]:
+    """Yield whether the API keys in use are those of their file."""
+    current = GaugeMetricFamily(
+        "rlservo_api_keys_current",
+        "1 while the API keys in use are those of their file; 0: the file cannot be used, and older keys stay",
+        labels=["replica"],
+    )
+    current.add_metric([replica], core.keys.current)
+    yield current
 
 
 def batches(core: Core, replica: str) -> Iterator[Metric]:

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -36,7 +37,7 @@ from rlservo.serve_app.keys import Access, access_of, grant
 from rlservo.serve_app.request_checks import Hosts, RequestChecks, check_path
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import Decision
-from rlservo.serve_app.stream import STREAM_PATHS, Stream, StreamRoute, refuse
+from rlservo.serve_app.stream import CHECK_KEY, STREAM_PATHS, Stream, StreamRoute, refuse
 
 CODES = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "wrong-media-type"}
 ACT_PATH = "/v1/policies/{name}/act"
@@ -140,6 +141,8 @@ class PolicyApp(FastAPI):
             return
         if direct is not None:
             scope["path_params"] = direct[1]
+            if scope["type"] == "websocket":
+                scope[CHECK_KEY] = partial(self._core.guard.check, presented, access)
             await direct[0].app(scope, receive, send)
         elif scope["type"] == "websocket":
             sentence = f"no stream is at {path[:200]}: connect to /v1/policies/NAME/stream"

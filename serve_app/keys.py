@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
+import os
 import re
 import secrets
 import stat
@@ -20,16 +21,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from typing_extensions import Self
 
 from rlservo.export.errors import ForbiddenError, UnauthenticatedError, UsageError
+from rlservo.export.regular_files import NotReadableError, blocks, open_regular
 from rlservo.serve_app.settings import ServerSettings
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.key_file import CurrentKeys
 
 LINE = re.compile(r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|admin)\s+sha256:(?P<digest>[0-9a-f]{64})")
 KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets can tell what they found
 KEY_BYTES = 32
+LONGEST_FILE = 1 << 20  # [bytes] of the key file: some ten thousand keys
 SCHEMES = (b"bearer", b"api-key")  # the second is what openpi's clients say
 ACCESS = "access"  # the attribute of a route, or of its endpoint, that says who may use it
 
@@ -93,11 +99,12 @@ class Keys:
     """For administration; a server with this one alone still asks nobody for a key who only wants actions."""
 
     @classmethod
-    def from_settings(cls, settings: ServerSettings) -> Self:
-        """Read the file and the entries that the settings name. Raises UsageError."""
+    def from_settings(cls, settings: ServerSettings, *, file_content: bytes | None = None) -> Self:
+        """Read the file (unless its content is given) and the entries that the settings name. Raises UsageError."""
         lines: list[tuple[str, str]] = []
         if settings.api_keys_file is not None:
-            lines += _read_file(Path(settings.api_keys_file))
+            file = Path(settings.api_keys_file)
+            lines += _lines(file, read_key_file(file) if file_content is None else file_content)
         entries = [entry.strip() for entry in settings.api_keys.split(",")]
         lines += [(f"entry {n} of RLSERVO_API_KEYS", entry) for n, entry in enumerate(entries, start=1) if entry]
         keys = []
@@ -129,7 +136,7 @@ class Keys:
 class Guard:
     """Decides by a request's key whether it may use what its route, or its method, grants."""
 
-    def __init__(self, keys: Keys) -> None:
+    def __init__(self, keys: Keys | CurrentKeys) -> None:
         self._keys = keys
 
     @property
@@ -190,13 +197,25 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _read_file(file: Path) -> list[tuple[str, str]]:
+def read_key_file(file: Path) -> bytes:
+    """Return the file's content. Raises UsageError where it cannot be read or anybody could have written it."""
     try:
-        mode = file.stat().st_mode
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"the key file {file} cannot be read: {error}") from error
+        with open_regular(file, LONGEST_FILE) as stream:
+            mode = os.fstat(stream.fileno()).st_mode
+            content = b"".join(blocks(stream, LONGEST_FILE))
+    except NotReadableError as error:
+        raise UsageError(f"the key file {file} {error}") from None
+    except OSError as error:
+        raise UsageError(f"the key file {file} cannot be read: {error.strerror}") from None
     if mode & stat.S_IWOTH:
         raise UsageError(f"the key file {file} can be written by every user of this machine: chmod o-w {file}")
+    return content
+
+
+def _lines(file: Path, content: bytes) -> list[tuple[str, str]]:
+    try:
+        lines = content.decode("utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise UsageError(f"the key file {file} cannot be read: {error}") from None
     stripped = ((number, line.strip()) for number, line in enumerate(lines, start=1))
     return [(f"{file}, line {number}", line) for number, line in stripped if line and not line.startswith("#")]

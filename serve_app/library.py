@@ -1,17 +1,25 @@
 """The bundles on disk and the policies in memory: find by name and version, load, prove, keep.
 
 A name or version that a request brings is only ever compared with what the folders hold; no path is made of it.
-Everything here blocks (hashing, onnxruntime, golden vectors): the event loop hands it to a thread.
+Everything here blocks (hashing, onnxruntime, golden vectors), and may do so for ever where a file system hangs:
+`control.py` calls it through `BlockingCalls`.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from rlservo.export.bundle import SUMS_FILE, find_bundles, read_contract, version_key
+from rlservo.export.bundle import (
+    DEFAULT_LIMITS,
+    BundleLimits,
+    digest_of,
+    find_bundles,
+    read_contract,
+    version_key,
+)
 from rlservo.export.errors import (
     BundleError,
     BundleTamperedError,
@@ -20,8 +28,10 @@ from rlservo.export.errors import (
     UnknownVersionError,
     UsageError,
 )
+from rlservo.serve_app.blocking_calls import BlockingCalls
 from rlservo.serve_app.plan import ServedConfig, now, plan_of
 from rlservo.serve_app.policy import Policy
+from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import PolicyStore
 
 Key = tuple[str, str]  # (name, version)
@@ -39,8 +49,9 @@ class Loaded:
 class Repository:
     """The folders of bundles that a server was given."""
 
-    def __init__(self, paths: Iterable[str | Path]) -> None:
+    def __init__(self, paths: Iterable[str | Path], limits: BundleLimits = DEFAULT_LIMITS) -> None:
         self._paths = [Path(path) for path in paths]
+        self._limits = limits
         if not self._paths:
             raise UsageError("no policy to serve: give at least one bundle folder")
 
@@ -61,7 +72,7 @@ class Repository:
         twice: set[Key] = set()
         for folder in folders.values():
             try:
-                contract = read_contract(folder)
+                contract = read_contract(folder, self._limits)
                 key = (contract.name, contract.version)
                 copied = key in found and digest_of(folder) == digest_of(found[key])
             except BundleError as error:
@@ -111,17 +122,34 @@ class Repository:
             f"the repository has no version '{str(version)[:32]}' of policy '{name}': it has {', '.join(versions)}"
         )
 
+    def find_digest(self, name: str, version: str | None) -> tuple[str, str]:
+        """Return (version, hash) of a bundle, as `find`."""
+        found, folder = self.find(name, version)
+        return found, digest_of(folder)
 
-def load_served(paths: Iterable[str | Path], config: ServedConfig) -> PolicyStore:
-    """Load and prove what a server of these folders would start with. Raises UsageError or BundleError."""
-    library = Library(Repository(paths))
-    plans = plan_of(config, library.repository.available(config), None)
+
+def load_served(
+    paths: Iterable[str | Path], config: ServedConfig, settings: ServerSettings | None = None
+) -> PolicyStore:
+    """Load and prove what a server of these folders would start with.
+
+    Raises UsageError or BundleError, and UnavailableError where the file system hangs.
+    """
+    settings = settings or ServerSettings()
+    calls, limits = BlockingCalls(), settings.bundle_limits
+    library = Library(Repository(paths, limits), partial(Policy.load, limits=limits))
+    available = calls.wait(
+        library.repository.available, config, timeout_s=settings.scan_timeout_s, what="looking through the folders"
+    )
+    plans = plan_of(config, available, None)
     policies: list[Policy] = []
     errors: list[RlservoError] = []
     for name, plan in plans.items():
         for version, digest in plan.versions.items():
+            what = f"loading policy '{name}' version {version}"
             try:
-                policies.append(library.load(name, version, digest).policy)
+                loaded = calls.wait(library.load, name, version, digest, timeout_s=settings.load_timeout_s, what=what)
+                policies.append(loaded.policy)
             except BundleError as error:
                 errors.append(error)
     raise_all(errors)
@@ -152,8 +180,13 @@ class Library:
             return loaded
         _, folder = self.repository.find(name, version)
         if digest_of(folder) == digest:
-            policy = self._load(folder)
-            if digest_of(folder) == digest:  # it was not exchanged meanwhile
+            try:
+                policy = self._load(folder)
+            except MemoryError:
+                raise BundleError(f"{folder} needs more memory than there is") from None
+            contract = policy.contract
+            # It was not exchanged meanwhile, neither now nor when its name was read and its hash accepted.
+            if (contract.name, contract.version, policy.digest) == (name, version, digest):
                 loaded = self._loaded[name, version, digest] = Loaded(policy, digest, now())
                 return loaded
         raise BundleTamperedError(
@@ -161,18 +194,15 @@ class Library:
             "export changes under a new version, or load this one again"
         )
 
-    def keep(self, keys: Iterable[tuple[str, str, str]]) -> None:
-        """Let all others go; whoever still computes with one of those is not disturbed."""
-        wanted = set(keys)
-        self._loaded = {key: loaded for key, loaded in self._loaded.items() if key in wanted}
+    def keep(self, served: Mapping[tuple[str, str, str], Loaded], proposed: Collection[tuple[str, str, str]]) -> None:
+        """Hold what is served, keep what is proposed, and let all others go; who computes with one is not disturbed.
 
-
-def digest_of(folder: Path) -> str:
-    """Return what tells this bundle from every other: the hash of its hashes."""
-    try:
-        return hashlib.sha256((folder / SUMS_FILE).read_bytes()).hexdigest()
-    except OSError as error:
-        raise BundleError(f"{folder / SUMS_FILE} cannot be read: {error.strerror}") from None
+        In place: a thread may be adding one at this moment.
+        """
+        for key in list(self._loaded):
+            if key not in served and key not in proposed:
+                self._loaded.pop(key, None)
+        self._loaded.update(served)
 
 
 def raise_all(errors: Sequence[RlservoError]) -> None:

@@ -40,7 +40,7 @@ class PolicySummary(BaseModel):
     """A policy of `GET /v1/policies`."""
 
     name: str
-    version: str = Field(description="The default: the alias `production`, else the newest.")
+    version: str = Field(description="The default: where the alias `production` leads.")
     versions: list[str] = Field(description="Those that answer, oldest first.")
     description: str
     control_rate_hz: float | None

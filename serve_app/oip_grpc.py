@@ -147,6 +147,7 @@ class Grpc:
         A stream that says nothing for `stream_idle_s` is ended.
         """
         idle_s = self._core.settings.stream_idle_s
+        key_changes = self._core.keys.changes
         try:
             request_id, session = self._check("ModelStreamInfer", context)
             session = session or secrets.token_hex(8)  # all of a stream is one version's where a canary runs
@@ -165,6 +166,13 @@ class Grpc:
                 except asyncio.TimeoutError:
                     _fail(context, DeadlineError(f"the stream was silent for {idle_s:g} s: open another one"))
                     return
+                if key_changes != self._core.keys.changes:  # the key may be no longer accepted
+                    key_changes = self._core.keys.changes
+                    try:
+                        self._check("ModelStreamInfer", context)
+                    except RlservoError as error:
+                        _fail(context, error)
+                        return
                 try:
                     yield messages.ModelStreamInferResponse(
                         infer_response=await self._infer((content, None), request_id, session)

@@ -3,13 +3,17 @@
 `ServedConfig` is what a person writes (Serve's `user_config`); a `Plan` is what came of it and of every change since:
 whole, numbered, the same for every replica. A version in a plan carries the hash of the bundle that was accepted, so
 that no replica serves another one under its name. It knows nothing of files, ray or HTTP.
+
+Every policy of a plan has the alias `production`, which is what clients get that ask for no version; where nobody said
+so it is written down when the policy is first served. So a version that is loaded later is never in use by itself, and
+a rollback always knows what was.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from typing import Annotated, Any, Literal
 
@@ -24,8 +28,6 @@ ALIAS_PATTERN = r"^[a-z][a-z0-9_-]{0,31}$"
 LONGEST_HISTORY = 16  # earlier versions of an alias that a rollback can go back through
 
 Digests = Mapping[str, str]
-DigestOf = Callable[[str, str], str]
-"""(name, version) to the bundle's hash; raises UnknownPolicyError or UnknownVersionError."""
 
 
 def _as_text(value: Any) -> Any:
@@ -59,7 +61,8 @@ class PolicyConfig(_Model):
     """To be loaded; all that the repository holds when left out."""
 
     aliases: dict[Alias, Version] = {}
-    """Names that clients may use in a version's place. `production` is the default version."""
+    """Names that clients may use in a version's place. `production` is the default version; left out, it stays where it
+    is, and at the start leads to the newest."""
 
     canary: Canary | None = None
 
@@ -97,11 +100,15 @@ class PolicyPlan(_Model):
     """One policy of a plan."""
 
     versions: dict[Version, str]
-    """The version's bundle, as the SHA-256 of its SHA256SUMS."""
+    """The version's bundle, as the SHA-256 of its SHA256SUMS. None at all: the policy was unloaded, and its
+    history is kept for when it is loaded again."""
 
     aliases: dict[Alias, Version] = {}
     history: dict[Alias, tuple[Version, ...]] = {}
     """Where an alias led before, the last one last."""
+
+    unloaded: dict[Version, str] = {}
+    """The bundles of the history's versions that are not loaded: a rollback leads back to the same ones."""
 
     canary: Canary | None = None
     shadow: Reference | None = None
@@ -115,10 +122,8 @@ class PolicyPlan(_Model):
 
     @property
     def default(self) -> str | None:
-        """The version of whoever asks for none."""
-        if PRODUCTION in self.aliases:
-            return self.aliases[PRODUCTION]
-        return max(self.versions, key=version_key, default=None)
+        """The version of whoever asks for none; None where nothing is loaded."""
+        return self.aliases.get(PRODUCTION)
 
     def version_of(self, reference: str) -> str | None:
         """Return the version that a version or an alias means, None where there is none."""
@@ -159,8 +164,8 @@ class Plan(_Model):
     def policy(self, name: str) -> PolicyPlan:
         """Return a policy. Raises UnknownPolicyError."""
         plan = self.policies.get(name)
-        if plan is None:
-            known = ", ".join(sorted(self.policies)) or "none"
+        if plan is None or not plan.versions:
+            known = ", ".join(sorted(name for name, each in self.policies.items() if each.versions)) or "none"
             raise UnknownPolicyError(f"no policy '{name[:64]}' is loaded: this server has {known}")
         return plan
 
@@ -196,7 +201,8 @@ def config_hash(document: Any) -> str:
 def plan_of(config: ServedConfig, available: Mapping[str, Digests], before: Plan | None) -> dict[str, PolicyPlan]:
     """Return the policies that a configuration means, given the repository's bundles (name -> version -> hash).
 
-    An alias that moves remembers where it led in `before`.
+    An alias that moves remembers where it led in `before`. Where `production` is not said it stays where it led, unless
+    that version is no longer to be served.
     Raises UnknownPolicyError, UnknownVersionError, ConflictError.
     """
     chosen = dict(config.policies)
@@ -210,17 +216,19 @@ def plan_of(config: ServedConfig, available: Mapping[str, Digests], before: Plan
                 f"the repository has no policy '{name}': it has {', '.join(sorted(available)) or 'none'}"
             )
         versions = digests if wanted.versions is None else {v: _digest(name, digests, v) for v in wanted.versions}
-        was = before.policies.get(name) if before is not None else None
+        was = (before.policies.get(name) if before is not None else None) or PolicyPlan(versions={})
+        stays = {PRODUCTION: was.default} if was.default in versions else {}
         policies[name] = _checked(
             name,
-            {
-                "versions": dict(sorted(versions.items(), key=lambda item: version_key(item[0]))),
-                "aliases": wanted.aliases,
-                "history": {} if was is None else _moved(was, wanted.aliases),
-                "canary": wanted.canary,
-                "shadow": wanted.shadow,
-            },
+            was,
+            versions=versions,
+            aliases={**stays, **wanted.aliases},
+            canary=wanted.canary,
+            shadow=wanted.shadow,
         )
+    if before is not None:  # what is no longer served is as good as unloaded: its history stays
+        for name in before.policies.keys() - policies.keys():
+            policies[name] = _unloaded(name, before.policies[name])
     return policies
 
 
@@ -228,39 +236,49 @@ def plan_of(config: ServedConfig, available: Mapping[str, Digests], before: Plan
 
 
 def load(plan: Plan, name: str, version: str, digest: str) -> dict[str, PolicyPlan]:
-    """Add a version, or take its bundle as it is now."""
-    policy = plan.policies.get(name, PolicyPlan(versions={}))
-    versions = dict(sorted({**policy.versions, version: digest}.items(), key=lambda item: version_key(item[0])))
-    return _with(plan, name, policy, versions=versions)
+    """Add a version, or take its bundle as it is now; what clients get stays as it is.
+
+    The first version of a policy that is not served becomes its `production`: it changes no reply but a 404. Raises
+    ConflictError where the folder holds another bundle than the one in use under this version.
+    """
+    policy = plan.policies.get(name) or PolicyPlan(versions={})
+    uses = _uses(policy, version)
+    if uses and policy.versions[version] != digest:
+        raise ConflictError(
+            f"policy '{name}' version {version} is in use by {' and '.join(uses)}, and its folder holds another bundle "
+            "by now: export changes under a new version, or point that elsewhere first"
+        )
+    return _with(plan, name, policy, versions={**policy.versions, version: digest})
 
 
 def unload(plan: Plan, name: str, version: str | None) -> dict[str, PolicyPlan]:
     """Drop a version, or with None the whole policy. Raises ConflictError while something leads to the version."""
     policy = plan.policy(name)
-    if version is None:
-        return {other: each for other, each in plan.policies.items() if other != name}
+    if version is None:  # its history stays: a rollback after it is loaded again still knows what was in use
+        return {**plan.policies, name: _unloaded(name, policy)}
     _require(name, policy, version)
-    uses = [f"the alias '{alias}'" for alias, target in policy.aliases.items() if target == version]
-    if policy.canary is not None and policy.version_of(policy.canary.version) == version:
-        uses.append("the canary")
-    if policy.shadow is not None and policy.version_of(policy.shadow) == version:
-        uses.append("the shadow")
+    if len(policy.versions) == 1:
+        raise ConflictError(f"version {version} is the last of policy '{name}': unload the policy itself")
+    uses = _uses(policy, version)
     if uses:
         raise ConflictError(
             f"policy '{name}' version {version} is in use by {' and '.join(uses)}: point that elsewhere first"
         )
-    if len(policy.versions) == 1:
-        raise ConflictError(f"version {version} is the last of policy '{name}': unload the policy itself")
     return _with(plan, name, policy, versions={v: digest for v, digest in policy.versions.items() if v != version})
 
 
 def set_alias(plan: Plan, name: str, alias: str, version: str | None) -> dict[str, PolicyPlan]:
-    """Let an alias lead to a loaded version, or with None remove it."""
+    """Let an alias lead to a loaded version, or with None remove it; `production` can only be moved."""
     policy = plan.policy(name)
     aliases = dict(policy.aliases)
     if version is None:
         if alias not in aliases:
             raise ConflictError(f"policy '{name}' has no alias '{alias}': it has {_listed(aliases)}")
+        if alias == PRODUCTION:
+            raise ConflictError(
+                f"the alias '{PRODUCTION}' of policy '{name}' says what clients get that ask for no version: point it "
+                "elsewhere, or unload the policy"
+            )
         for use, reference in (("canary", policy.canary and policy.canary.version), ("shadow", policy.shadow)):
             if reference == alias:
                 raise ConflictError(f"the alias '{alias}' of policy '{name}' is in use by the {use}: end that first")
@@ -268,13 +286,11 @@ def set_alias(plan: Plan, name: str, alias: str, version: str | None) -> dict[st
     else:
         _require(name, policy, version)
         aliases[alias] = version
-    return _with(plan, name, policy, aliases=aliases, history=_moved(policy, aliases))
+    return _with(plan, name, policy, aliases=aliases)
 
 
-def roll_back(
-    plan: Plan, name: str, alias: str, digest_of: DigestOf, *, expected: str | None = None
-) -> dict[str, PolicyPlan]:
-    """Let an alias lead where it led before, loading that version again if need be.
+def roll_back(plan: Plan, name: str, alias: str, *, expected: str | None = None) -> dict[str, PolicyPlan]:
+    """Let an alias lead where it led before, to the same bundle, which is loaded again if need be.
 
     `expected` is where it leads as far as the caller knows: the same command twice goes back once.
     """
@@ -288,11 +304,10 @@ def roll_back(
     if not earlier:
         raise ConflictError(f"the alias '{alias}' of policy '{name}' has led nowhere else: there is no way back")
     version = earlier[-1]
-    versions = dict(policy.versions)
-    if version not in versions:
-        versions[version] = digest_of(name, version)
-    history = {**policy.history, alias: earlier[:-1]}
-    return _with(plan, name, policy, versions=versions, aliases={**policy.aliases, alias: version}, history=history)
+    versions = {version: policy.unloaded.get(version, ""), **policy.versions}
+    changed = _with(plan, name, policy, versions=versions, aliases={**policy.aliases, alias: version})
+    history = {**changed[name].history, alias: earlier[:-1]}
+    return {**changed, name: changed[name].model_copy(update={"history": history})}
 
 
 def set_canary(plan: Plan, name: str, canary: Canary | None) -> dict[str, PolicyPlan]:
@@ -306,11 +321,21 @@ def set_shadow(plan: Plan, name: str, shadow: str | None) -> dict[str, PolicyPla
 
 
 def _with(plan: Plan, name: str, policy: PolicyPlan, **changes: Any) -> dict[str, PolicyPlan]:
-    values = {field: getattr(policy, field) for field in PolicyPlan.model_fields} | changes
-    return {**plan.policies, name: _checked(name, values)}
+    return {**plan.policies, name: _checked(name, policy, **changes)}
 
 
-def _checked(name: str, values: Mapping[str, Any]) -> PolicyPlan:
+def _checked(name: str, was: PolicyPlan, **changes: Any) -> PolicyPlan:
+    """Return the policy with these changes: sorted, in use as somebody said, with the way back from what it was."""
+    values: dict[str, Any] = {field: getattr(was, field) for field in PolicyPlan.model_fields} | changes
+    versions: dict[str, str] = dict(sorted(values["versions"].items(), key=lambda item: version_key(item[0])))
+    aliases: dict[str, str] = dict(values["aliases"])
+    if versions and PRODUCTION not in aliases:
+        aliases[PRODUCTION] = list(versions)[-1]
+    history = _moved(was, aliases)
+    known = {**was.unloaded, **was.versions}
+    kept = {version for earlier in history.values() for version in earlier if version not in versions}
+    unloaded = {version: known[version] for version in sorted(kept, key=version_key) if version in known}
+    values |= {"versions": versions, "aliases": aliases, "history": history, "unloaded": unloaded}
     try:
         policy = PolicyPlan(**values)
     except ValidationError as error:
@@ -323,6 +348,20 @@ def _checked(name: str, values: Mapping[str, Any]) -> PolicyPlan:
     if policy.shadow is not None:
         _require(name, policy, policy.shadow)
     return policy
+
+
+def _unloaded(name: str, policy: PolicyPlan) -> PolicyPlan:
+    return _checked(name, policy, versions={}, aliases={}, canary=None, shadow=None)
+
+
+def _uses(policy: PolicyPlan, version: str) -> list[str]:
+    """Return what leads to a version."""
+    uses = [f"the alias '{alias}'" for alias, target in policy.aliases.items() if target == version]
+    if policy.canary is not None and policy.version_of(policy.canary.version) == version:
+        uses.append("the canary")
+    if policy.shadow is not None and policy.version_of(policy.shadow) == version:
+        uses.append("the shadow")
+    return uses
 
 
 def _require(name: str, policy: PolicyPlan, reference: str) -> None:
@@ -340,6 +379,9 @@ def _moved(policy: PolicyPlan, aliases: Mapping[str, str]) -> dict[str, tuple[st
     for alias, version in policy.aliases.items():
         if aliases.get(alias) != version:
             history[alias] = (*history.get(alias, ()), version)[-LONGEST_HISTORY:]
+    for alias, version in aliases.items():  # loaded again as what it was: the way back is further back
+        if history.get(alias, ())[-1:] == (version,):
+            history[alias] = history[alias][:-1]
     return history
 
 

@@ -23,10 +23,13 @@ from typing_extensions import Self
 from rlservo.export.bundle import (
     CONTRACT_FILE,
     CONTRACT_KEY,
+    DEFAULT_LIMITS,
     GOLDEN_FILE,
+    ONNX_FILE,
     REWARD,
     BoxSpec,
     Bundle,
+    BundleLimits,
     Contract,
     DiscreteSpec,
     Distribution,
@@ -67,6 +70,7 @@ GOLDEN_RTOL = (
 )
 GOLDEN_ATOL = 1e-5  # the same for actions near zero
 SHOWN_HASH = 12  # hexadecimal digits: enough to tell the graphs apart that ever bear one name and version
+MAX_ELEMENTS = 1 << 24  # of an observation or action: a contract of one line could ask for all the memory there is
 NOTICE_EVERY_S = 60.0  # an observation out of bounds comes a hundred times a second, and is worth a line a minute
 
 # onnxruntime's names of the types a policy's tensors have.
@@ -170,26 +174,27 @@ class Policy:
         threads: int = 1,
         check_golden: bool = True,
         options: PolicyOptions = DEFAULT_OPTIONS,
+        limits: BundleLimits = DEFAULT_LIMITS,
     ) -> Self:
         """Load the bundle at `path` (a bundle, a policy folder or a repository with one policy).
 
         Checks hashes, the graph against the contract and, unless `check_golden` is off, that this machine reproduces
         the golden vectors. `threads` is onnxruntime's intra-op thread count; one is fastest for networks of this size.
 
-        `options` say how strict it is at its edges.
+        `options` say how strict it is at its edges, `limits` how large the bundle's files may be.
 
         Raises BundleError, BundleTamperedError or GoldenMismatchError, and UsageError where the options do not fit.
         """
         if threads < 1:
             raise UsageError(f"threads must be 1 or more, got {threads}")
-        bundle = load_bundle(path)
+        bundle = load_bundle(path, limits)
         _check_contract(bundle)
         session = _open(bundle, threads)
         _check_graph(bundle, session)
         _check_copy(bundle, session)
         if check_golden:
             check_golden_vectors(bundle, session.run)
-        return cls(bundle, session, options, graph_hash=hashlib.sha256(bundle.onnx.read_bytes()).hexdigest())
+        return cls(bundle, session, options, graph_hash=bundle.sums[ONNX_FILE])
 
     @property
     def contract(self) -> Contract:
@@ -199,6 +204,11 @@ class Policy:
     def path(self) -> Path:
         """The bundle folder this policy was loaded from."""
         return self._bundle.path
+
+    @property
+    def digest(self) -> str:
+        """What tells the loaded bundle from every other of its name and version."""
+        return self._bundle.digest
 
     def act(
         self, obs: Observation, *, explore: bool = False, seed: int | None = None, reward: ArrayLike | None = None
@@ -459,6 +469,8 @@ def _check_leaf(bundle: Bundle, name: str, space: LeafSpec) -> None:
         kind = "?"
     if kind not in "fiub":
         raise BundleError(f"{where} has dtype '{space.dtype}': expected a number type")
+    if space.size > MAX_ELEMENTS:
+        raise BundleError(f"{where} has {space.size:,} elements: at most {MAX_ELEMENTS:,}")
     if space.elements and len(space.elements) != space.size:
         raise BundleError(f"{where} names {len(space.elements)} elements of {space.size}")
     if isinstance(space, BoxSpec):
@@ -475,10 +487,12 @@ def _quoted(names: Sequence[str]) -> str:
 
 
 def _open(bundle: Bundle, threads: int) -> onnxruntime.InferenceSession:
-    try:
-        return open_session(bundle.onnx, threads)
-    except Exception as error:  # onnxruntime's own exceptions share no base but Exception
-        raise BundleError(f"{bundle.onnx} is not a graph onnxruntime can run: {first_line(error)}") from error
+    with bundle.verified_copy(ONNX_FILE) as file:
+        try:
+            return open_session(file, threads)
+        except Exception as error:  # onnxruntime's own exceptions share no base but Exception
+            sentence = first_line(error).replace(str(file), bundle.onnx.name)
+            raise BundleError(f"{bundle.onnx} is not a graph onnxruntime can run: {sentence}") from error
 
 
 def _check_graph(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:

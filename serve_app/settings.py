@@ -15,6 +15,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from typing_extensions import Self
 
+from rlservo.export.bundle import BundleLimits
 from rlservo.export.errors import UsageError
 from rlservo.serve_app.options import PolicyOptions
 
@@ -102,8 +103,33 @@ class ServerSettings(BaseModel):
     replica does. Off, Serve counts them in its own metrics and holds them to its `request_timeout_s`; where its tracing
     is on, it handles them in any case."""
 
+    max_policy_bytes: int = Field(512 << 20, ge=1024)
+    """A larger policy.onnx (or policy.ts) is refused before it is read. Loading takes about twice its size."""
+
+    max_golden_bytes: int = Field(512 << 20, ge=1024)
+    """A larger golden.npz, packed or unpacked, is refused before it is read."""
+
+    max_contract_bytes: int = Field(16 << 20, ge=1024)
+    """A larger contract.json is refused before it is read."""
+
+    scan_timeout_s: float = Field(10.0, gt=0, allow_inf_nan=False)
+    """[s] A look through the policies' folders that takes longer is given up: a file system may hang."""
+
+    load_timeout_s: float = Field(30.0, gt=0, allow_inf_nan=False)
+    """[s] Loading and proving one version that takes longer is given up. Below 45, within which every replica has to
+    follow a change."""
+
     docs: bool = True
     """Serve the interactive API documentation at /docs, from files that come with the server."""
+
+    @property
+    def bundle_limits(self) -> BundleLimits:
+        """How large a bundle's files may be."""
+        return BundleLimits(
+            max_policy_bytes=self.max_policy_bytes,
+            max_golden_bytes=self.max_golden_bytes,
+            max_contract_bytes=self.max_contract_bytes,
+        )
 
     @field_validator("api_keys_file", "log_file")
     @classmethod

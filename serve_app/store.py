@@ -14,7 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.bundle import DictSpec, SpaceSpec, TupleSpec, find_bundles, leaf_specs, read_contract, version_key
+from rlservo.export.bundle import (
+    DEFAULT_LIMITS,
+    BundleLimits,
+    DictSpec,
+    SpaceSpec,
+    TupleSpec,
+    find_bundles,
+    leaf_specs,
+    read_contract,
+    version_key,
+)
 from rlservo.export.errors import (
     BundleError,
     RequestError,
@@ -26,7 +36,7 @@ from rlservo.export.errors import (
 from rlservo.serve_app.acting import Observation
 from rlservo.serve_app.batching import Batcher
 from rlservo.serve_app.options import DEFAULT_OPTIONS, PolicyOptions
-from rlservo.serve_app.plan import PolicyPlan
+from rlservo.serve_app.plan import PRODUCTION, PolicyPlan
 from rlservo.serve_app.policy import Policy
 
 
@@ -71,7 +81,7 @@ class Shadow:
 
 
 class PolicyStore:
-    """Several policies in several versions; a name's default is its `production` alias, else its newest version."""
+    """Several policies in several versions; a name's default is its `production` alias, without plans the newest."""
 
     def __init__(
         self,
@@ -83,9 +93,10 @@ class PolicyStore:
     ) -> None:
         """Take loaded policies, and by name which are to do what; those `changed` were served otherwise before.
 
-        A plan may name versions that are not among the policies; where it leads to one, that part of it is left out.
-        What goes on of a store that this one `replaces` is the micro-batching of the policies that both have.
-        Raises UsageError when two have the same name and version, or, without plans, when there is none.
+        A plan may name versions that are not among the policies; an alias, canary or shadow that leads to one is left
+        out. Raises UsageError when two have the same name and version, when the default version is not there (no other
+        takes its place), or, without plans, when there is no policy. What goes on of a store that this one `replaces`
+        is the micro-batching of the policies that both have.
         """
         self._policies: dict[str, dict[str, Policy]] = {}
         self._changed = frozenset(changed)
@@ -109,7 +120,7 @@ class PolicyStore:
         self._canary: dict[str, _Canary] = {}
         self._shadow: dict[str, Shadow] = {}
         for name, versions in self._policies.items():
-            self._arrange(name, versions, (plans or {}).get(name) or PolicyPlan(versions=dict.fromkeys(versions, "")))
+            self._arrange(name, versions, (plans or {}).get(name) or _newest(versions))
         before: dict[Policy, Batcher] = {} if replaces is None else replaces._batchers
         self._batchers: dict[Policy, Batcher] = {
             policy: before.get(policy) or Batcher(policy.network(), policy.options.micro_batch)
@@ -284,9 +295,11 @@ class PolicyStore:
                 policy.close()
 
     def _arrange(self, name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> None:
-        self._aliases[name] = {alias: versions[v] for alias, v in sorted(plan.aliases.items()) if v in versions}
-        default = versions.get(plan.default or "") or list(versions.values())[-1]
+        default = versions.get(plan.default or "")
+        if default is None:
+            raise UsageError(f"policy '{name}' is to be served as version {plan.default}, which is not loaded")
         self._default[name] = default
+        self._aliases[name] = {alias: versions[v] for alias, v in sorted(plan.aliases.items()) if v in versions}
         canary = plan.canary and versions.get(plan.version_of(plan.canary.version) or "")
         if canary and plan.canary:
             self._canary[name] = _Canary(canary, plan.canary.share, canary.episodic)
@@ -315,6 +328,10 @@ def _wants_batches(policy: Policy) -> bool:
     contract = policy.contract
     observed = leaf_specs(contract.observation_space, "obs")
     return policy.options.micro_batch > 1 and not policy.episodic and len(contract.inputs) == len(observed)
+
+
+def _newest(versions: Mapping[str, Policy]) -> PolicyPlan:
+    return PolicyPlan(versions=dict.fromkeys(versions, ""), aliases={PRODUCTION: list(versions)[-1]})
 
 
 def _act(policy: Policy, obs: Observation, explore: bool = False, seed: int | None = None) -> Decision:
@@ -365,12 +382,19 @@ def take_notices(policy: Policy) -> tuple[str, ...]:
     return taken
 
 
-def load_policy(folder: Path, *, threads: int = 1, options: Mapping[str, PolicyOptions] | None = None) -> Policy:
+def load_policy(
+    folder: Path,
+    *,
+    threads: int = 1,
+    options: Mapping[str, PolicyOptions] | None = None,
+    limits: BundleLimits = DEFAULT_LIMITS,
+) -> Policy:
     """Load and prove a bundle; `options` are by policy name, '*' is for those not named. Raises BundleError."""
     if not options:
-        return Policy.load(folder, threads=threads)
-    name = read_contract(folder).name
-    policy = Policy.load(folder, threads=threads, options=options.get(name, options.get("*", DEFAULT_OPTIONS)))
+        return Policy.load(folder, threads=threads, limits=limits)
+    name = read_contract(folder, limits).name
+    chosen = options.get(name, options.get("*", DEFAULT_OPTIONS))
+    policy = Policy.load(folder, threads=threads, options=chosen, limits=limits)
     if _wants_batches(policy):
         policy.check_rows()
     return policy

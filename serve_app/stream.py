@@ -22,7 +22,7 @@ import logging
 import secrets
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
@@ -51,6 +51,7 @@ KEEP = b"errors=keep"
 KNOWN = frozenset({"obs", *wire.OPTIONS, *wire.OF_EPISODE})
 PROTOCOL = "websocket"
 NO_OPTIONS: dict[str, Any] = {}
+CHECK_KEY = "rlservo.check_key"  # in a stream's scope: what raises when the key that opened it is no longer accepted
 DENIAL = "websocket.http.response"  # the ASGI extension that answers an upgrade with an HTTP error
 
 
@@ -65,6 +66,8 @@ class _Conversation:
     request_id: str | None  # of the connection; requests are told apart by `seq`
     _: KW_ONLY
     keep: bool  # whether the connection outlives errors
+    check_key: Callable[[], object]  # raises UnauthenticatedError or ForbiddenError
+    key_changes: int  # how often the keys had changed when this one was last checked
     received: float | None = None
     seq: Any = None  # as the client gave it
 
@@ -86,6 +89,7 @@ class Stream:
         """Serve one connection until the client closes it."""
         name = ""
         version: str | None = None
+        key_changes = self._core.keys.changes  # the key was checked in this very turn of the event loop
         try:
             name, version = self._addressed(scope["path_params"])
             # All requests of a stream get the same version where a canary runs.
@@ -104,7 +108,16 @@ class Stream:
         idle = IdleTimer(self._core.settings.stream_idle_s)
         session = Session(policy) if policy.episodic else None
         keep = KEEP in scope.get("query_string", b"").split(b"&")
-        conversation = _Conversation(name, version, label, session, request_id(scope), keep=keep)
+        conversation = _Conversation(
+            name,
+            version,
+            label,
+            session,
+            request_id(scope),
+            keep=keep,
+            check_key=scope[CHECK_KEY],
+            key_changes=key_changes,
+        )
         try:
             with self._core.admission.streaming():
                 await send(_binary(pack(_metadata(policy.contract))))
@@ -168,6 +181,9 @@ class Stream:
             idle.touch()
             if message["type"] == "websocket.disconnect":
                 return
+            if asked.key_changes != core.keys.changes:
+                asked.key_changes = core.keys.changes
+                asked.check_key()  # ends the stream, also one that outlives errors
             try:
                 obs, options = self._read(message, asked)
                 asked.seq = options.get("seq")

@@ -170,6 +170,63 @@ def test_triton_load_and_unload_are_the_same_commands(port: int, key_path: Path)
     assert ask(port, "POST", "/v2/repository/models/gridworld/unload", {})[0] == 401
 
 
+@pytest.fixture
+def started(policies: Path, key_path: Path, served: Serve, tmp_path: Path) -> Iterator[tuple[AdminClient, int, Path]]:
+    """A server started as `rlservo serve DIR` does, with nothing said, over ur5 in 1 and 2."""
+    root = tmp_path / "policies"
+    for version in ("1", "2"):
+        shutil.copytree(policies / "ur5" / version, root / "ur5" / version)
+    digest = "sha256:" + hashlib.sha256(read_key(key_path).encode()).hexdigest()
+    control = Control(Library(Repository([root])), Shelf(), replica="only")
+    asyncio.run(control.configure({}))
+    app = create_app(lambda: control.store, ServerSettings(operator_key=digest), replica="only", control=control)
+    with served(app) as port, AdminClient(f"http://127.0.0.1:{port}", api_key=read_key(key_path)) as client:
+        yield client, port, root
+    control.close()
+
+
+def test_from_the_default_start_on_a_load_changes_no_reply_and_a_rollback_leads_back(
+    started: tuple[AdminClient, int, Path], policies: Path, key_path: Path
+) -> None:
+    admin, port, root = started
+    assert act(port)["version"] == "2" and listed(port)["aliases"] == {"production": "2"}
+    shutil.copytree(policies / "ur5" / "10", root / "ur5" / "10")
+    for load in (
+        lambda: admin.load("ur5"),
+        lambda: ask(port, "POST", "/v2/repository/models/ur5/load", {}, authorization=f"Bearer {read_key(key_path)}"),
+    ):
+        load()
+        assert act(port)["version"] == "2" and listed(port)["versions"] == ["1", "2", "10"]
+    assert act(port, "versions/10/act")["version"] == "10"  # who asks for it gets it
+    admin.alias("ur5", "production", "10")
+    assert act(port)["version"] == "10"
+    with pytest.raises(ConflictError, match="in use by the alias 'production'"):
+        admin.unload("ur5", "10")
+    admin.unload("ur5", "2")
+    admin.rollback("ur5", "production")
+    assert act(port)["version"] == "2" and listed(port)["versions"] == ["1", "2", "10"]
+    with pytest.raises(ConflictError, match="has led nowhere else"):
+        admin.rollback("ur5", "production")
+    with pytest.raises(ConflictError, match="point it elsewhere"):
+        admin.alias("ur5", "production", None)
+
+
+def test_a_policy_unloaded_and_loaded_again_is_served_and_knows_its_way_back(
+    started: tuple[AdminClient, int, Path], box_policy: Callable[..., Path]
+) -> None:
+    admin, port, root = started
+    admin.alias("ur5", "production", "1")
+    admin.unload("ur5")
+    assert ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[0] == 404
+    admin.load("ur5")
+    assert act(port)["version"] == "2"
+    shutil.rmtree(root / "ur5" / "1")
+    shutil.move(box_policy(root.parent / "other", version="1", seed=8), root / "ur5" / "1")
+    with pytest.raises(RefusedError, match="is not the bundle that was accepted"):  # and not another one of that name
+        admin.rollback("ur5", "production")
+    assert act(port)["version"] == "2"
+
+
 def test_administration_needs_the_key_and_acting_does_not(port: int) -> None:
     assert act(port)["version"] == "1"
     for path in ("/v1/admin/policies", "/v1/admin/policies/ur5/load", "/v2/repository/models/ur5/load"):

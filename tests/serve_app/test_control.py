@@ -15,8 +15,8 @@ import pytest
 from rlservo.export.errors import BundleError, ConflictError, PartlyAppliedError, RefusedError, UnavailableError
 from rlservo.serve_app import plan
 from rlservo.serve_app.control import Change, Control, Following
-from rlservo.serve_app.library import Library, Repository, digest_of
-from rlservo.serve_app.plan import Canary, Plan
+from rlservo.serve_app.library import Library, Repository
+from rlservo.serve_app.plan import Canary
 from rlservo.serve_app.policy import Policy
 
 OBS = np.zeros(27, np.float32) + 0.1
@@ -72,14 +72,6 @@ def config(*versions: str, production: str, **more: Any) -> dict[str, Any]:
     }
 
 
-def loading(control: Control, version: str) -> Change:
-    def change(before: Plan) -> Any:
-        found, folder = control.repository.find("ur5", version)
-        return plan.load(before, "ur5", found, digest_of(folder))
-
-    return change
-
-
 def aliasing(version: str) -> Change:
     return lambda before: plan.set_alias(before, "ur5", "production", version)
 
@@ -99,7 +91,7 @@ def test_a_change_on_one_replica_is_served_by_all_when_it_returns(folder: Path) 
         await fleet.deploy(config("1", production="1"))
         first, second = fleet.controls
         held = second.store
-        await first.change(loading(first, "2"), what="load")
+        await first.load("ur5", "2", what="load")
         await second.change(aliasing("2"), what="alias")
         assert fleet.defaults() == ["2", "2"]
         assert held is not None and held.default("ur5") == "1"  # whoever began with the old store ends with it
@@ -132,7 +124,7 @@ def test_a_version_that_fails_is_refused_and_every_replica_says_why(folder: Path
         await fleet.deploy(config("1", production="1"))
         break_weights(folder, "2")
         with pytest.raises(RefusedError, match=r"nothing has changed: .*policy.onnx is not the file") as caught:
-            await fleet.controls[0].change(loading(fleet.controls[0], "2"), what="load ur5 2")
+            await fleet.controls[0].load("ur5", "2", what="load ur5 2")
         assert caught.value.details["versions"][0]["version"] == "2"
         for control in fleet.controls:
             assert control.plan is not None and control.plan.refused is not None
@@ -165,7 +157,7 @@ def test_golden_vectors_that_are_not_reproduced_refuse_a_version(
         fleet = Fleet(folder)
         await fleet.deploy(config("10", production="10"))
         with pytest.raises(RefusedError, match="golden"):
-            await fleet.controls[0].change(loading(fleet.controls[0], "11"), what="load")
+            await fleet.controls[0].load("ur5", "11", what="load")
 
     asyncio.run(run())
 
@@ -222,7 +214,7 @@ def test_a_replica_that_cannot_follow_keeps_what_it_had_and_the_command_names_it
         fleet = Fleet(folder, elsewhere)
         await fleet.deploy(config("1", production="1"))
         with pytest.raises(PartlyAppliedError, match=r"r1: the repository has no version '2'") as caught:
-            await fleet.controls[0].change(loading(fleet.controls[0], "2"), what="load")
+            await fleet.controls[0].load("ur5", "2", what="load")
         assert list(caught.value.details["replicas"]) == ["r1"]
         with pytest.raises(PartlyAppliedError, match="r1"):
             await fleet.controls[0].change(aliasing("2"), what="alias")
@@ -250,7 +242,7 @@ def test_the_same_version_is_the_same_bundle_on_every_replica(
         await restarted.configure(fleet.current)
         assert restarted.store is not None and restarted.store.versions("ur5") == ("1",)
         assert "is not the bundle that was accepted" in restarted.states()["ur5"]["2"].reason
-        await fleet.controls[0].change(loading(fleet.controls[0], "2"), what="load")  # now it is
+        await fleet.controls[0].load("ur5", "2", what="load")  # now it is
         reloaded = fleet.controls[0].store
         assert reloaded is not None and not np.allclose(reloaded.act("ur5", "2", OBS).action, action)
 
@@ -297,7 +289,7 @@ def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folde
     async def run() -> None:
         control = Control(Library(Repository([folder]), slowly), Shelf(), replica="slow")
         await control.configure(config("1", production="1"))
-        change = asyncio.create_task(control.change(loading(control, "2"), what="load"))
+        change = asyncio.create_task(control.load("ur5", "2", what="load"))
         while not began.is_set():
             await asyncio.sleep(0.01)
         assert control.states()["ur5"]["2"].state == "loading"

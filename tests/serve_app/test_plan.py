@@ -84,20 +84,73 @@ def test_rollbacks_go_back_through_what_an_alias_was_and_load_what_is_gone() -> 
         now = now.after(plan.set_alias(now, "ur5", "production", version), "alias")
     assert now.policies["ur5"].history == {"production": ("1", "2")}
     now = now.after(plan.unload(now, "ur5", "2"), "unload")
-    asked: list[tuple[str, str]] = []
-
-    def digest_of(name: str, version: str) -> str:
-        asked.append((name, version))
-        return "b2"
-
-    now = now.after(plan.roll_back(now, "ur5", "production", digest_of), "rollback")
-    assert now.policies["ur5"].default == "2" and now.policies["ur5"].versions["2"] == "b2" and asked == [("ur5", "2")]
+    assert now.policies["ur5"].unloaded == {"2": "b"}
+    now = now.after(plan.roll_back(now, "ur5", "production"), "rollback")
+    assert now.policies["ur5"].default == "2"
+    assert now.policies["ur5"].versions == {"1": "a", "2": "b", "10": "c"}  # the same bundle as before
     with pytest.raises(ConflictError, match="leads to 2 and was expected at 10"):
-        plan.roll_back(now, "ur5", "production", digest_of, expected="10")
-    now = now.after(plan.roll_back(now, "ur5", "production", digest_of, expected="2"), "rollback")
+        plan.roll_back(now, "ur5", "production", expected="10")
+    now = now.after(plan.roll_back(now, "ur5", "production", expected="2"), "rollback")
     assert now.policies["ur5"].default == "1"
     with pytest.raises(ConflictError, match="has led nowhere else"):
-        plan.roll_back(now, "ur5", "production", digest_of)
+        plan.roll_back(now, "ur5", "production")
+
+
+@pytest.mark.parametrize("config", [{}, {"policies": {"ur5": {"versions": ["1", "2"]}}},
+                                    {"policies": {"ur5": {"aliases": {"candidate": "1"}}}}])  # fmt: skip
+def test_what_is_in_use_at_the_start_is_written_down_and_a_load_never_changes_it(config: dict[str, Any]) -> None:
+    now = made(planned(config))
+    first = now.policies["ur5"].default
+    assert first is not None and now.policies["ur5"].aliases["production"] == first
+    now = now.after(plan.load(now, "ur5", "11", "e"), "load")
+    assert now.policies["ur5"].default == first
+    now = now.after(plan.set_alias(now, "ur5", "production", "11"), "alias")
+    now = now.after(plan.roll_back(now, "ur5", "production"), "rollback")
+    assert now.policies["ur5"].default == first
+
+
+def test_production_is_moved_but_neither_removed_nor_unloaded_nor_exchanged() -> None:
+    now = made(planned({}))
+    with pytest.raises(ConflictError, match=r"says what clients get .* point it elsewhere, or unload the policy"):
+        plan.set_alias(now, "ur5", "production", None)
+    with pytest.raises(ConflictError, match="version 10 is in use by the alias 'production'"):
+        plan.unload(now, "ur5", "10")
+    with pytest.raises(ConflictError, match="in use by the alias 'production', and its folder holds another bundle"):
+        plan.load(now, "ur5", "10", "exchanged")
+    assert plan.load(now, "ur5", "10", "c")["ur5"] == now.policies["ur5"]
+    assert plan.load(now, "ur5", "2", "exchanged")["ur5"].versions["2"] == "exchanged"  # nothing leads there
+
+
+def test_a_policy_that_was_not_served_is_in_use_as_what_was_loaded_first() -> None:
+    now = made(planned({"policies": {"mir": {}}, "unlisted": "ignore"}))
+    now = now.after(plan.load(now, "ur5", "2", "b"), "load")
+    assert now.policies["ur5"].default == "2"
+    now = now.after(plan.load(now, "ur5", "10", "c"), "load")
+    assert now.policies["ur5"].default == "2"
+
+
+def test_unloading_a_policy_and_loading_another_version_leaves_the_way_back() -> None:
+    now = made(planned({"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}}}}))
+    now = now.after(plan.set_alias(now, "ur5", "production", "2"), "alias")
+    now = now.after(plan.unload(now, "ur5", None), "unload")
+    with pytest.raises(UnknownPolicyError, match=r"no policy 'ur5' is loaded: this server has mir$"):
+        now.policy("ur5")
+    again = now.after(plan.load(now, "ur5", "2", "b"), "load")
+    assert again.policies["ur5"].history == {"production": ("1",)}  # what is in use is not its own way back
+    now = now.after(plan.load(now, "ur5", "10", "c"), "load")
+    now = now.after(plan.roll_back(now, "ur5", "production"), "rollback")
+    assert now.policies["ur5"].default == "2" and now.policies["ur5"].versions == {"2": "b", "10": "c"}
+
+
+def test_a_configuration_that_does_not_say_production_leaves_it_where_it_is() -> None:
+    before = made(planned({"policies": {"ur5": {"aliases": {"production": "1"}}}}))
+    assert planned({}, before)["ur5"].default == "1"
+    assert planned({"policies": {"ur5": {"versions": ["1", "2"], "shadow": "2"}}}, before)["ur5"].default == "1"
+    gone = planned({"policies": {"ur5": {"versions": ["2", "10"]}}}, before)["ur5"]  # it cannot stay
+    assert (gone.default, gone.history, gone.unloaded) == ("10", {"production": ("1",)}, {"1": "a"})
+    ignored = made(planned({"policies": {"mir": {}}, "unlisted": "ignore"}, before))
+    assert not ignored.policies["ur5"].versions
+    assert planned({}, ignored)["ur5"].history == {"production": ("1",)}
 
 
 def test_a_new_configuration_leaves_the_way_back_open() -> None:
@@ -120,7 +173,7 @@ def test_what_is_in_use_is_not_unloaded() -> None:
         plan.unload(now, "mir", "1")
     with pytest.raises(ConflictError, match="no alias 'old': it has production, candidate"):
         plan.set_alias(now, "ur5", "old", None)
-    assert set(plan.unload(now, "mir", None)) == {"ur5"}
+    assert {name for name, policy in plan.unload(now, "mir", None).items() if policy.versions} == {"ur5"}
     with pytest.raises(UnknownVersionError, match="no version '3'"):
         plan.set_canary(now, "ur5", Canary(version="3", share=0.5))
 
