@@ -82,7 +82,7 @@ def flood(port: int, case: Case, replicas: list[int]) -> Flood:
 def _request(case: Case, obs: object) -> bytes:
     body = json.dumps({"obs": np.asarray(obs).tolist()}).encode()
     head = (
-        f"POST /v1/policies/{case.name}/act HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        f"POST /v1/policies/{case.name}/act HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
         f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
     )
     return head.encode() + body

@@ -34,7 +34,7 @@ from rlservo.serve_app.docs import add_docs
 from rlservo.serve_app.edge import JSON, JSON_HEADERS, BareRoute, Body, Endpoint, Headers
 from rlservo.serve_app.gauges import gauges_of
 from rlservo.serve_app.keys import Access, access_of, grant
-from rlservo.serve_app.request_checks import Hosts, RequestChecks, check_path
+from rlservo.serve_app.request_checks import PATH, Hosts, RequestChecks, check_path
 from rlservo.serve_app.settings import ServerSettings
 from rlservo.serve_app.store import Decision
 from rlservo.serve_app.stream import CHECK_KEY, STREAM_PATHS, Stream, StreamRoute, refuse
@@ -42,7 +42,7 @@ from rlservo.serve_app.stream import CHECK_KEY, STREAM_PATHS, Stream, StreamRout
 CODES = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "wrong-media-type"}
 ACT_PATH = "/v1/policies/{name}/act"
 ACT_VERSION_PATH = "/v1/policies/{name}/versions/{version}/act"
-PATHS_REMEMBERED = 1024
+PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
 
 
 def create_app(
@@ -129,8 +129,9 @@ class PolicyApp(FastAPI):
         self._mount = scope.get("root_path", "")
         path = route_path(scope)
         try:
-            check_path(scope, path)
             direct = self._find_direct(scope, path)
+            if direct is None or b"%" in (scope.get("raw_path") or b""):
+                check_path(scope, path)
             route, access = (direct[0], direct[0].access) if direct is not None else self._find(scope)
             presented, unreadable = self._checks.read(scope)
             scope[edge.KEY] = self._core.guard.check(presented, access)
@@ -163,10 +164,10 @@ class PolicyApp(FastAPI):
         await refuse(scope, receive, send, error)
 
     def _find_direct(self, scope: Scope, path: str) -> tuple[BareRoute | StreamRoute, dict[str, Any]] | None:
-        """Return the direct route of a path below the prefix, and the path's parameters."""
+        """Return the direct route of a usable path below the prefix, and the path's parameters."""
         kind = scope["method"] if scope["type"] == "http" else "WEBSOCKET"
         found = self._found.get((kind, path))
-        if found is None:
+        if found is None and len(path) <= LONGEST_REMEMBERED and PATH.fullmatch(path) is not None:
             for route in self._direct.get(kind, ()):
                 match = route.path_regex.fullmatch(path)
                 if match is not None:
