@@ -34,6 +34,7 @@ from rlservo.export.errors import (
     UnknownPolicyError,
 )
 from rlservo.serve_app import wire
+from rlservo.serve_app.age import LEAST_S
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.logs import FIELDS
 from rlservo.serve_app.store import Decision
@@ -84,11 +85,14 @@ class Endpoint:
         try:
             self._check_headers(scope["headers"])
             check_length(scope["headers"], self._max_body)
+            waited = admission.age.waited(scope["headers"])
             with admission.reading(self._timeout_s) as timeout_s:
                 body = await read_body(receive, max_bytes=self._max_body, timeout_s=timeout_s)
             if body is None:  # the client has gone
                 return
-            received = min(started, admission.enter())  # only now: a body that is slow to come waits for itself
+            received = min(started, admission.enter(waited))  # only now: a body that is slow to come waits for itself
+            if waited is not None and waited > LEAST_S:
+                received -= waited
             content, headers, decision = await self._handle(scope, body, received)
             status = 200
             taken, batch = time.perf_counter() - received, decision.batch or 1
