@@ -147,13 +147,13 @@ def clock() -> str:
     return "unknown"
 
 
-def bridging(text: str, *, alone_since: float | None = None) -> str:
+def bridging(text: str, *, hung_since: float | None = None) -> str:
     """Return a mended configuration without what is Ray's own: its admin socket, statistics and metrics.
 
-    What comes in the beginning may have waited since HAProxy was last known to run (`alone_since`, `time.time`).
+    What comes in the beginning may have waited since a HAProxy hung (`hung_since`, `time.time`).
     """
-    if alone_since is not None:
-        stamp = f"http-request set-header {STAMP} {alone_since * 1e3:.0f}-{clock()}"
+    if hung_since is not None:
+        stamp = f"http-request set-header {STAMP} {hung_since * 1e3:.0f}-{clock()}"
         until = f"if {{ date(0,ms) -m int lt {time.time() * 1e3 + SETTLE_MS:.0f} }}"
         text = re.sub(rf"^( *)http-request set-header {STAMP} .*$", rf"\g<0>\n\1{stamp} {until}", text, flags=re.M)
     text = re.sub(r"^ *stats (?:socket|timeout) .*\n", "", text, flags=re.MULTILINE)
@@ -290,15 +290,15 @@ def _watch(binary: str, file: Path, note: Path, listeners: list[str]) -> None:
     holder = _Holder(file, listeners)
     try:
         os.close(write_end)
-        ran = _wait(read_end, proxy, file, holder)
-        _bridge(binary, file, note, raylet, holder, listeners, ran)
+        hung = _wait(read_end, proxy, file, holder)
+        _bridge(binary, file, note, raylet, holder, listeners, hung)
     finally:
         holder.close()
         os._exit(0)
 
 
-def _wait(read_end: int, proxy: int, file: Path, holder: _Holder) -> float:
-    """Wait for HAProxy's end, which is brought about where it hangs; return when it last ran (`time.time`)."""
+def _wait(read_end: int, proxy: int, file: Path, holder: _Holder) -> float | None:
+    """Wait for HAProxy's end, which is brought about where it hangs; then return since when it did (`time.time`)."""
     ran, hung_s, confirmed, looked = time.time(), 0.0, False, 0.0
     while True:
         waiting = [read_end] if holder.socket is None else [read_end, holder.socket]
@@ -307,7 +307,7 @@ def _wait(read_end: int, proxy: int, file: Path, holder: _Holder) -> float:
             holder.give()
         if read_end in ready:
             if not (content := os.read(read_end, 65536)):
-                return ran if hung_s else time.time()
+                return ran if hung_s else None
             os.write(1, content)
         if time.monotonic() - looked < 0.4:
             continue
@@ -355,7 +355,7 @@ def _answering(file: Path) -> int:
 
 
 def _bridge(
-    binary: str, file: Path, note: Path, raylet: int, holder: _Holder, listeners: list[str], ran: float
+    binary: str, file: Path, note: Path, raylet: int, holder: _Holder, listeners: list[str], hung: float | None
 ) -> None:
     """Stand in for a HAProxy that has ended, unless another one is there already or Serve has ended, too."""
     if _answering(file) or not listeners or not _controller(raylet):
@@ -367,26 +367,32 @@ def _bridge(
         return
     old = set(_running(binary, file))  # replaced earlier, and busy with what they still carry
     copy = file.with_name(BRIDGE)
-    copy.write_text(bridging(file.read_text(), alone_since=ran))
-    process = subprocess.Popen(
-        [binary, "-db", "-f", str(copy)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        pass_fds=range(FIRST_FD, FIRST_FD + len(listeners)),
-    )
-    note.write_text(str(process.pid))
-    controlled = time.monotonic()
-    while process.poll() is None:
+    copy.write_text(bridging(file.read_text(), hung_since=hung))
+
+    def start() -> subprocess.Popen[bytes]:
+        inherited = range(FIRST_FD, FIRST_FD + len(listeners))
+        command, nowhere = [binary, "-db", "-f", str(copy)], subprocess.DEVNULL
+        started = subprocess.Popen(command, stdout=nowhere, stderr=nowhere, pass_fds=inherited)
+        note.write_text(str(started.pid))
+        return started
+
+    process, controlled = start(), time.monotonic()
+    while process.poll() is None or process.returncode < 0:
+        if process.returncode is not None:  # killed, as the one before it
+            process = start()
         now = time.monotonic()
         if _controller(raylet):
             controlled = now
         if now - controlled > ORPHAN_S or not _is_there(raylet):
             process.kill()
-        elif set(_running(binary, file)) - old and KNOWS_REPLICAS.search(file.read_text()):
+            process.wait()
+            break
+        if set(_running(binary, file)) - old and KNOWS_REPLICAS.search(file.read_text()):
             time.sleep(1.0)  # it listens by then
             note.unlink(missing_ok=True)
             process.send_signal(signal.SIGUSR1)  # answers what it has, and ends
             process.wait()
+            break
         if holder.socket is None:
             time.sleep(LOOK_S)
         elif select.select([holder.socket], [], [], LOOK_S)[0]:
