@@ -50,6 +50,7 @@ ACTING = "{ path_end /act /infer /ModelInfer }"
 REQUEST_TIMEOUT_S = 5  # for a request's head, and a body that fits the proxy's buffer
 CONNECT_TIMEOUT_MS = 250
 SCRIPT, ERROR_FILE, LATE_FILE, SLOW_FILE, BRIDGE = "haproxy", "503.http", "408.http", "504.http", "bridge.cfg"
+KNOWN = "known.cfg"  # the last configuration that knew replicas
 FIRST_FD = 40  # of the listening sockets in every process that has them: configurations name them by number
 BACKLOG = 4096
 HOLDER = "l."  # and the watcher's process id: where it gives the sockets away, beside the configuration
@@ -97,11 +98,8 @@ def find_binary() -> str | None:
         return shutil.which("haproxy")
 
 
-def mend(text: str, error_file: Path, *, bridged: bool = False) -> str:
-    """Return Ray's configuration with its faults mended.
-
-    `bridged`: a bridge is listening, and goes on until this one knows its replicas.
-    """
+def mend(text: str, error_file: Path) -> str:
+    """Return Ray's configuration with its faults mended."""
     text = re.sub(r"^(frontend prometheus\n +bind )(:\d+)$", r"\g<1>127.0.0.1\2", text, flags=re.MULTILINE)
     text = re.sub(r"^(listen stats\n +bind )\*(:\d+)$", r"\g<1>127.0.0.1\2", text, flags=re.MULTILINE)
     text = re.sub(r"^( *errorfile 50[23]) .*$", rf"\1 {error_file}", text, flags=re.MULTILINE)
@@ -118,10 +116,7 @@ def mend(text: str, error_file: Path, *, bridged: bool = False) -> str:
         return text
     # Not yet, or no more: 404 would say that there is no such policy.
     text = NOT_FOUND.sub(r"\1 status 503 default-errorfiles", text)
-    text = GRPC_NOT_FOUND.sub(r'\g<1>14\2 "no replica is there yet"', text)
-    if bridged:
-        text = FRONTENDS.sub(lambda found: re.sub(r"^ +bind .*\n", "", found[0], flags=re.MULTILINE), text)
-    return text
+    return GRPC_NOT_FOUND.sub(r'\g<1>14\2 "no replica is there yet"', text)
 
 
 def _leave_hung_replicas(text: str) -> str:
@@ -164,13 +159,20 @@ def main(folder: str, binary: str, *arguments: str) -> NoReturn:
     """Become HAProxy with a mended configuration, and leave a process behind that watches it."""
     if "-f" in arguments:
         file = Path(arguments[arguments.index("-f") + 1])
-        note = file.with_name("bridge.pid")
+        known = file.with_name(KNOWN)
         _write_answers(Path(folder))  # it may have been prepared by an earlier version
         text = file.read_text()
-        listeners = _listeners(file, text)
-        text = mend(text, Path(folder) / ERROR_FILE, bridged=_is_running(note, binary))
-        file.write_text(inheriting(text, listeners))
-        _watch(binary, file, note, listeners)
+        listeners, kept = _listeners(file, text)
+        text = inheriting(mend(text, Path(folder) / ERROR_FILE), listeners)
+        if KNOWS_REPLICAS.search(text):
+            known.write_text(text)
+        elif kept and "-sf" not in arguments and known.exists():
+            # The first HAProxy of an actor that has taken another's place, and has not yet heard of any replica.
+            text = known.read_text()
+        else:
+            known.unlink(missing_ok=True)
+        file.write_text(text)
+        _watch(binary, file, listeners)
     os.execv(binary, [binary, *arguments])
 
 
@@ -189,8 +191,8 @@ def inheriting(text: str, listeners: list[str]) -> str:
     return text
 
 
-def _listeners(file: Path, text: str) -> list[str]:
-    """Have the frontends' listening sockets, at `FIRST_FD` and up; return their addresses.
+def _listeners(file: Path, text: str) -> tuple[list[str], bool]:
+    """Have the frontends' listening sockets, at `FIRST_FD` and up; return (their addresses, whether they were kept).
 
     Those that a watcher keeps; where it has none for us, new ones. None where they cannot be had: then HAProxy binds.
     """
@@ -208,10 +210,10 @@ def _listeners(file: Path, text: str) -> list[str]:
     try:
         found = [kept[address] if address in kept else _open(address) for address in addresses]
     except OSError:
-        return []
+        return [], False
     for number, descriptor in enumerate(found, FIRST_FD):
         os.dup2(descriptor, number, inheritable=True)
-    return addresses
+    return addresses, all(address in kept for address in addresses)
 
 
 def _open(address: str) -> int:
@@ -274,7 +276,7 @@ class _Holder:
 # The watcher
 
 
-def _watch(binary: str, file: Path, note: Path, listeners: list[str]) -> None:
+def _watch(binary: str, file: Path, listeners: list[str]) -> None:
     """Leave a process that sees this one's end: HAProxy's standard output is a pipe, which ends with it."""
     raylet, proxy = _parent(os.getppid()), os.getpid()
     read_end, write_end = os.pipe()
@@ -291,7 +293,7 @@ def _watch(binary: str, file: Path, note: Path, listeners: list[str]) -> None:
     try:
         os.close(write_end)
         hung = _wait(read_end, proxy, file, holder)
-        _bridge(binary, file, note, raylet, holder, listeners, hung)
+        _bridge(binary, file, raylet, holder, listeners, hung)
     finally:
         holder.close()
         os._exit(0)
@@ -354,9 +356,7 @@ def _answering(file: Path) -> int:
     return int(fields.get("Pid", 0)) if fields.get("Stopping", "0") == "0" else 0
 
 
-def _bridge(
-    binary: str, file: Path, note: Path, raylet: int, holder: _Holder, listeners: list[str], hung: float | None
-) -> None:
+def _bridge(binary: str, file: Path, raylet: int, holder: _Holder, listeners: list[str], hung: float | None) -> None:
     """Stand in for a HAProxy that has ended, unless another one is there already or Serve has ended, too."""
     if _answering(file) or not listeners or not _controller(raylet):
         return
@@ -367,14 +367,13 @@ def _bridge(
         return
     old = set(_running(binary, file))  # replaced earlier, and busy with what they still carry
     copy = file.with_name(BRIDGE)
-    copy.write_text(bridging(file.read_text(), hung_since=hung))
+    known = file.with_name(KNOWN)
+    copy.write_text(bridging((known if known.exists() else file).read_text(), hung_since=hung))
 
     def start() -> subprocess.Popen[bytes]:
         inherited = range(FIRST_FD, FIRST_FD + len(listeners))
         command, nowhere = [binary, "-db", "-f", str(copy)], subprocess.DEVNULL
-        started = subprocess.Popen(command, stdout=nowhere, stderr=nowhere, pass_fds=inherited)
-        note.write_text(str(started.pid))
-        return started
+        return subprocess.Popen(command, stdout=nowhere, stderr=nowhere, pass_fds=inherited)
 
     process, controlled = start(), time.monotonic()
     while process.poll() is None or process.returncode < 0:
@@ -389,7 +388,6 @@ def _bridge(
             break
         if set(_running(binary, file)) - old and KNOWS_REPLICAS.search(file.read_text()):
             time.sleep(1.0)  # it listens by then
-            note.unlink(missing_ok=True)
             process.send_signal(signal.SIGUSR1)  # answers what it has, and ends
             process.wait()
             break
@@ -397,19 +395,11 @@ def _bridge(
             time.sleep(LOOK_S)
         elif select.select([holder.socket], [], [], LOOK_S)[0]:
             holder.give()
-    note.unlink(missing_ok=True)
 
 
 def _running(binary: str, file: Path) -> list[int]:
     """Return the HAProxies that run with this configuration."""
     return [pid for pid in _pids() if _runs(pid, binary, file)]
-
-
-def _is_running(note: Path, binary: str) -> bool:
-    """Whether a bridge runs."""
-    with contextlib.suppress(OSError, ValueError):
-        return _runs(int(note.read_text()), binary, note.with_name(BRIDGE))
-    return False
 
 
 def _runs(pid: int, binary: str, file: Path) -> bool:
