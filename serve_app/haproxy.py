@@ -45,7 +45,7 @@ from typing import NoReturn
 
 STAMP = "x-rlservo-received"  # [ms since 1970] when HAProxy had the request, and on which machine's clock
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # the same in two processes that read the same clock
-ACTION_TIMEOUT_S = 10  # for a replica's answer to a request for actions: policies take milliseconds
+ACTION_TIMEOUT_S = 5  # for a replica's answer to a request for actions: policies take milliseconds
 ACTING = "{ path_end /act /infer /ModelInfer }"
 REQUEST_TIMEOUT_S = 5  # for a request's head, and a body that fits the proxy's buffer
 CONNECT_TIMEOUT_MS = 250
@@ -55,7 +55,7 @@ FIRST_FD = 40  # of the listening sockets in every process that has them: config
 BACKLOG = 4096
 HOLDER = "l."  # and the watcher's process id: where it gives the sockets away, beside the configuration
 # A HAProxy whose admin socket says nothing for so long hangs.
-PROBE_S, PROBE_WAITS, HUNG_S, HANGS = 0.1, 5, 2.0, -1
+PROBE_S, PROBE_WAITS, HUNG_S, HANGS = 0.1, 5, 1.5, -1
 SETTLE_MS = 1000  # in which a bridge takes what had waited for it
 UNREACHABLE = b'{"error":"no replica of the policy server can be reached: try again shortly","code":"unavailable"}'
 LATE = b'{"error":"the request did not arrive within %d s","code":"deadline-passed"}' % REQUEST_TIMEOUT_S
@@ -301,7 +301,7 @@ def _watch(binary: str, file: Path, listeners: list[str]) -> None:
 
 def _wait(read_end: int, proxy: int, file: Path, holder: _Holder) -> float | None:
     """Wait for HAProxy's end, which is brought about where it hangs; then return since when it did (`time.time`)."""
-    ran, hung_s, confirmed, looked = time.time(), 0.0, False, 0.0
+    ran, hung_s, patience_s, looked = time.time(), 0.0, 3 * HUNG_S, 0.0  # longer for one that is starting
     while True:
         waiting = [read_end] if holder.socket is None else [read_end, holder.socket]
         ready, _, _ = select.select(waiting, [], [], 0.5)
@@ -316,12 +316,12 @@ def _wait(read_end: int, proxy: int, file: Path, holder: _Holder) -> float | Non
         looked = time.monotonic()
         answering = _answering(file)
         if answering == proxy:
-            ran, hung_s, confirmed = time.time(), 0.0, True
+            ran, hung_s, patience_s = time.time(), 0.0, HUNG_S
         elif answering > 0:  # it has been replaced, and may take as long as it likes
-            confirmed = False
-        elif answering == HANGS and confirmed:
+            patience_s = float("inf")
+        elif answering == HANGS:
             hung_s += PROBE_WAITS * PROBE_S
-            if hung_s >= HUNG_S and _is_there(proxy):
+            if hung_s >= patience_s and _is_there(proxy):
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(proxy, signal.SIGKILL)
 

@@ -498,7 +498,7 @@ def test_a_replica_that_takes_too_long_is_not_waited_for(node: Node) -> None:
     # The script runs in a process of its own: the file it was is given a shorter time.
     script = node.folder / "haproxy_with_a_second.py"
     source = Path(haproxy.__file__).read_text()
-    script.write_text(source.replace("ACTION_TIMEOUT_S = 10", "ACTION_TIMEOUT_S = 1"))
+    script.write_text(source.replace(f"ACTION_TIMEOUT_S = {haproxy.ACTION_TIMEOUT_S}", "ACTION_TIMEOUT_S = 1"))
     node.script.write_text(node.script.read_text().replace(str(Path(haproxy.__file__).resolve()), str(script)))
     node.proxy(FULL)
     until(lambda: node.ask()[0] == 200)
