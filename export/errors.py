@@ -24,6 +24,7 @@ handler in `deploy/cli.py` maps them to exit codes.
     │   └── SessionLostError      session-lost             the server has no such session (any more)
     ├── UnavailableError          unavailable              not ready, or the server cannot be reached
     │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
+    │   ├── LateError             late                     the observation waited too long: send a newer one
     │   └── PartlyAppliedError    partly-applied           a change that some replicas could not follow
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
 """
@@ -152,6 +153,12 @@ class OverloadedError(UnavailableError):
     """The server has as much work as it takes on; nothing was computed."""
 
     code = "over-capacity"
+
+
+class LateError(UnavailableError):
+    """The observation waited longer than the server answers as fresh; nothing was computed."""
+
+    code = "late"
 
 
 class PartlyAppliedError(UnavailableError):

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rlservo.export.errors import DeadlineError, OverloadedError
+from rlservo.serve_app.age import Age
 
 HURRY_S = 0.05  # [s] for a body when too many are half sent
 
@@ -26,6 +27,7 @@ class Admission:
         """Set the limits: of a burst, of the wait in it, of bodies half sent, of streams."""
         self._max_queued = max_queued
         self._max_queue_s = max_queue_ms / 1e3
+        self.age = Age(self._max_queue_s)
         self._max_incoming = max_incoming
         self._max_streams = max_streams
         self._burst = 0
@@ -35,8 +37,12 @@ class Admission:
         self.longest = 0  # the longest burst so far
         self.turned_away = 0  # before anybody looked at them
 
-    def enter(self) -> float:
-        """Return when this request had arrived at the latest (`time.perf_counter`). Raises OverloadedError."""
+    def enter(self, waited: float | None = None) -> float:
+        """Return when this request had arrived at the latest (`time.perf_counter`).
+
+        `waited` is how long it did before, where that is known. Raises OverloadedError or LateError.
+        """
+        self.age.check(waited)
         now = time.perf_counter()
         if self._burst == 0:
             self._burst_began = now

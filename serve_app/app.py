@@ -100,7 +100,11 @@ def _serve_limit(settings: ServerSettings) -> int:
     ray_actor_options={"num_cpus": 0.1},
     # A line per request costs more than the policy; below this level Serve makes one all the same and drops it (5%).
     logging_config={"enable_access_log": False, "log_level": "WARNING"},
-    health_check_period_s=5,
+    # A replica that hangs is gone after three checks in vain, 8 s at most; Serve's own 30 s a check would be minutes.
+    # HAProxy leaves it alone before that, after two of its own (`haproxy.py`). It has no end in order:
+    # RAY_SERVE_FORCE_STOP_UNHEALTHY_REPLICAS.
+    health_check_period_s=1,
+    health_check_timeout_s=2,
     graceful_shutdown_timeout_s=15,  # streams are closed with a code at its beginning, and cut at its end
     user_config={},
     **SURGE,
@@ -154,6 +158,7 @@ class PolicyServer(InferenceService):
         )
         core: Core = app.state.core
         self._core = core
+        core.admission.age.watch()
         # By way of the module: Serve pickles this class with copies of the objects that it names.
         ahead = self._settings.ahead_of_serve and _can_be_left_out()
         ingress.door.open(app, core.admission.is_open, ahead=ahead)

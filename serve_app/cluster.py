@@ -18,8 +18,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rlservo.serve_app.processes import end_marked, remove_folder
+from rlservo.serve_app.operator_key import remove_key
+from rlservo.serve_app.processes import describe_end, end_marked, remove_folder
 
+LOOK_S = 0.5  # between looks at whether Ray's own processes live
 ORDERLY_END_S = 25.0  # [s] less than the launcher waits
 OBJECT_STORE_BYTES = 80 << 20  # Ray's least is 75 MiB; requests do not go through it
 
@@ -63,7 +65,11 @@ def main() -> int:
         raise
     started.set()
     _report(plan, {"ready": True})
-    stop.wait()
+    while not stop.wait(LOOK_S):
+        if (cause := _ray_ended()) is not None:
+            _report(plan, {"died": cause})
+            _leave_nothing(plan)
+            return 1
     app.stop()
     ray.shutdown()
     _leave_nothing(plan)
@@ -93,6 +99,19 @@ def _leave_out_extras() -> None:
         services.start_api_server = _no_api_server
 
 
+def _ray_ended() -> str | None:
+    """Return which process without which nothing is served has ended, and how; None while all of them live.
+
+    Ray (2.60) leaves the driver of a cluster whose raylet is gone waiting for ever.
+    """
+    from ray._private import worker
+
+    node: Any = worker._global_node
+    for name, process in [] if node is None else node.dead_processes():
+        return f"its process '{name}' {describe_end(process.poll())}"
+    return None
+
+
 def _no_api_server(*_: Any, **__: Any) -> tuple[str, None]:
     """Return the address and the process of a dashboard that is not there."""
     return "", None
@@ -110,7 +129,9 @@ def _watch_input(stop: threading.Event, started: threading.Event, plan: dict[str
 
 
 def _leave_nothing(plan: dict[str, Any]) -> None:
-    """End what is left and remove the folder. The launcher does the same, unless it was killed."""
+    """End what is left, remove the folder and the key's file. The launcher does the same, unless it was killed."""
+    if plan["key_file"] is not None:
+        remove_key(Path(plan["key_file"]), plan["settings"]["operator_key"])
     end_marked(plan["mark"], os.getsid(0))
     remove_folder(Path(plan["folder"]))
 

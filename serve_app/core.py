@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 
 from rlservo.export.bundle import DictSpec, SpaceSpec, TupleSpec
-from rlservo.export.errors import DeadlineError, RlservoError, TooLargeError, UnavailableError, UnknownPolicyError
+from rlservo.export.errors import (
+    DeadlineError,
+    LateError,
+    RlservoError,
+    TooLargeError,
+    UnavailableError,
+    UnknownPolicyError,
+)
 from rlservo.serve_app.admission import Admission
 from rlservo.serve_app.control import Control
 from rlservo.serve_app.episodes import Episode, Episodes
@@ -116,7 +123,7 @@ class Core:
         `episode` is what the request says of its episode, `stream` the session of the stream it came on. All requests
         of a `session` get the same version where a canary runs.
 
-        Raises DeadlineError, TooLargeError, UnavailableError and what `PolicyStore.act` raises.
+        Raises DeadlineError, LateError, TooLargeError, UnavailableError and what `PolicyStore.act` raises.
         """
         store = self.store()
         in_time = None if deadline_ms is None else partial(_check_deadline, deadline_ms, received, seq)
@@ -129,7 +136,8 @@ class Core:
                 raise TooLargeError(f"a batch of {rows} observations is too large: at most {self.settings.max_batch}")
         if episode is None and stream is None:
             if store.batches and not explore:
-                decision = await store.act_together(name, version, obs, session=session, check=in_time)
+                check = partial(_check_wait, time.perf_counter(), self.admission.age.limit_s, in_time)
+                decision = await store.act_together(name, version, obs, session=session, check=check)
             else:
                 decision = store.act(name, version, obs, explore=explore, seed=seed, session=session)
         else:
@@ -184,6 +192,14 @@ class Core:
 
 
 NO_EPISODE = Episode()
+
+
+def _check_wait(since: float, limit_s: float, in_time: Callable[[], None] | None) -> None:
+    """Look again at an observation that was gathered for a batch, and waited for those before it."""
+    if time.perf_counter() - since > limit_s:
+        raise LateError(f"the observation waited longer than {limit_s * 1e3:g} ms for its batch: send a newer one")
+    if in_time is not None:
+        in_time()
 
 
 def _check_deadline(deadline_ms: float, received: float, seq: int | None) -> None:

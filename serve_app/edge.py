@@ -35,6 +35,7 @@ from rlservo.export.errors import (
     UnknownPolicyError,
 )
 from rlservo.serve_app import wire
+from rlservo.serve_app.age import LEAST_S
 from rlservo.serve_app.core import Core
 from rlservo.serve_app.keys import Access
 from rlservo.serve_app.logs import FIELDS
@@ -85,10 +86,13 @@ class Endpoint:
         started = time.perf_counter()
         try:
             self._check_headers(scope["headers"])
+            waited = admission.age.waited(scope["headers"])
             body = await receive_body(self._core, scope, receive)
             if body is None:  # the client has gone
                 return
-            received = min(started, admission.enter())  # only now: a body that is slow to come waits for itself
+            received = min(started, admission.enter(waited))  # only now: a body that is slow to come waits for itself
+            if waited is not None and waited > LEAST_S:
+                received -= waited
             content, headers, decision = await self._handle(scope, body, received)
             status = 200
             taken, batch = time.perf_counter() - received, decision.batch or 1

@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import queue
+import re
 import secrets
 import signal
 import subprocess
@@ -30,13 +31,27 @@ from rlservo.serve_app.keys import Role, check_exposure, is_loopback
 from rlservo.serve_app.library import load_served
 from rlservo.serve_app.operator_key import operator_key
 from rlservo.serve_app.plan import ServedConfig
-from rlservo.serve_app.processes import MARK, check_port, end_marked, free_ports, is_free, remove_folder
+from rlservo.serve_app.processes import (
+    MARK,
+    check_port,
+    describe_end,
+    end_marked,
+    free_ports,
+    is_free,
+    remove_folder,
+)
 from rlservo.serve_app.settings import ServerSettings
 
 logger = logging.getLogger(__name__)
 
 START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 30.0
+ENDED_S = 5.0  # from the end of a process's reports to its own
+# In Python's and Ray's logs: a level, an exception's last line, what a raylet's end is told as.
+FAULT = re.compile(
+    r"^(?:\[.*\] *)?(?:ERROR|CRITICAL|FATAL)\b|^\w[\w.]*(?:Error|Exception)\b|\bC? *Check failed\b|terminated\b"
+)
+COLOURS = re.compile(r"\x1b\[[\d;]*m")
 MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
@@ -119,6 +134,7 @@ def serve_policies(
                 "port": port,
                 "grpc_port": grpc_port,
                 "replicas": replicas,
+                "key_file": None if key_file is None else str(key_file.absolute()),
                 "served": dict(served or {}),
                 "settings": {**chosen.model_dump(), **({"operator_key": digest} if digest else {})},
             },
@@ -127,13 +143,14 @@ def serve_policies(
             events,
         ) as child,
     ):
-        _wait_ready(folder, events)
+        _wait_ready(child, folder, events)
         if on_ready is not None:
             grpc = None if grpc_port is None else f"{_shown_host(host)}:{grpc_port}"
             on_ready(Served(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc, key_file))
         event = events.get()
         if isinstance(event, Mapping):
-            raise UnavailableError(f"the server ended by itself: {_log_tail(folder)}")
+            cause = event.get("died") or _cause_of_end(child, folder)
+            raise UnavailableError(f"the server ended by itself: {cause}")
         if event == STOP:
             _end_in_order(child, events)
 
@@ -150,17 +167,19 @@ def _operator_key(file: Path | None) -> Iterator[tuple[Path | None, str]]:
         yield (file if digest else None), digest
 
 
-def _wait_ready(folder: Path, events: queue.SimpleQueue[Any]) -> None:
+def _wait_ready(child: subprocess.Popen[bytes], folder: Path, events: queue.SimpleQueue[Any]) -> None:
     try:
         event = events.get(timeout=START_TIMEOUT_S)
     except queue.Empty:
-        raise UnavailableError(f"the server was not ready within {START_TIMEOUT_S:g} s: {_log_tail(folder)}") from None
+        raise UnavailableError(
+            f"the server was not ready within {START_TIMEOUT_S:g} s: {_last_fault(folder)}"
+        ) from None
     if event in (STOP, STOP_NOW):
         raise KeyboardInterrupt
     if "error" in event:
         raise UnavailableError(f"the server could not start: {event['error']}")
     if "ready" not in event:
-        raise UnavailableError(f"the server ended while it was starting: {_log_tail(folder)}")
+        raise UnavailableError(f"the server ended while it was starting: {_cause_of_end(child, folder)}")
 
 
 def _end_in_order(child: subprocess.Popen[bytes], events: queue.SimpleQueue[Any]) -> None:
@@ -304,6 +323,8 @@ def ray_environment(
             **_replica_ports(port),
             # A busy or small computer needs longer than Serve's 5 s to start a proxy, and Serve kills one that does.
             "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
+            # A replica that hangs does not end in order, so Serve need not wait for that.
+            "RAY_SERVE_FORCE_STOP_UNHEALTHY_REPLICAS": "1",
             # Requests take microseconds: replicas need not wait half a minute for stragglers when the server stops.
             "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "0",
         }
@@ -327,6 +348,7 @@ def ray_environment(
             "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
             "RAY_SERVE_PORT_QUARANTINE_S": "150",
             "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "2",  # three looks in vain, and a dead proxy is replaced
+            "RAY_SERVE_HAPROXY_HEALTH_CHECK_INTER": "1s",  # and as long for the answer; after two in vain it is left
             "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # Ray's hour would keep a half-sent request for as long
             "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
             "RAY_SERVE_HAPROXY_BINARY_PATH": str(haproxy_script.prepare(folder, haproxy)),
@@ -386,9 +408,18 @@ def _shown_host(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def _log_tail(folder: Path) -> str:
+def _cause_of_end(child: subprocess.Popen[bytes], folder: Path) -> str:
+    """Return how the cluster's process ended, with the last fault in its log, if there is one."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        child.wait(ENDED_S)
+    return f"its main process {describe_end(child.poll())}; {_last_fault(folder)}"
+
+
+def _last_fault(folder: Path) -> str:
+    """Return the last line of the log that tells of a fault; most lines tell of what went well."""
     with contextlib.suppress(OSError):
-        lines = (folder / "server.log").read_text(errors="replace").strip().splitlines()
-        if lines:
-            return lines[-1][:500]
-    return "it left no message"
+        lines = (folder / "server.log").read_text(errors="replace").splitlines()
+        faults = [line.strip() for line in lines if FAULT.search(line)]
+        if faults:
+            return f"its log says: {COLOURS.sub('', faults[-1])[:500]}"
+    return "its log tells of no fault"

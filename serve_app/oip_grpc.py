@@ -131,11 +131,11 @@ class Grpc:
     async def answer(self, method: str, request: Incoming, context: Any) -> Any:
         """Return the reply to one call. An error sets the status, and the empty reply is not looked at."""
         try:
-            request_id, session = self._check(method, context)
+            request_id, session, waited = self._check(method, context)
             if request_id is not None:
                 context.set_trailing_metadata([(REQUEST_ID, request_id)])  # in addition to Serve's own
             if method == "ModelInfer":
-                return await self._infer(request, request_id, session)
+                return await self._infer(request, request_id, session, waited)
             return self._methods[method](request)
         except Exception as error:
             _fail(context, error)
@@ -149,7 +149,7 @@ class Grpc:
         idle_s = self._core.settings.stream_idle_s
         key_changes = self._core.keys.changes
         try:
-            request_id, session = self._check("ModelStreamInfer", context)
+            request_id, session, _ = self._check("ModelStreamInfer", context)
             session = session or secrets.token_hex(8)  # all of a stream is one version's where a canary runs
             counted = self._core.admission.streaming()
             counted.__enter__()
@@ -186,8 +186,11 @@ class Grpc:
             counted.__exit__(None, None, None)
             self._core.metrics.stream("", -1)
 
-    def _check(self, method: str, context: Any) -> tuple[str | None, str | None]:
-        """Return the caller's (request id, session), where given. Raises ForbiddenError or UnauthenticatedError."""
+    def _check(self, method: str, context: Any) -> tuple[str | None, str | None, float | None]:
+        """Return the caller's (request id, session), where given, and how long the call has waited, where known.
+
+        Raises ForbiddenError or UnauthenticatedError.
+        """
         if self._local_only and not is_local(context.peer()):
             raise ForbiddenError(
                 "this server listens on this machine only: serve it with --host to reach it from others"
@@ -200,7 +203,7 @@ class Grpc:
         except RlservoError as error:
             self._core.kept_out(PROTOCOL, error, given.get(REQUEST_ID), peer=_caller(context.peer(), metadata))
             raise
-        return given.get(REQUEST_ID), given.get(SESSION)
+        return given.get(REQUEST_ID), given.get(SESSION), self._core.admission.age.waited(headers)
 
     def _model_ready(self, request: Incoming) -> Any:
         asked = _parse(messages.ModelReadyRequest, request[0])
@@ -224,11 +227,13 @@ class Grpc:
         asked = _parse(messages.RepositoryIndexRequest, request[0])
         return messages.RepositoryIndexResponse(models=oip.repository_index(self._core, ready=asked.ready))
 
-    async def _infer(self, request: Incoming, request_id: str | None, session: str | None) -> Any:
+    async def _infer(
+        self, request: Incoming, request_id: str | None, session: str | None, waited: float | None = None
+    ) -> Any:
         content, remaining_s = request
         name, version = "", None
         try:
-            received = self._core.admission.enter()
+            received = self._core.admission.enter(waited)
             if len(content) > self._core.settings.max_body_bytes:
                 limit = self._core.settings.max_body_bytes
                 raise TooLargeError(f"the message is larger than {limit} bytes", {"max_bytes": limit})

@@ -38,11 +38,21 @@ def operator_key(file: Path) -> Iterator[str]:
     try:
         with os.fdopen(descriptor, "w") as stream:
             stream.write(key + "\n")
-        yield f"sha256:{hashlib.sha256(key.encode()).hexdigest()}"
+        yield digest_of(key)
     finally:
-        with contextlib.suppress(OSError):
-            if file.read_text().strip() == key:  # and not of a server that came after us
-                file.unlink()
+        remove_key(file, digest_of(key))
+
+
+def digest_of(key: str) -> str:
+    """Return `sha256:<hash>` of a key."""
+    return f"sha256:{hashlib.sha256(key.encode()).hexdigest()}"
+
+
+def remove_key(file: Path, digest: str) -> None:
+    """Remove the key file of the server whose key has this digest; one of a server that came after it stays."""
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        if digest_of(file.read_text(encoding="ascii").strip()) == digest:
+            file.unlink()
 
 
 def read_key(file: Path) -> str:

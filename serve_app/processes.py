@@ -166,6 +166,17 @@ def end_marked(mark: str, session: int | None = None, *, timeout_s: float = 10.0
     return marked(mark, session)
 
 
+def describe_end(returncode: int | None) -> str:
+    """Return how a process ended, as the end of a sentence about it; negative is a signal, as `subprocess` has it."""
+    if returncode is None:
+        return "ended"
+    if returncode >= 0:
+        return f"ended with exit status {returncode}"
+    with contextlib.suppress(ValueError):
+        return f"was ended by {signal.Signals(-returncode).name}"
+    return f"was ended by signal {-returncode}"
+
+
 def remove_folder(folder: Path, *, timeout_s: float = 5.0) -> None:
     """Remove a folder that processes just ended, or another cleaner, may be touching a last time."""
     deadline = time.monotonic() + timeout_s

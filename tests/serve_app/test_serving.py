@@ -37,10 +37,15 @@ SPOOR = "RLSERVO_TEST"  # inherited by every process a test starts, however far 
 
 # Runs the launcher in a process's main thread, as the command line does, and tells when it is ready.
 LAUNCH = """
-import json, sys
+import json, pathlib, sys
 from rlservo.serve_app.launcher import serve_policies
 plan = json.loads(sys.argv[1])
-serve_policies(plan["dirs"], port=plan["port"], on_ready=lambda served: print("READY", served.url, flush=True))
+serve_policies(
+    plan["dirs"],
+    port=plan["port"],
+    admin_key_file=pathlib.Path(plan["key_file"]),
+    on_ready=lambda served: print("READY", served.url, flush=True),
+)
 print("ENDED", flush=True)
 """
 
@@ -50,6 +55,7 @@ class Run:
     process: subprocess.Popen[str]
     port: int
     spoor: str
+    key_file: Path | None = None
 
     def wait_until_ready(self) -> None:
         """Wait for the launcher's own word."""
@@ -67,6 +73,7 @@ class Run:
         while (left := self.left() + (own_folders(self.spoor) if folders else [])) and time.monotonic() < deadline:
             time.sleep(0.1)
         assert left == []
+        assert self.key_file is None or not self.key_file.exists()
         assert port_holder(self.port) is None
         check_port("127.0.0.1", self.port)
 
@@ -118,9 +125,11 @@ def running(arguments: list[str], port: int, **environment: str) -> Iterator[Run
 @contextlib.contextmanager
 def launched(policies: Path, *, prefix: tuple[str, ...] = (), **environment: str) -> Iterator[Run]:
     (port,) = free_ports(1)
-    plan = json.dumps({"dirs": [str(policies)], "port": port})
-    with running([*prefix, sys.executable, "-c", LAUNCH, plan], port, **environment) as run:
-        yield run
+    with tempfile.TemporaryDirectory() as keys:
+        plan = json.dumps({"dirs": [str(policies)], "port": port, "key_file": f"{keys}/admin.key"})
+        with running([*prefix, sys.executable, "-c", LAUNCH, plan], port, **environment) as run:
+            run.key_file = Path(keys, "admin.key")
+            yield run
 
 
 def ask(port: int, method: str, path: str, body: Any = None) -> tuple[int, Any]:
@@ -246,6 +255,7 @@ def test_a_running_server_leaves_nothing_however_it_is_ended(policies: Path, sig
     with launched(policies) as run:
         run.wait_until_ready()
         assert ask(run.port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[0] == 200
+        assert run.key_file is not None and run.key_file.exists()
         for number in signals:
             run.process.send_signal(number)
             time.sleep(0.3)
