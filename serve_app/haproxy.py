@@ -41,7 +41,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 STAMP = "x-rlservo-received"  # [ms since 1970] when HAProxy had the request, and on which machine's clock
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # the same in two processes that read the same clock
@@ -305,7 +305,7 @@ def _wait(read_end: int, proxy: int, file: Path, holder: _Holder) -> float | Non
     """Wait for HAProxy's end, which is brought about where it hangs; then return since when it did (`time.time`)."""
     ran, hung_s, patience_s, looked = time.time(), 0.0, 3 * HUNG_S, 0.0  # longer for one that is starting
     while True:
-        waiting = [read_end] if holder.socket is None else [read_end, holder.socket]
+        waiting: list[Any] = [read_end] if holder.socket is None else [read_end, holder.socket]
         ready, _, _ = select.select(waiting, [], [], 0.5)
         if holder.socket in ready:
             holder.give()

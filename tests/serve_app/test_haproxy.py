@@ -123,12 +123,16 @@ class Node:
                 os.kill(self.first_controller, signal.SIGKILL)  # a killed raylet's is nobody's child
         self.raylet.kill()
         self.raylet.communicate()
-        for _ in range(2):  # the bridges of what is killed here see that the raylet is gone
-            for pid in (*self.proxies(), *self.bridges()):
+        quiet = 0
+        deadline = time.monotonic() + 20
+        while quiet < 5:  # looks in a row: the bridges of what is killed here see that the raylet is gone
+            assert time.monotonic() < deadline
+            left = (*self.proxies(), *self.bridges())
+            quiet = 0 if left else quiet + 1
+            for pid in left:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
-            time.sleep(0.3)
-        assert not self.proxies() and not self.bridges()
+            time.sleep(0.1)
 
 
 class Replica(BaseHTTPRequestHandler):
