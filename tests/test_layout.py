@@ -67,6 +67,7 @@ def test_module_imports_only_what_the_design_allows(path: Path) -> None:
         "serve_app": {
             "rlservo.serve_app",
             "rlservo.export.errors",
+            "rlservo.export.regular_files",
             "rlservo.export.bundle",
             "rlservo.export.scores",
             "rlservo.export.session",
