@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import ray_settings  # before Ray  # isort: skip
 import ray
@@ -55,7 +56,7 @@ def request_of(config: AlgorithmConfig) -> list[dict[str, float]]:
     Raises UsageError for amounts that are none.
     """
     try:
-        factory = config.algo_class.default_resource_request(config.copy(copy_frozen=False))
+        factory = cast(Any, config.algo_class).default_resource_request(config.copy(copy_frozen=False))
     except (TypeError, ValueError) as error:
         raise UsageError(f"the resources asked for are none that RLlib understands: {error}") from error
     bundles = [{name: float(amount) for name, amount in bundle.items() if amount} for bundle in factory.bundles]
@@ -122,7 +123,7 @@ def _advice(request: Sequence[Bundle], room: Room, name: str, config: AlgorithmC
     each: object = config.num_cpus_per_env_runner
     if not isinstance(each, int | float):
         return "leave the values out that ask for as many"  # it is swept
-    rest = _total(request, name) - each * config.num_env_runners
+    rest = _total(request, name) - each * (config.num_env_runners or 0)
     if name != "CPU" or not each or rest > room.total(name) + ROUNDING:
         return "ask for fewer learners or evaluation runners, or for less in each process"
     return f"give --num-cpus {int((room.total(name) - rest + ROUNDING) / each)}"
