@@ -26,12 +26,13 @@ from typing import Any
 
 from rlservo.export.errors import UnavailableError, UsageError
 from rlservo.serve_app import haproxy as haproxy_script
+from rlservo.serve_app import loopback
 from rlservo.serve_app.keys import Role, check_exposure, is_loopback
 from rlservo.serve_app.library import load_served
 from rlservo.serve_app.operator_key import operator_key
 from rlservo.serve_app.plan import ServedConfig
 from rlservo.serve_app.processes import MARK, check_port, end_marked, free_ports, is_free, remove_folder
-from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.settings import PREFIX, ServerSettings
 
 logger = logging.getLogger(__name__)
 
@@ -41,6 +42,7 @@ MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
 FIRST_PORT, SERVERS, PORTS_PER_SERVER = 30_000, 21, 64  # up to 32687; outgoing connections begin at 32768
+LOG_BYTES, LOG_BACKUPS = 4 << 20, 1  # [bytes] of one log of Ray's, and how many earlier ones are kept
 STOP, STOP_NOW = "stop", "stop now"
 
 DEFAULT_MESSAGE = 4 << 20  # [bytes]
@@ -226,9 +228,13 @@ def _child(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Start the cluster's process, pass on what it reports, and end all that carries its mark."""
     mark = secrets.token_hex(16)
+    settings = plan["settings"]
     environment = ray_environment(
-        folder, haproxy=haproxy, mark=mark, port=plan["port"], max_message=plan["settings"]["max_body_bytes"]
+        folder, haproxy=haproxy, mark=mark, port=plan["port"], max_message=settings["max_body_bytes"]
     )
+    # The proxy is no part of the application, which is given its settings.
+    for name in ("stream_idle_s", "max_connections_per_address"):
+        environment[PREFIX + name.upper()] = str(settings[name])
     read_fd, write_fd = os.pipe()
     (folder / RAY_FOLDER).mkdir()
     full_plan = {
@@ -289,6 +295,14 @@ def ray_environment(
             # Neither Ray nor onnxruntime reports use to its makers from a robot's computer.
             "RAY_USAGE_STATS_ENABLED": "0",
             "ORT_DISABLE_TELEMETRY": "1",
+            # One machine: nothing but the proxy's ports is for others. The variable that turns clusters off, which Ray
+            # does by itself on macOS, makes the node's address 127.0.0.1, and Ray's ports listen on the node's address.
+            "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+            loopback.VARIABLE: "1",
+            haproxy_script.CHECK_SECRET: secrets.token_hex(16),
+            # Ray's own is six files of 512 MB for each of its processes.
+            "RAY_ROTATION_MAX_BYTES": str(LOG_BYTES),
+            "RAY_ROTATION_BACKUP_COUNT": str(LOG_BACKUPS),
             "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",
             "RAY_SERVE_RUN_ROUTER_IN_SEPARATE_LOOP": "0",
             "RAY_SERVE_LOG_TO_STDERR": "0",
@@ -323,7 +337,9 @@ def ray_environment(
             "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
             "RAY_SERVE_PORT_QUARANTINE_S": "150",
             "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "2",  # three looks in vain, and a dead proxy is replaced
-            "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # Ray's hour would keep a half-sent request for as long
+            # For a client that sends no more of a body, or reads no more of a reply; not for one that waits. Ray's is an
+            # hour. `haproxy.py` has the other phases' time-outs.
+            "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "5",
             "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
             "RAY_SERVE_HAPROXY_BINARY_PATH": str(haproxy_script.prepare(folder, haproxy)),
             "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
