@@ -20,9 +20,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rlservo.serve_app.processes import end_marked, remove_folder
+from rlservo.serve_app.processes import SERVER_LOG, cut_log, end_marked, remove_folder
 
 ORDERLY_END_S = 25.0  # [s] less than the launcher waits
+LOG_LOOK_S = 60.0
 OBJECT_STORE_BYTES = 80 << 20  # Ray's least is 75 MiB; requests do not go through it
 
 
@@ -65,7 +66,8 @@ def main() -> int:
         raise
     started.set()
     _report(plan, {"ready": True})
-    stop.wait()
+    while not stop.wait(LOG_LOOK_S):
+        cut_log(Path(plan["folder"]) / SERVER_LOG)
     app.stop()
     ray.shutdown()
     _leave_nothing(plan)

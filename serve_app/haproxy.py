@@ -221,7 +221,9 @@ def _bound_connections(text: str, limits: Limits) -> str:
     for protocol, answer in answers.items() if _has_grpc(text) else [("http", answers["http"])]:
         more = f"{tracked}\n    http-request return {answer} if {{ sc0_conn_cur gt {most} }}"
         what = f"the {protocol} frontend"
-        text = replace_once(text, rf"^frontend {protocol}_frontend$", lambda found, more=more: f"{found[0]}\n{more}", what)
+        text = replace_once(
+            text, rf"^frontend {protocol}_frontend$", lambda found, more=more: f"{found[0]}\n{more}", what
+        )
     return replace_once(text, r"^frontend prometheus$", rf"{table}\g<0>", "the metrics' frontend")
 
 
@@ -255,7 +257,11 @@ def _with_header(request: bytes, secret: str) -> bytes:
     """Return the HTTP/2 request of Ray's gRPC health check with the secret as one more header."""
     start = request.find(b"SM\r\n\r\n") + 6 + 9  # after the preface and its empty settings
     length = int.from_bytes(request[start : start + 3], "big")
-    head, block, rest = request[start + 3 : start + 9], request[start + 9 : start + 9 + length], request[start + 9 + length :]
+    head, block, rest = (
+        request[start + 3 : start + 9],
+        request[start + 9 : start + 9 + length],
+        request[start + 9 + length :],
+    )
     if head[0] != 1:
         raise TemplateError(f"Ray {_ray_version()} checks the health of gRPC in another way than Ray 2.60")
     name, value = CHECK_HEADER.encode(), secret.encode()

@@ -31,7 +31,16 @@ from rlservo.serve_app.keys import Role, check_exposure, is_loopback
 from rlservo.serve_app.library import load_served
 from rlservo.serve_app.operator_key import operator_key
 from rlservo.serve_app.plan import ServedConfig
-from rlservo.serve_app.processes import MARK, check_port, end_marked, free_ports, is_free, remove_folder
+from rlservo.serve_app.processes import (
+    LOG_BYTES,
+    MARK,
+    SERVER_LOG,
+    check_port,
+    end_marked,
+    free_ports,
+    is_free,
+    remove_folder,
+)
 from rlservo.serve_app.settings import PREFIX, ServerSettings
 
 logger = logging.getLogger(__name__)
@@ -42,7 +51,7 @@ MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
 FIRST_PORT, SERVERS, PORTS_PER_SERVER = 30_000, 21, 64  # up to 32687; outgoing connections begin at 32768
-LOG_BYTES, LOG_BACKUPS = 4 << 20, 1  # [bytes] of one log of Ray's, and how many earlier ones are kept
+LOG_BACKUPS = 1  # how many earlier files of each of Ray's logs are kept
 STOP, STOP_NOW = "stop", "stop now"
 
 DEFAULT_MESSAGE = 4 << 20  # [bytes]
@@ -244,7 +253,7 @@ def _child(
         "mark": mark,
         "report_fd": write_fd,
     }
-    with (folder / "server.log").open("wb") as log:
+    with (folder / SERVER_LOG).open("ab") as log:  # at its end, wherever that is: `cluster.py` cuts it
         child = subprocess.Popen(
             [sys.executable, "-m", "rlservo.serve_app.cluster", json.dumps(full_plan)],
             stdin=subprocess.PIPE,
@@ -300,7 +309,9 @@ def ray_environment(
             "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
             loopback.VARIABLE: "1",
             haproxy_script.CHECK_SECRET: secrets.token_hex(16),
-            # Ray's own is six files of 512 MB for each of its processes.
+            # Ray writes statistics of its event loops to its logs every minute, 100 MB a day (once a day now: -1 is never
+            # for some of its processes, and always for another), and keeps 3 GB of each process's.
+            "RAY_event_stats_print_interval_ms": "86400000",
             "RAY_ROTATION_MAX_BYTES": str(LOG_BYTES),
             "RAY_ROTATION_BACKUP_COUNT": str(LOG_BACKUPS),
             "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",
@@ -400,7 +411,7 @@ def _shown_host(host: str) -> str:
 
 def _log_tail(folder: Path) -> str:
     with contextlib.suppress(OSError):
-        lines = (folder / "server.log").read_text(errors="replace").strip().splitlines()
+        lines = (folder / SERVER_LOG).read_text(errors="replace").strip().splitlines()
         if lines:
             return lines[-1][:500]
     return "it left no message"
