@@ -23,7 +23,7 @@ from uvicorn.protocols.http import auto
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Receive, Scope, Send
+    from starlette.types import Receive, Scope, Send
 
 HEAD_S = 5.0
 """[s] for a request's head, from the connection's begin or the head's first byte on."""

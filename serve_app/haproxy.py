@@ -200,8 +200,7 @@ def _bound_time(text: str, error_file: Path, limits: Limits) -> str:
     # HAProxy takes a gRPC call's silence for that of its connection. A call without a stream is there at once.
     more = f"""    timeout client {limits.stream_s}s
     http-request wait-for-body time {REQUEST_TIMEOUT_S}s unless {{ path_end StreamInfer }}"""
-    text = replace_once(text, r"^frontend grpc_frontend$", rf"\g<0>\n{more}", "the gRPC frontend")
-    return text
+    return replace_once(text, r"^frontend grpc_frontend$", rf"\g<0>\n{more}", "the gRPC frontend")
 
 
 def _bound_connections(text: str, limits: Limits) -> str:

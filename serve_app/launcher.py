@@ -305,12 +305,12 @@ def ray_environment(
             "RAY_USAGE_STATS_ENABLED": "0",
             "ORT_DISABLE_TELEMETRY": "1",
             # One machine: nothing but the proxy's ports is for others. The variable that turns clusters off, which Ray
-            # does by itself on macOS, makes the node's address 127.0.0.1, and Ray's ports listen on the node's address.
+            # does by itself on macOS, lets the node's address be 127.0.0.1, and Ray's ports listen on that address.
             "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
             loopback.VARIABLE: "1",
             haproxy_script.CHECK_SECRET: secrets.token_hex(16),
-            # Ray writes statistics of its event loops to its logs every minute, 100 MB a day (once a day now: -1 is never
-            # for some of its processes, and always for another), and keeps 3 GB of each process's.
+            # Ray writes its event loops' statistics to its logs every minute, 100 MB a day: now once a day (-1 is never
+            # for some of its processes, and all the time for another). It keeps 3 GB of each process's logs.
             "RAY_event_stats_print_interval_ms": "86400000",
             "RAY_ROTATION_MAX_BYTES": str(LOG_BYTES),
             "RAY_ROTATION_BACKUP_COUNT": str(LOG_BACKUPS),
@@ -348,8 +348,8 @@ def ray_environment(
             "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
             "RAY_SERVE_PORT_QUARANTINE_S": "150",
             "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "2",  # three looks in vain, and a dead proxy is replaced
-            # For a client that sends no more of a body, or reads no more of a reply; not for one that waits. Ray's is an
-            # hour. `haproxy.py` has the other phases' time-outs.
+            # For a client that sends no more of a body, or reads no more of a reply; not for one that waits. Ray's is
+            # an hour. `haproxy.py` has the other phases' time-outs.
             "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "5",
             "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
             "RAY_SERVE_HAPROXY_BINARY_PATH": str(haproxy_script.prepare(folder, haproxy)),

@@ -1,7 +1,7 @@
 """Ray Serve's own HTTP paths and gRPC methods, which know no keys: nobody answers them.
 
-`/-/routes` and `ListApplications` tell what is deployed. `/-/healthz` and `Healthz` are what HAProxy's health checks ask;
-where the server has a secret for those checks (`rlservo serve` makes one), whoever does not know it gets no answer.
+`/-/routes` and `ListApplications` tell what is deployed. `/-/healthz` and `Healthz` are what HAProxy's health checks
+ask: where the server has a secret for those checks (`rlservo serve` makes one), only they are answered.
 For everybody else there are `/healthz`, `/v2/health/live` and `/v2/health/ready`. `haproxy.py` does the same in front.
 """
 

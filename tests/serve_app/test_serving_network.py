@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-import os
 import queue
 import re
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -87,12 +87,12 @@ def processes_of(folder: Path) -> frozenset[int]:
 
 
 @contextlib.contextmanager
-def serving(policies: Path, temporary: Path, *, with_grpc: bool, with_key: bool) -> Iterator[Server]:
+def serving(policies: Path, *, with_grpc: bool, with_key: bool) -> Iterator[Server]:
     port, grpc_port = free_ports(2)
     key, line = new_key("tests")
     ready, stop = threading.Event(), threading.Event()
     failures: list[BaseException] = []
-    before = set(Path("/tmp").glob("rlservo-*"))
+    before = _folders()
 
     def serve() -> None:
         try:
@@ -116,7 +116,7 @@ def serving(policies: Path, temporary: Path, *, with_grpc: bool, with_key: bool)
     try:
         while not ready.wait(0.1):
             assert thread.is_alive(), failures
-        (folder,) = [made for made in set(Path("/tmp").glob("rlservo-*")) - before if _is_of(made, port)]
+        (folder,) = [made for made in _folders() - before if _is_of(made, port)]
         yield Server(port, grpc_port if with_grpc else None, folder, key, processes_of(folder))
     finally:
         stop.set()
@@ -124,13 +124,17 @@ def serving(policies: Path, temporary: Path, *, with_grpc: bool, with_key: bool)
     assert failures == []
 
 
+def _folders() -> set[Path]:
+    return {folder for parent in {tempfile.gettempdir(), "/tmp"} for folder in Path(parent).glob("rlservo-*")}
+
+
 def _is_of(folder: Path, port: int) -> bool:
     return any(f":{port}" in file.read_text() for file in folder.glob("*/haproxy.cfg"))
 
 
 @pytest.fixture(scope="module")
-def server(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with serving(policies, tmp_path_factory.mktemp("t"), with_grpc=True, with_key=True) as made:
+def server(policies: Path) -> Iterator[Server]:
+    with serving(policies, with_grpc=True, with_key=True) as made:
         yield made
 
 
@@ -328,7 +332,7 @@ def test_what_is_logged_is_bounded(server: Server) -> None:
     assert f"RAY_ROTATION_MAX_BYTES={LOG_BYTES}".encode() in environment
     told = re.findall(rb"--logging-rotate-bytes=(\d+)", (raylets[0] / "cmdline").read_bytes())
     assert set(told) == {str(LOG_BYTES).encode()}
-    assert all(os.stat(file).st_size < 2 * LOG_BYTES for file in server.folder.rglob("*.log"))
+    assert all(file.stat().st_size < 2 * LOG_BYTES for file in server.folder.rglob("*.log"))
 
 
 def test_a_log_is_cut_to_its_last_lines(tmp_path: Path) -> None:
@@ -346,8 +350,8 @@ def test_a_log_is_cut_to_its_last_lines(tmp_path: Path) -> None:
     assert lines[0].startswith("line ")
 
 
-def test_without_a_grpc_port_nobody_speaks_grpc(policies: Path, tmp_path: Path) -> None:
-    with serving(policies, tmp_path, with_grpc=False, with_key=False) as server:
+def test_without_a_grpc_port_nobody_speaks_grpc(policies: Path) -> None:
+    with serving(policies, with_grpc=False, with_key=False) as server:
         for port in {port for _, port in server.listeners()}:
             with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
                 for method in ("inference.GRPCInferenceService/ServerLive", "ray.serve.RayServeAPIService/Healthz"):
