@@ -241,6 +241,8 @@ def _child(
     environment = ray_environment(
         folder, haproxy=haproxy, mark=mark, port=plan["port"], max_message=settings["max_body_bytes"]
     )
+    if haproxy is None and not is_loopback(plan["host"]):
+        environment[loopback.VARIABLE] = loopback.INNER
     # The proxy is no part of the application, which is given its settings.
     for name in ("stream_idle_s", "max_connections_per_address"):
         environment[PREFIX + name.upper()] = str(settings[name])
@@ -307,7 +309,7 @@ def ray_environment(
             # One machine: nothing but the proxy's ports is for others. The variable that turns clusters off, which Ray
             # does by itself on macOS, lets the node's address be 127.0.0.1, and Ray's ports listen on that address.
             "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
-            loopback.VARIABLE: "1",
+            loopback.VARIABLE: loopback.ALL,
             haproxy_script.CHECK_SECRET: secrets.token_hex(16),
             # Ray writes its event loops' statistics to its logs every minute, 100 MB a day: now once a day (-1 is never
             # for some of its processes, and all the time for another). It keeps 3 GB of each process's logs.
