@@ -194,13 +194,13 @@ def _bound_time(text: str, error_file: Path, limits: Limits) -> str:
     more = f"""    option http-buffer-request
     option http-ignore-probes
     http-request del-header upgrade unless {handshake} {no_body}"""
-    text = replace_once(text, r"^frontend http_frontend$", rf"\g<0>\n{more}", "the HTTP frontend")
+    text = _into_frontend(text, "http", more)
     if not _has_grpc(text):
         return text
     # HAProxy takes a gRPC call's silence for that of its connection. A call without a stream is there at once.
     more = f"""    timeout client {limits.stream_s}s
     http-request wait-for-body time {REQUEST_TIMEOUT_S}s unless {{ path_end StreamInfer }}"""
-    return replace_once(text, r"^frontend grpc_frontend$", rf"\g<0>\n{more}", "the gRPC frontend")
+    return _into_frontend(text, "grpc", more)
 
 
 def _bound_connections(text: str, limits: Limits) -> str:
@@ -219,11 +219,14 @@ def _bound_connections(text: str, limits: Limits) -> str:
     }
     for protocol, answer in answers.items() if _has_grpc(text) else [("http", answers["http"])]:
         more = f"{tracked}\n    http-request return {answer} if {{ sc0_conn_cur gt {most} }}"
-        what = f"the {protocol} frontend"
-        text = replace_once(
-            text, rf"^frontend {protocol}_frontend$", lambda found, more=more: f"{found[0]}\n{more}", what
-        )
+        text = _into_frontend(text, protocol, more)
     return replace_once(text, r"^frontend prometheus$", rf"{table}\g<0>", "the metrics' frontend")
+
+
+def _into_frontend(text: str, protocol: str, more: str) -> str:
+    """Put lines at the beginning of a frontend."""
+    name = f"frontend {protocol}_frontend"
+    return replace_once(text, rf"^{name}$", lambda _: f"{name}\n{more}", f"'{name}'")
 
 
 def _hide_serve(text: str, limits: Limits) -> str:
@@ -232,11 +235,11 @@ def _hide_serve(text: str, limits: Limits) -> str:
     body = '{\\"error\\":\\"nothing is here: policies are under /v1/policies\\",\\"code\\":\\"not-found\\"}'
     answer = f'    http-request return status 404 content-type application/json string "{body}"'
     more = f"{answer} if {{ path_beg -i {hidden} }}"
-    text = replace_once(text, r"^frontend http_frontend$", lambda found: f"{found[0]}\n{more}", "the HTTP frontend")
+    text = _into_frontend(text, "http", more)
     if _has_grpc(text):
         answer = "    http-request return status 200 content-type application/grpc hdr grpc-status 12"
         rule = f'{answer} hdr grpc-message "this server has no such method" if {{ path_beg -i /ray.serve. }}'
-        text = replace_once(text, r"^frontend grpc_frontend$", lambda found: f"{found[0]}\n{rule}", "the gRPC frontend")
+        text = _into_frontend(text, "grpc", rule)
     if not limits.secret:
         return text
     checks = len(re.findall(r"^ *option httpchk", text, re.MULTILINE))
