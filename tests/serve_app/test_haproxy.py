@@ -37,6 +37,7 @@ defaults
     mode http
     timeout connect 5s
     timeout client 5s
+    timeout http-keep-alive 90s
     timeout server 60s
     errorfile 502 /ray/500.http
     errorfile 503 /ray/500.http
@@ -451,14 +452,13 @@ def answered(connection: socket.socket, timeout_s: float = 15) -> bytes:
     return answer
 
 
-@pytest.mark.parametrize("content", [b"", b"POST /act HTTP/1.1\r\nhost: x\r\ncontent-length: 9\r\n\r\nhel"])
-def test_one_address_cannot_take_all_connections(node: Node, content: bytes) -> None:
+def test_one_address_cannot_take_all_connections(node: Node) -> None:
     node.proxy(FULL, settings=("RLSERVO_MAX_CONNECTIONS_PER_ADDRESS=20",))
     until(lambda: node.ask()[0] == 200)
     whole = b"GET / HTTP/1.1\r\nhost: x\r\n\r\n"
     with contextlib.ExitStack() as stack:
         for _ in range(20):
-            stack.enter_context(opened(node.port, "127.0.0.1", content))
+            stack.enter_context(opened(node.port, "127.0.0.1", whole)).recv(12)
         until(lambda: node.ask()[0] in (429, 0))
         with opened(node.port, "127.0.0.1", whole) as connection:
             head, _, body = answered(connection).partition(b"\r\n\r\n")
