@@ -48,7 +48,7 @@ def install() -> None:
         return handler._replace(unary_unary=_closed(service_method, handler.unary_unary))
 
     override_method_handler.closes = True  # type: ignore[attr-defined]
-    gRPCGenericServer._override_method_handler = override_method_handler  # type: ignore[method-assign]
+    gRPCGenericServer._override_method_handler = override_method_handler  # type: ignore[assignment, method-assign]
 
 
 def _closed(service_method: str, answer: Any) -> Any:
