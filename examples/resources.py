@@ -143,7 +143,7 @@ def _bundle(bundle: Bundle) -> str:
 
 def _listed(request: Sequence[Bundle]) -> str:
     """Return the bundles in words, equal ones together: `1 process with 1 CPU, 8 with 0.5 CPUs each`."""
-    parts = []
+    parts: list[str] = []
     for words, count in Counter(_bundle(bundle) for bundle in request).items():
         process = "process" + "es" * (count > 1) if not parts else ""
         parts.append(" ".join(filter(None, (str(count), process, "with", words, "each" * (count > 1)))))

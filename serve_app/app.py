@@ -43,7 +43,7 @@ APPLICATION = "rlservo"
 DEPLOYMENT = "PolicyServer"
 SPARE = 64  # health, metrics, documentation
 GRPC_SERVICE = "rlservo.serve_app.grpc_ingress:add_service"
-FOLLOW_TIMEOUT_S = 45.0  # [s] for every replica to load and prove what a change brought; HAProxy waits for 60
+FOLLOW_TIMEOUT_S = 45.0  # [s] for every replica to load and prove what a change brought
 # A rolling update starts the new replica before the old one stops; older Rays stop first.
 SURGE: dict[str, Any] = (
     {"max_surge_percent": 100} if "max_surge_percent" in inspect.signature(serve.deployment).parameters else {}
@@ -290,7 +290,9 @@ def start(
     settings: dict[str, Any],
 ) -> None:
     """Start Serve in the connected Ray cluster and return when requests are answered."""
-    grpc_options = gRPCOptions(port=grpc_port or 0, grpc_servicer_functions=[GRPC_SERVICE], enable_reflection=False)
+    # Without a port Serve's fallback proxy would listen all the same, where there is a service.
+    services = [] if grpc_port is None else [GRPC_SERVICE]
+    grpc_options = gRPCOptions(port=grpc_port or 0, grpc_servicer_functions=services, enable_reflection=False)
     serve.start(http_options=HTTPOptions(host=host, port=port), grpc_options=grpc_options)
     app = build(BuildArguments(policies=policies, replicas=replicas, served=served, settings=settings))
     serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)

@@ -11,6 +11,8 @@ import contextlib
 import functools
 import json
 import os
+import shlex
+import shutil
 import signal
 import sys
 import threading
@@ -19,10 +21,11 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.serve_app.operator_key import remove_key
-from rlservo.serve_app.processes import describe_end, end_marked, remove_folder
+from rlservo.serve_app.processes import SERVER_LOG, cut_log, describe_end, end_marked, remove_folder
 
 LOOK_S = 0.5  # between looks at whether Ray's own processes live
 ORDERLY_END_S = 25.0  # [s] less than the launcher waits
+LOG_LOOK_S = 60.0
 OBJECT_STORE_BYTES = 80 << 20  # Ray's least is 75 MiB; requests do not go through it
 
 
@@ -48,7 +51,7 @@ def main() -> int:
             log_to_driver=False,
             configure_logging=False,
             _temp_dir=plan["ray_folder"],
-            _node_ip_address="127.0.0.1",  # some of Ray's ports listen everywhere all the same, with the token
+            _node_ip_address="127.0.0.1",  # where Ray's ports listen, with the variable that `launcher.py` sets
             _system_config={"enable_worker_prestart": False},
         )
         app.start(
@@ -65,11 +68,15 @@ def main() -> int:
         raise
     started.set()
     _report(plan, {"ready": True})
+    looked = time.monotonic()
     while not stop.wait(LOOK_S):
         if (cause := _ray_ended()) is not None:
             _report(plan, {"died": cause})
             _leave_nothing(plan)
             return 1
+        if time.monotonic() - looked > LOG_LOOK_S:
+            looked = time.monotonic()
+            cut_log(Path(plan["folder"]) / SERVER_LOG)
     app.stop()
     ray.shutdown()
     _leave_nothing(plan)
@@ -80,12 +87,15 @@ def _leave_out_extras() -> None:
     """Keep Ray (2.60) from starting what nothing here uses and an answer waits for, where its own switches do not.
 
     The autoscaler's monitor and the log forwarder are 165 MB and a second; `ray start` has flags for both, `ray.init`
-    none. The node waits 3 s for the ports of its agent's HTTP and gRPC servers, which are for the dashboard; Ray leaves
-    them out where the dashboard's packages are missing, so here it is told that they are. Without a dashboard its
-    process starts all the same, to send usage statistics that are off, and `ray.init` waits until it is up. Where these
-    private names have moved, everything starts.
+    none. Without a dashboard its process starts all the same, to send usage statistics that are off, and `ray.init`
+    waits until it is up. Where these private names have moved, everything starts.
+
+    The dashboard's agent is 80 MB, opens a port to every interface, which three half-open connections block, and logs
+    a traceback a second about the dashboard that is not there. The raylet insists on a process, so it gets one that
+    does nothing. Raises RuntimeError where Ray starts it in another way.
     """
-    from ray._private import parameter, services, utils
+    import ray
+    from ray._private import parameter, services
 
     with contextlib.suppress(AttributeError):
         parameter.RayParams = functools.partial(  # type: ignore[misc, assignment]
@@ -93,10 +103,37 @@ def _leave_out_extras() -> None:
             no_monitor=True,
             include_log_monitor=False,  # type: ignore[arg-type]
         )
-    if hasattr(utils, "get_dashboard_dependency_error"):
-        utils.get_dashboard_dependency_error = lambda: ImportError("left out")
     if hasattr(services, "start_api_server"):
         services.start_api_server = _no_api_server
+    start: Any = getattr(services, "start_ray_process", None)
+    if start is None:
+        raise RuntimeError(f"Ray {ray.__version__} starts its processes in another way than 2.60 does")
+
+    def start_ray_process(command: list[str], process_type: str, *arguments: Any, **more: Any) -> Any:
+        if process_type == "raylet":
+            command = without_agent(command)
+        return start(command, process_type, *arguments, **more)
+
+    services.start_ray_process = start_ray_process
+
+
+def without_agent(raylet: list[str]) -> list[str]:
+    """Return the raylet's command with an idle process as the dashboard's agent, and no wait for the agent's ports.
+
+    Raises RuntimeError where the command is another than that of Ray 2.60.
+    """
+    import ray
+
+    changed = {
+        "--dashboard_agent_command": shlex.join([shutil.which("sleep") or "sleep", "infinity"]),
+        "--metrics-agent-port": "-1",
+        "--metrics_export_port": "-1",
+    }
+    for option in changed:
+        if (count := sum(word.startswith(f"{option}=") for word in raylet)) != 1:
+            raise RuntimeError(f"Ray {ray.__version__} starts its raylet with {count} of {option}: 2.60 has one")
+    kept = [word for word in raylet if word.partition("=")[0] not in changed]
+    return [*kept, *(f"{option}={value}" for option, value in changed.items()), "--dashboard_agent_listen_port=-1"]
 
 
 def _ray_ended() -> str | None:

@@ -4,6 +4,11 @@ Ray (2.60) starts HAProxy from an actor, anew for every change of replicas (`hap
 
 - Its statistics and metrics listen on every interface, whatever host is asked for; a client gets an hour to send a
   request's headers; where no replica can be reached it answers 500 in HTML, and 404 until it knows of any.
+- One address may take all of its connections. So they are counted by address: beyond the bound a request is answered
+  429, and beyond a little more the connection is closed.
+- A request with `Upgrade` and a body is passed on with both, and never answered. The header is left for a WebSocket's
+  handshake alone. A WebSocket, and a gRPC stream, may be silent for as long as the replica allows (`stream_idle_s`).
+- Serve's own paths and gRPC methods (`/-/routes`, `ListApplications`) answer whoever asks. Here nobody answers them.
 - A replica that is killed still takes connections while the kernel ends it, and resets them. What was sent to it is
   tried again elsewhere (`RAY_SERVE_HAPROXY_RETRY_ON`), but only what HAProxy had seen whole before it passed it on:
   a client that sends head and body apart got nothing. So it waits for a body, or for what fits its buffer. Where a
@@ -30,6 +35,8 @@ from __future__ import annotations
 import array
 import contextlib
 import fcntl
+import json
+import math
 import os
 import re
 import select
@@ -40,8 +47,10 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 STAMP = "x-rlservo-received"  # [ms since 1970] when HAProxy had the request, and on which machine's clock
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # the same in two processes that read the same clock
@@ -57,6 +66,13 @@ HOLDER = "l."  # and the watcher's process id: where it gives the sockets away, 
 # A HAProxy whose admin socket says nothing for so long hangs.
 PROBE_S, PROBE_WAITS, HUNG_S, HANGS = 0.1, 5, 1.5, -1
 SETTLE_MS = 1000  # in which a bridge takes what had waited for it
+MAX_CONNECTIONS = 1024  # per client address; `ServerSettings.max_connections_per_address`
+STREAM_IDLE_S = 300.0  # `ServerSettings.stream_idle_s`
+STREAM_MARGIN_S = 30  # the replica ends a silent stream, with a sentence; the proxy only what the replica has left
+FIN_TIMEOUT_S = 5  # for a connection that one side has closed
+OVER = 32  # connections beyond the bound that are told so; further ones are closed without a word
+CHECK_SECRET = "RLSERVO_CHECK_SECRET"
+CHECK_HEADER = "x-rlservo-check"
 UNREACHABLE = b'{"error":"no replica of the policy server can be reached: try again shortly","code":"unavailable"}'
 LATE = b'{"error":"the request did not arrive within %d s","code":"deadline-passed"}' % REQUEST_TIMEOUT_S
 SLOW = b'{"error":"no replica answered within %d s: try again","code":"no-answer"}' % ACTION_TIMEOUT_S
@@ -75,7 +91,7 @@ def prepare(folder: Path, binary: str) -> Path:
     _write_answers(folder)
     script = folder / SCRIPT
     program = shlex.join([sys.executable, "-IS", str(Path(__file__).resolve()), str(folder), binary])
-    script.write_text(f'#!/bin/sh\nexec {program} "$@"\n')
+    script.write_text(f'#!/bin/sh\nRLSERVO_RAY_VERSION={_ray_version()} exec {program} "$@"\n')
     script.chmod(0o700)
     return script
 
@@ -98,43 +114,100 @@ def find_binary() -> str | None:
         return shutil.which("haproxy")
 
 
-def mend(text: str, error_file: Path) -> str:
-    """Return Ray's configuration with its faults mended."""
-    text = re.sub(r"^(frontend prometheus\n +bind )(:\d+)$", r"\g<1>127.0.0.1\2", text, flags=re.MULTILINE)
-    text = re.sub(r"^(listen stats\n +bind )\*(:\d+)$", r"\g<1>127.0.0.1\2", text, flags=re.MULTILINE)
-    text = re.sub(r"^( *errorfile 50[23]) .*$", rf"\1 {error_file}", text, flags=re.MULTILINE)
-    text = re.sub(r"^( *errorfile 504) .*$", rf"\1 {error_file.with_name(SLOW_FILE)}", text, flags=re.MULTILINE)
-    more = f"    timeout http-request {REQUEST_TIMEOUT_S}s\n    errorfile 408 {error_file.with_name(LATE_FILE)}"
-    text = re.sub(r"^defaults$", rf"\g<0>\n{more}", text, flags=re.MULTILINE)
-    # Whose requests were refused, and who administers, is logged with the client's address, not the proxy's.
-    text = re.sub(r"^defaults$", r"\g<0>\n    option forwardfor", text, flags=re.MULTILINE)
+class TemplateError(Exception):
+    """Ray writes another configuration than the one that is mended here."""
+
+
+class Limits(NamedTuple):
+    """What is bounded, from the environment that Ray's processes inherit."""
+
+    max_connections: int
+    """Per client address; 0: no bound."""
+
+    stream_idle_s: float
+    secret: str
+    """What HAProxy's health checks show to replicas; without one, health is nobody's secret."""
+
+    @classmethod
+    def from_environment(cls) -> Limits:
+        """Read `RLSERVO_*`, the names of `ServerSettings`."""
+        environment = os.environ
+        return cls(
+            int(environment.get("RLSERVO_MAX_CONNECTIONS_PER_ADDRESS", MAX_CONNECTIONS)),
+            float(environment.get("RLSERVO_STREAM_IDLE_S", STREAM_IDLE_S)),
+            environment.get(CHECK_SECRET, ""),
+        )
+
+    @property
+    def stream_s(self) -> int:
+        """How long a stream may be silent before the proxy ends it."""
+        return math.ceil(self.stream_idle_s) + STREAM_MARGIN_S
+
+
+def replace_once(
+    text: str, pattern: str | re.Pattern[str], new: str | Callable[[re.Match[str]], str], what: str, *, times: int = 1
+) -> str:
+    """Replace the one match of a pattern, or the `times` there must be. Raises TemplateError for any other number."""
+    text, count = (re.compile(pattern, re.MULTILINE) if isinstance(pattern, str) else pattern).subn(new, text)
+    if count != times:
+        raise TemplateError(
+            f"Ray {_ray_version()} writes another HAProxy configuration than Ray 2.60: {what} is there {count} times, "
+            f"not {times}; install a Ray that this version of rlservo knows"
+        )
+    return text
+
+
+def _ray_version() -> str:
+    """Return Ray's version; the script that `prepare` writes knows it, for it runs without Ray."""
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        return os.environ.get("RLSERVO_RAY_VERSION") or metadata.version("ray")
+    return "?"
+
+
+def mend(text: str, error_file: Path, *, limits: Limits | None = None) -> str:
+    """Return Ray's configuration with its faults mended. Raises TemplateError where it is not the one known here."""
+    limits = limits or Limits.from_environment()
+    text = replace_once(text, r"^(frontend prometheus\n +bind )(:\d+)$", r"\g<1>127.0.0.1\2", "the metrics' port")
+    text = replace_once(text, r"^(listen stats\n +bind )\*(:\d+)$", r"\g<1>127.0.0.1\2", "the statistics' port")
+    for status, file in ((502, error_file), (503, error_file), (504, error_file.with_name(SLOW_FILE))):
+        text = replace_once(text, rf"^( *errorfile {status}) .*$", rf"\1 {file}", f"the answer {status}")
     if "RAY_SERVE_HAPROXY_TIMEOUT_CONNECT_S" not in os.environ:
-        text = re.sub(r"^( *timeout connect) .*$", rf"\1 {CONNECT_TIMEOUT_MS}ms", text, flags=re.MULTILINE)
-    # Not for gRPC, whose streams are requests that go on. A connection on which nothing came gets no 408.
-    more = "    option http-buffer-request\n    option http-ignore-probes"
-    text = re.sub(r"^frontend http_frontend$", rf"\g<0>\n{more}", text, flags=re.MULTILINE)
-    text = _stamp(_leave_hung_replicas(text))
-    if KNOWS_REPLICAS.search(text):
-        return text
-    # Not yet, or no more: 404 would say that there is no such policy.
-    text = NOT_FOUND.sub(r"\1 status 503 default-errorfiles", text)
-    return GRPC_NOT_FOUND.sub(r'\g<1>14\2 "no replica is there yet"', text)
+        text = replace_once(text, r"^( *timeout connect) .*$", rf"\1 {CONNECT_TIMEOUT_MS}ms", "'timeout connect'")
+    if not KNOWS_REPLICAS.search(text):
+        text = _without_replicas(text)
+    text = _leave_hung_replicas(text)
+    # What is put into a frontend last comes first: connections are bounded before requests are read and stamped.
+    text = _stamp(text)
+    text = _hide_serve(text, limits)
+    text = _bound_time(text, error_file, limits)
+    return _bound_connections(text, limits)
+
+
+def _without_replicas(text: str) -> str:
+    """Say that replicas are not there yet, or no more: 404 would say that there is no such policy."""
+    text = replace_once(text, NOT_FOUND, r"\1 status 503 default-errorfiles", "the answer to unknown paths")
+    if _has_grpc(text):
+        new = r'\g<1>14\2 "no replica is there yet"'
+        text = replace_once(text, GRPC_NOT_FOUND, new, "the answer to unknown gRPC applications", times=2)
+    return text
 
 
 def _leave_hung_replicas(text: str) -> str:
     """Bound how long a request waits for a replica that takes it and does not answer."""
-    text = re.sub(r"^ *server SERVE_REPLICA.*$", r"\g<0> on-marked-down shutdown-sessions", text, flags=re.MULTILINE)
+    replicas = len(KNOWS_REPLICAS.findall(text))
+    mark_down = r"\g<0> on-marked-down shutdown-sessions"
+    text = replace_once(text, r"^ *server SERVE_REPLICA.*$", mark_down, "a replica", times=replicas)
+    backend = re.compile(r"^backend (?:http|grpc)-.*$", re.MULTILINE)
     rule = f"    http-request set-timeout server {ACTION_TIMEOUT_S}s if {ACTING}"
-    return re.sub(r"^backend (?:http|grpc)-.*$", rf"\g<0>\n{rule}", text, flags=re.MULTILINE)
+    return replace_once(text, backend, rf"\g<0>\n{rule}", "a backend", times=len(backend.findall(text)))
 
 
 def _stamp(text: str) -> str:
     """Note on every request when it came. A body that is slow to come waits for itself, so only after it."""
-    body = f"    http-request wait-for-body time {REQUEST_TIMEOUT_S}s if METH_POST\n"
     stamp = f"    http-request set-header {STAMP} %[date(0,ms)]-{clock()}"
-    options = r"^frontend http_frontend\n(?: +option .*\n)+"
-    text = re.sub(options, rf"\g<0>{body}{stamp}\n", text, flags=re.MULTILINE)
-    return re.sub(r"^frontend grpc_frontend$", rf"\g<0>\n{stamp}", text, flags=re.MULTILINE)
+    body = f"    http-request wait-for-body time {REQUEST_TIMEOUT_S}s if METH_POST"
+    text = _into_frontend(text, "http", f"{body}\n{stamp}")
+    return _into_frontend(text, "grpc", stamp) if _has_grpc(text) else text
 
 
 def clock() -> str:
@@ -142,6 +215,103 @@ def clock() -> str:
     with contextlib.suppress(OSError):
         return BOOT_ID.read_text().strip()
     return "unknown"
+
+
+def _has_grpc(text: str) -> bool:
+    return re.search(r"^frontend grpc_frontend$", text, re.MULTILINE) is not None
+
+
+def _bound_time(text: str, error_file: Path, limits: Limits) -> str:
+    """Give every phase of a connection a time-out, and streams theirs."""
+    # Whose requests were refused, and who administers, is logged with the client's address, not the proxy's.
+    more = f"""    option forwardfor
+    timeout http-request {REQUEST_TIMEOUT_S}s
+    timeout tunnel {limits.stream_s}s
+    timeout client-fin {FIN_TIMEOUT_S}s
+    timeout server-fin {FIN_TIMEOUT_S}s
+    errorfile 408 {error_file.with_name(LATE_FILE)}"""
+    text = replace_once(text, r"^defaults$", rf"\g<0>\n{more}", "the section of defaults")
+    # Not for gRPC, whose streams are requests that go on. A connection on which nothing came gets no 408.
+    handshake = "{ method GET } { req.hdr(upgrade) -i -m str websocket }"
+    no_body = "!{ req.hdr(transfer-encoding) -m found } !{ req.hdr(content-length) -m int gt 0 }"
+    more = f"""    option http-buffer-request
+    option http-ignore-probes
+    http-request del-header upgrade unless {handshake} {no_body}"""
+    text = _into_frontend(text, "http", more)
+    if not _has_grpc(text):
+        return text
+    # HAProxy takes a gRPC call's silence for that of its connection. A call without a stream is there at once.
+    more = f"""    timeout client {limits.stream_s}s
+    http-request wait-for-body time {REQUEST_TIMEOUT_S}s unless {{ path_end StreamInfer }}"""
+    return _into_frontend(text, "grpc", more)
+
+
+def _bound_connections(text: str, limits: Limits) -> str:
+    """Bound how many connections an address may have, HTTP and gRPC together."""
+    if limits.max_connections == 0:
+        return text
+    most = limits.max_connections
+    table = "backend connections_by_address\n    stick-table type ipv6 size 100k expire 10m store conn_cur\n"
+    sentence = f"your address has more than {most} connections to this server: close some, or wait"
+    body = json.dumps({"error": sentence, "code": "over-capacity"}, separators=(",", ":")).replace('"', '\\"')
+    tracked = f"""    tcp-request connection track-sc0 src table connections_by_address
+    tcp-request connection reject if {{ sc0_conn_cur gt {most + OVER} }}"""
+    answers = {
+        "http": f'status 429 content-type application/json hdr connection close hdr retry-after 1 string "{body}"',
+        "grpc": f'status 200 content-type application/grpc hdr grpc-status 8 hdr grpc-message "{sentence}"',
+    }
+    for protocol, answer in answers.items() if _has_grpc(text) else [("http", answers["http"])]:
+        more = f"{tracked}\n    http-request return {answer} if {{ sc0_conn_cur gt {most} }}"
+        text = _into_frontend(text, protocol, more)
+    return replace_once(text, r"^frontend prometheus$", rf"{table}\g<0>", "the metrics' frontend")
+
+
+def _into_frontend(text: str, protocol: str, more: str) -> str:
+    """Put lines at the beginning of a frontend."""
+    name = f"frontend {protocol}_frontend"
+    return replace_once(text, rf"^{name}$", lambda _: f"{name}\n{more}", f"'{name}'")
+
+
+def _hide_serve(text: str, limits: Limits) -> str:
+    """Let nobody answer what Serve itself answers without a key; its health is then the health checks' alone."""
+    hidden = "/-/" if limits.secret else "/-/routes"
+    body = '{\\"error\\":\\"nothing is here: policies are under /v1/policies\\",\\"code\\":\\"not-found\\"}'
+    answer = f'    http-request return status 404 content-type application/json string "{body}"'
+    more = f"{answer} if {{ path_beg -i {hidden} }}"
+    text = _into_frontend(text, "http", more)
+    if _has_grpc(text):
+        answer = "    http-request return status 200 content-type application/grpc hdr grpc-status 12"
+        rule = f'{answer} hdr grpc-message "this server has no such method" if {{ path_beg -i /ray.serve. }}'
+        text = _into_frontend(text, "grpc", rule)
+    if not limits.secret:
+        return text
+    checks = len(re.findall(r"^ *option httpchk", text, re.MULTILINE))
+    new = rf"\1\n    http-check send hdr {CHECK_HEADER} {limits.secret}"
+    text = replace_once(text, r"^( *option httpchk GET /-/healthz)$", new, "the health check", times=checks)
+    checks = len(re.findall(r"^ *option tcp-check", text, re.MULTILINE))
+    return replace_once(
+        text,
+        r"^( *tcp-check send-binary )([0-9a-f]+)$",
+        lambda found: found[1] + _with_header(bytes.fromhex(found[2]), limits.secret).hex(),
+        "the gRPC health check",
+        times=checks,
+    )
+
+
+def _with_header(request: bytes, secret: str) -> bytes:
+    """Return the HTTP/2 request of Ray's gRPC health check with the secret as one more header."""
+    start = request.find(b"SM\r\n\r\n") + 6 + 9  # after the preface and its empty settings
+    length = int.from_bytes(request[start : start + 3], "big")
+    head, block, rest = (
+        request[start + 3 : start + 9],
+        request[start + 9 : start + 9 + length],
+        request[start + 9 + length :],
+    )
+    if head[0] != 1:
+        raise TemplateError(f"Ray {_ray_version()} checks the health of gRPC in another way than Ray 2.60")
+    name, value = CHECK_HEADER.encode(), secret.encode()
+    block += b"\x00%c%s%c%s" % (len(name), name, len(value), value)  # a literal header, without indexing
+    return request[:start] + len(block).to_bytes(3, "big") + head + block + rest
 
 
 def bridging(text: str, *, hung_since: float | None = None) -> str:
@@ -152,9 +322,11 @@ def bridging(text: str, *, hung_since: float | None = None) -> str:
     if hung_since is not None:
         stamp = f"http-request set-header {STAMP} {hung_since * 1e3:.0f}-{clock()}"
         until = f"if {{ date(0,ms) -m int lt {time.time() * 1e3 + SETTLE_MS:.0f} }}"
-        text = re.sub(rf"^( *)http-request set-header {STAMP} .*$", rf"\g<0>\n\1{stamp} {until}", text, flags=re.M)
-    text = re.sub(r"^ *stats (?:socket|timeout) .*\n", "", text, flags=re.MULTILINE)
-    return re.sub(r"^(?:frontend prometheus|listen stats)\n(?: .*\n?)*", "", text, flags=re.MULTILINE)
+        stamped = rf"^( *)http-request set-header {STAMP} .*$"
+        text = replace_once(text, stamped, rf"\g<0>\n\1{stamp} {until}", "the stamp", times=1 + _has_grpc(text))
+    text = replace_once(text, r"^ *stats (?:socket|timeout) .*\n", "", "the statistics' socket", times=2)
+    sections = r"^(?:frontend prometheus|listen stats)\n(?: .*\n?)*"
+    return replace_once(text, sections, "", "the statistics' sections", times=2)
 
 
 def main(folder: str, binary: str, *arguments: str) -> NoReturn:
@@ -165,7 +337,10 @@ def main(folder: str, binary: str, *arguments: str) -> NoReturn:
         _write_answers(Path(folder))  # it may have been prepared by an earlier version
         text = file.read_text()
         listeners, kept = _listeners(file, text)
-        text = inheriting(mend(text, Path(folder) / ERROR_FILE), listeners)
+        try:
+            text = inheriting(mend(text, Path(folder) / ERROR_FILE), listeners)
+        except TemplateError as error:
+            sys.exit(str(error))
         if KNOWS_REPLICAS.search(text):
             known.write_text(text)
         elif kept and "-sf" not in arguments and known.exists():

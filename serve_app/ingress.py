@@ -29,6 +29,7 @@ from typing import Protocol
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from rlservo.serve_app import connections, loopback, serve_endpoints
 from rlservo.serve_app.joined import join_writes
 from rlservo.serve_app.logs import FIELDS
 from rlservo.serve_app.request_checks import mend_headers
@@ -40,6 +41,10 @@ TURNED_AWAY = (
     (b"content-type", b"application/json"),
     (b"content-length", b"%d" % len(FULL)),
     (b"retry-after", b"1"),
+)
+NOT_FOUND = (
+    (b"content-type", b"application/json"),
+    (b"content-length", b"%d" % len(serve_endpoints.NOTHING)),
 )
 NO_WATCH = (b"x-request-disconnect-disabled", b"?1")
 REQUEST_ID = b"x-request-id"
@@ -107,7 +112,13 @@ class Ingress:
                 raise
             return
         headers = mend_headers(scope["headers"])
-        scope["headers"] = [*headers, NO_WATCH] if http else headers
+        if http:
+            if serve_endpoints.is_closed(scope):
+                await send({"type": "http.response.start", "status": 404, "headers": list(NOT_FOUND)})
+                await send({"type": "http.response.body", "body": serve_endpoints.NOTHING})
+                return
+            headers = [*headers, NO_WATCH]
+        scope["headers"] = headers
         await self._app(scope, receive, send)
 
 
@@ -135,5 +146,9 @@ numbers = itertools.count(1)
 
 
 def middlewares() -> list[Middleware]:
-    """Return what Serve puts around each HTTP server it starts."""
+    """Return what Serve puts around each HTTP server it starts; it calls this before it binds the server's port."""
+    connections.install()
+    serve_endpoints.install()
+    if loopback.is_wanted():
+        loopback.install()
     return [Middleware(Ingress)]

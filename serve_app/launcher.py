@@ -27,12 +27,15 @@ from typing import Any
 
 from rlservo.export.errors import UnavailableError, UsageError
 from rlservo.serve_app import haproxy as haproxy_script
+from rlservo.serve_app import loopback
 from rlservo.serve_app.keys import Role, check_exposure, is_loopback
 from rlservo.serve_app.library import load_served
 from rlservo.serve_app.operator_key import operator_key
 from rlservo.serve_app.plan import ServedConfig
 from rlservo.serve_app.processes import (
+    LOG_BYTES,
     MARK,
+    SERVER_LOG,
     check_port,
     describe_end,
     end_marked,
@@ -40,7 +43,7 @@ from rlservo.serve_app.processes import (
     is_free,
     remove_folder,
 )
-from rlservo.serve_app.settings import ServerSettings
+from rlservo.serve_app.settings import PREFIX, ServerSettings
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +59,7 @@ MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
 FIRST_PORT, SERVERS, PORTS_PER_SERVER = 30_000, 21, 64  # up to 32687; outgoing connections begin at 32768
+LOG_BACKUPS = 1  # how many earlier files of each of Ray's logs are kept
 STOP, STOP_NOW = "stop", "stop now"
 
 DEFAULT_MESSAGE = 4 << 20  # [bytes]
@@ -249,9 +253,15 @@ def _child(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Start the cluster's process, pass on what it reports, and end all that carries its mark."""
     mark = secrets.token_hex(16)
+    settings = plan["settings"]
     environment = ray_environment(
-        folder, haproxy=haproxy, mark=mark, port=plan["port"], max_message=plan["settings"]["max_body_bytes"]
+        folder, haproxy=haproxy, mark=mark, port=plan["port"], max_message=settings["max_body_bytes"]
     )
+    if haproxy is None and not is_loopback(plan["host"]):
+        environment[loopback.VARIABLE] = loopback.INNER
+    # The proxy is no part of the application, which is given its settings.
+    for name in ("stream_idle_s", "max_connections_per_address"):
+        environment[PREFIX + name.upper()] = str(settings[name])
     read_fd, write_fd = os.pipe()
     (folder / RAY_FOLDER).mkdir()
     full_plan = {
@@ -261,7 +271,7 @@ def _child(
         "mark": mark,
         "report_fd": write_fd,
     }
-    with (folder / "server.log").open("wb") as log:
+    with (folder / SERVER_LOG).open("ab") as log:  # at its end, wherever that is: `cluster.py` cuts it
         child = subprocess.Popen(
             [sys.executable, "-m", "rlservo.serve_app.cluster", json.dumps(full_plan)],
             stdin=subprocess.PIPE,
@@ -312,6 +322,16 @@ def ray_environment(
             # Neither Ray nor onnxruntime reports use to its makers from a robot's computer.
             "RAY_USAGE_STATS_ENABLED": "0",
             "ORT_DISABLE_TELEMETRY": "1",
+            # One machine: nothing but the proxy's ports is for others. The variable that turns clusters off, which Ray
+            # does by itself on macOS, lets the node's address be 127.0.0.1, and Ray's ports listen on that address.
+            "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+            loopback.VARIABLE: loopback.ALL,
+            haproxy_script.CHECK_SECRET: secrets.token_hex(16),
+            # Ray writes its event loops' statistics to its logs every minute, 100 MB a day: now once a day (-1 is never
+            # for some of its processes, and all the time for another). It keeps 3 GB of each process's logs.
+            "RAY_event_stats_print_interval_ms": "86400000",
+            "RAY_ROTATION_MAX_BYTES": str(LOG_BYTES),
+            "RAY_ROTATION_BACKUP_COUNT": str(LOG_BACKUPS),
             "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",
             "RAY_SERVE_RUN_ROUTER_IN_SEPARATE_LOOP": "0",
             "RAY_SERVE_LOG_TO_STDERR": "0",
@@ -349,7 +369,9 @@ def ray_environment(
             "RAY_SERVE_PORT_QUARANTINE_S": "150",
             "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "2",  # three looks in vain, and a dead proxy is replaced
             "RAY_SERVE_HAPROXY_HEALTH_CHECK_INTER": "1s",  # and as long for the answer; after two in vain it is left
-            "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # Ray's hour would keep a half-sent request for as long
+            # For a client that sends no more of a body, or reads no more of a reply; not for one that waits. Ray's is
+            # an hour. `haproxy.py` has the other phases' time-outs.
+            "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "5",
             "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
             "RAY_SERVE_HAPROXY_BINARY_PATH": str(haproxy_script.prepare(folder, haproxy)),
             "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
@@ -418,7 +440,7 @@ def _cause_of_end(child: subprocess.Popen[bytes], folder: Path) -> str:
 def _last_fault(folder: Path) -> str:
     """Return the last line of the log that tells of a fault; most lines tell of what went well."""
     with contextlib.suppress(OSError):
-        lines = (folder / "server.log").read_text(errors="replace").splitlines()
+        lines = (folder / SERVER_LOG).read_text(errors="replace").splitlines()
         faults = [line.strip() for line in lines if FAULT.search(line)]
         if faults:
             return f"its log says: {COLOURS.sub('', faults[-1])[:500]}"

@@ -21,6 +21,9 @@ from pathlib import Path
 from rlservo.export.errors import UnavailableError, UsageError
 
 MARK = "RLSERVO_LAUNCH"
+SERVER_LOG = "server.log"
+KEPT_BYTES = 4096  # of a log that is cut
+LOG_BYTES = 4 << 20  # [bytes] of this log, and of each log of Ray's
 PROC = Path("/proc")
 # Where `free_ports` looks: above those Ray gives its workers, below those of replicas (`launcher.py`, 30000 and up)
 # and those of outgoing connections (Linux: 32768 and up).
@@ -175,6 +178,19 @@ def describe_end(returncode: int | None) -> str:
     with contextlib.suppress(ValueError):
         return f"was ended by {signal.Signals(-returncode).name}"
     return f"was ended by signal {-returncode}"
+
+
+def cut_log(file: Path, max_bytes: int = LOG_BYTES) -> None:
+    """Empty a log that has grown beyond its bound, but for its last lines; whoever writes it appends."""
+    with contextlib.suppress(OSError):
+        if file.stat().st_size <= max_bytes:
+            return
+        with file.open("rb+") as log:
+            log.seek(-KEPT_BYTES, os.SEEK_END)
+            kept = log.read().partition(b"\n")[2]
+            log.truncate(0)
+        with file.open("ab") as log:
+            log.write(kept)
 
 
 def remove_folder(folder: Path, *, timeout_s: float = 5.0) -> None:

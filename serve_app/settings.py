@@ -52,6 +52,10 @@ class ServerSettings(BaseModel):
     max_streams: int = Field(256, ge=1)
     """Streams (WebSocket, gRPC) that may be open at once, per replica."""
 
+    max_connections_per_address: int = Field(1024, ge=0)
+    """Connections that one client address may have to HAProxy; further ones are answered 429, many more are closed at
+    once. Ray's HAProxy takes 4096 altogether. 0: no bound, for a server that has another proxy before it."""
+
     stream_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
     """[s] A stream (WebSocket, gRPC) whose client says nothing for so long is closed."""
 

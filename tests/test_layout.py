@@ -19,7 +19,7 @@ ONLY_IN = {
         "export/old_models.py",
         "examples/",
     ),
-    "ray.serve": ("serve_app/app.py",),
+    "ray.serve": ("serve_app/app.py", "serve_app/loopback.py", "serve_app/serve_endpoints.py"),
     "ray.experimental": ("serve_app/ledger.py",),
     "fastapi": (
         "serve_app/http.py",
@@ -31,7 +31,12 @@ ONLY_IN = {
         "serve_app/app.py",
     ),
     "mujoco": ("envs/",),
-    "grpc": ("envs/robot_server/", "serve_app/oip_grpc.py", "serve_app/grpc_ingress.py"),
+    "grpc": (
+        "envs/robot_server/",
+        "serve_app/oip_grpc.py",
+        "serve_app/grpc_ingress.py",
+        "serve_app/serve_endpoints.py",
+    ),
     "google.protobuf": ("envs/robot_server/", "serve_app/oip_grpc.py", "serve_app/oip_messages.py"),
     "torch": ("export/",),
     "pickle": ("export/unpickle.py",),

