@@ -46,12 +46,16 @@ class BlockingCalls:
         loop = asyncio.get_running_loop()
         returned: asyncio.Future[None] = loop.create_future()
 
-        def wake(_future: Future[Result]) -> None:
+        def wake() -> None:
+            if not returned.done():
+                returned.set_result(None)
+
+        def wake_loop(_future: Future[Result]) -> None:
             with contextlib.suppress(RuntimeError):  # the loop has ended: nobody waits
-                loop.call_soon_threadsafe(lambda: returned.done() or returned.set_result(None))
+                loop.call_soon_threadsafe(wake)
 
         future = self._start(function, arguments)
-        future.add_done_callback(wake)
+        future.add_done_callback(wake_loop)
         try:
             await asyncio.wait_for(returned, deadline - time.monotonic())
         except asyncio.TimeoutError:
