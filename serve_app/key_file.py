@@ -33,7 +33,7 @@ class CurrentKeys:
         content = None if file is None else read_key_file(Path(file))
         self._keys = Keys.from_settings(settings, file_content=content)
         self._seen: bytes | str | None = content
-        self._used = self._seen
+        self._used: bytes | str | None = content
         self._refused = ""
         self._looked_at = time.monotonic()
         self.changes = 0

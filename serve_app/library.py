@@ -135,7 +135,7 @@ def load_served(
 
     Raises UsageError or BundleError, and UnavailableError where the file system hangs.
     """
-    settings = settings or ServerSettings()
+    settings = settings or ServerSettings.from_environment(environment={})
     calls, limits = BlockingCalls(), settings.bundle_limits
     library = Library(Repository(paths, limits), partial(Policy.load, limits=limits))
     available = calls.wait(
