@@ -105,7 +105,8 @@ class TimedProtocol(HttpToolsProtocol):
 
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
         # The parser has stopped at this head: a body is lost, and so is the next request.
-        if self.parser.should_upgrade() and any(name == b"upgrade" for name, _ in cycle.scope["headers"]):
+        parser: Any = self.parser
+        if parser.should_upgrade() and any(name == b"upgrade" for name, _ in cycle.scope["headers"]):
             cycle.keep_alive = False
             if _has_body(cycle.scope):
                 app = _refuse_upgrade

@@ -32,16 +32,18 @@ def install() -> None:
     from ray.serve._private import default_impl, http_util, replica
     from ray.serve._private.constants import RAY_SERVE_ENABLE_HA_PROXY
 
+    http: Any = http_util  # what they import they do not export
+    own: Any = replica
     try:
         # A second time changes nothing. Serve pickles its proxy's class with the functions it calls, hence the names
         # that those look up.
         if os.environ[VARIABLE] == ALL:
             default_impl.add_grpc_address = _on_loopback(default_impl.add_grpc_address)
         if RAY_SERVE_ENABLE_HA_PROXY:  # otherwise Serve's own proxy is the public one, and replicas have no port
-            if http_util.socket not in (socket, SOCKETS):
+            if http.socket not in (socket, SOCKETS):
                 raise AttributeError("its HTTP server has no module 'socket'")
-            http_util.socket = SOCKETS  # type: ignore[assignment]
-        replica.add_port_to_grpc_server = _on_loopback(replica.add_port_to_grpc_server)
+            http.socket = SOCKETS
+        own.add_port_to_grpc_server = _on_loopback(own.add_port_to_grpc_server)
     except AttributeError as error:
         raise RuntimeError(f"Ray {ray.__version__} binds its ports in another way than 2.60 does: {error}") from error
 
