@@ -1,7 +1,7 @@
 """Model configuration and statistics, which Triton's tools ask for before they infer (perf_analyzer, model_analyzer).
 
 The documents have the fields of Triton's messages ModelConfig and ModelStatistics, over HTTP as JSON. A field of theirs
-that nothing here corresponds to is left out; a duration that nobody measures is 0 in 0 times.
+that nothing here corresponds to is left out, a duration that nobody measures is 0.
 
 Specification: github.com/triton-inference-server/server, docs/protocol/extension_model_configuration.md and
 extension_statistics.md; github.com/triton-inference-server/common, protobuf/model_config.proto.
@@ -116,10 +116,12 @@ def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
         "inference_stats": {
             "success": duration(totals.requests, totals.request_s),
             "fail": duration(totals.failures, 0.0),  # how long they took is not kept
-            "queue": NOTHING,
-            "compute_input": NOTHING,
+            # What has been read is computed at once, and checking observation and action is in `compute_infer`: no time
+            # apart. The counts are equal all the same, perf_analyzer ends where they are not.
+            "queue": duration(totals.requests, 0.0),
+            "compute_input": duration(totals.requests, 0.0),
             "compute_infer": duration(totals.requests, totals.inference_s),
-            "compute_output": NOTHING,
+            "compute_output": duration(totals.requests, 0.0),
             "cache_hit": NOTHING,
             "cache_miss": NOTHING,
         },

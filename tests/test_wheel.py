@@ -68,8 +68,9 @@ def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -
         assert f"\n{heavy}==" not in f"\n{listed}"
     loaded = run(str(python), "-c", "import rlservo; print(rlservo.__version__, rlservo.Policy.load, rlservo.rollout)")
     assert loaded.returncode == 0, loaded.stderr
-    missing = run(str(python), "-c", "from rlservo import PolicyClient")
-    assert "rlservo.PolicyClient needs the Python package 'httpx': pip install 'rlservo[client]'" in missing.stderr
+    for name, extra in (("PolicyClient", "client"), ("StreamClient", "client"), ("export_checkpoint", "train")):
+        missing = run(str(python), "-c", f"from rlservo import {name}").stderr
+        assert f"pip install 'rlservo[{extra}]'" in missing.splitlines()[-1], missing
     program = "import sys; print(*sorted(name for name in sys.modules if 'rlservo' in name), 'typing' in sys.modules)"
     started = run(str(python), "-c", program)
     assert started.stdout.split() == ["rlservo", "rlservo.envs", "rlservo.envs.discovery", "False"]

@@ -40,18 +40,21 @@ __all__ = [
     "rollout",
 ]
 
-# Public name -> the module that holds it, and the extra that installs what it needs beyond the in-process runtime.
+# Public name -> the module that holds it.
 _MODULES = {
-    "ActingPolicy": ("rlservo.serve_app.acting", ""),
-    "AdminClient": ("rlservo.serve_app.admin_client", "client"),
-    "Policy": ("rlservo.serve_app.policy", ""),
-    "PolicyClient": ("rlservo.serve_app.client", "client"),
-    "StreamClient": ("rlservo.serve_app.stream_client", "client"),
-    "WithFallback": ("rlservo.serve_app.fallback", ""),
-    "errors": ("rlservo.export", ""),
-    "export_checkpoint": ("rlservo.export.exporter", "train"),
-    "rollout": ("rlservo.serve_app.rollout", ""),
+    "ActingPolicy": "rlservo.serve_app.acting",
+    "AdminClient": "rlservo.serve_app.admin_client",
+    "Policy": "rlservo.serve_app.policy",
+    "PolicyClient": "rlservo.serve_app.client",
+    "StreamClient": "rlservo.serve_app.stream_client",
+    "WithFallback": "rlservo.serve_app.fallback",
+    "errors": "rlservo.export",
+    "export_checkpoint": "rlservo.export.exporter",
+    "rollout": "rlservo.serve_app.rollout",
 }
+
+# The extra that installs what a name needs beyond the in-process runtime.
+_EXTRAS = {"AdminClient": "client", "PolicyClient": "client", "StreamClient": "client", "export_checkpoint": "train"}
 
 if not TYPE_CHECKING:  # a type checker would take it for a promise of every name
 
@@ -60,7 +63,7 @@ if not TYPE_CHECKING:  # a type checker would take it for a promise of every nam
         if name == "__version__":
             value = _installed_version()
         elif name in _MODULES:
-            value = _load(name, *_MODULES[name])
+            value = _load(name)
         else:
             raise AttributeError(f"module 'rlservo' has no attribute {name!r}")
         globals()[name] = value
@@ -71,15 +74,16 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-def _load(name: str, module: str, extra: str) -> object:
+def _load(name: str) -> object:
     try:
         # What `from module import name` does: the name may be a module itself.
-        return getattr(__import__(module, fromlist=[name]), name)
+        return getattr(__import__(_MODULES[name], fromlist=[name]), name)
     except ModuleNotFoundError as error:
-        if not extra or (error.name or "").startswith("rlservo"):
+        if name not in _EXTRAS or (error.name or "").startswith("rlservo"):
             raise
         raise ModuleNotFoundError(
-            f"rlservo.{name} needs the Python package {error.name!r}: pip install 'rlservo[{extra}]'", name=error.name
+            f"rlservo.{name} needs the Python package {error.name!r}: pip install 'rlservo[{_EXTRAS[name]}]'",
+            name=error.name,
         ) from None
 
 
