@@ -553,8 +553,8 @@ def _bridge(binary: str, file: Path, raylet: int, holder: _Holder, listeners: li
         return subprocess.Popen(command, stdout=nowhere, stderr=nowhere, pass_fds=inherited)
 
     process, controlled = start(), time.monotonic()
-    while process.poll() is None or process.returncode < 0:
-        if process.returncode is not None:  # killed, as the one before it
+    while (ended := process.poll()) is None or ended < 0:
+        if ended is not None:  # killed, as the one before it
             process = start()
         now = time.monotonic()
         if _controller(raylet):
