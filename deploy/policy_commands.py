@@ -61,9 +61,10 @@ def load(
     key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:
-    """Load a version and prove it; what clients get stays as it is until an alias leads there.
+    """Load a version and prove it, ready for an alias.
 
-    Of a policy that is not served at all, the version loaded first is in use at once.
+    What clients get stays as it is until then; of a policy that is not served at all, the version loaded first is in
+    use at once.
 
     Example: `rlservo policy load ur5 4`
     """

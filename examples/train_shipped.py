@@ -6,8 +6,8 @@
 for one run. The run goes to `runs/NAME`: the best checkpoint so far (by the mean of the last episodes or, where the
 settings have `validation`, by episodes of the exported policy, without exploration), `curve.csv` and `curve.png`.
 `--install` then puts the pruned checkpoint and the curve beside the settings. One process, one thread: RLlib samples in
-the driver, because two sampling processes get `MeanStdFilter` statistics merged wrongly (docs/decisions.md). How good a policy
-is afterwards `evaluate_shipped.py` tells, on other seeds.
+the driver, because two sampling processes get `MeanStdFilter` statistics merged wrongly (docs/decisions.md). How good a
+policy is afterwards `evaluate_shipped.py` tells, on other seeds.
 """
 
 from __future__ import annotations

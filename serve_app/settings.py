@@ -10,14 +10,16 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from typing_extensions import Self
 
-from rlservo.export.bundle import BundleLimits
 from rlservo.export.errors import UsageError
 from rlservo.serve_app.options import PolicyOptions
+
+if TYPE_CHECKING:
+    from rlservo.export.bundle import BundleLimits
 
 PREFIX = "RLSERVO_"
 
@@ -129,6 +131,8 @@ class ServerSettings(BaseModel):
     @property
     def bundle_limits(self) -> BundleLimits:
         """How large a bundle's files may be."""
+        from rlservo.export.bundle import BundleLimits  # which imports numpy: `rlservo key` reads the settings, too
+
         return BundleLimits(
             max_policy_bytes=self.max_policy_bytes,
             max_golden_bytes=self.max_golden_bytes,

@@ -293,6 +293,11 @@ def test_the_openapi_document_is_valid_3_0_and_describes_every_route(ask: Ask) -
         "/v2/models/{name}/versions/{version}/ready",
         "/v2/models/{name}/infer",
         "/v2/models/{name}/versions/{version}/infer",
+        "/v2/models/stats",
+        "/v2/models/{name}/stats",
+        "/v2/models/{name}/config",
+        "/v2/models/{name}/versions/{version}/stats",
+        "/v2/models/{name}/versions/{version}/config",
         "/v2/repository/index",
     }
     request = document["paths"]["/v1/policies/{name}/act"]["post"]["requestBody"]["content"]["application/json"][
