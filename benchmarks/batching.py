@@ -38,10 +38,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from rlservo.export.bundle import ONNX_FILE, Bundle, load_bundle
-from rlservo.export.exporter import export_checkpoint
-from rlservo.export.session import open_session
-from rlservo.serve_app.processes import free_ports
+from rlservo.export.commands.export import export_checkpoint
+from rlservo.export.contract.bundle import ONNX_FILE, Bundle, load_bundle
+from rlservo.export.contract.onnx_session import open_session
+from rlservo.serve_app.ray_serve.processes import free_ports
 from speed.loads import wrk
 from speed.servers import Exchange, Server, running
 

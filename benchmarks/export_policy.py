@@ -26,9 +26,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from rlservo.export.bundle import load_bundle
-from rlservo.export.session import open_session
-from rlservo.serve_app.policy import Policy
+from rlservo.export.contract.bundle import load_bundle
+from rlservo.export.contract.onnx_session import open_session
+from rlservo.serve_app.runtime.policy import Policy
 
 ROOT = Path(__file__).resolve().parent.parent
 CHECKPOINT = ROOT / "examples" / "checkpoints" / "ur5_positioning"

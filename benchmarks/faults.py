@@ -33,9 +33,9 @@ from rich.console import Console
 from rich.table import Table
 
 from flood import flood
-from rlservo.export.bundle import ONNX_FILE
-from rlservo.serve_app.client import PolicyClient
-from rlservo.serve_app.stream_client import StreamClient
+from rlservo.export.contract.bundle import ONNX_FILE
+from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.client.stream_client import StreamClient
 from serving import OUT, ROOT
 from speed.asks import Episode, WrongError, askers, episode_of, open_stream
 from speed.catalogue import Case, case_of, rlservo
@@ -275,7 +275,8 @@ def _code(bench: Bench) -> None:
     home = bench.folder / "code"
     home.mkdir(exist_ok=True)
     (home / "changed_app.py").write_text(
-        "from rlservo.serve_app import app\n\n\ndef build(args: app.BuildArguments):\n    return app.build(args)\n"
+        "from rlservo.serve_app.ray_serve import app\n\n\n"
+        "def build(args: app.BuildArguments):\n    return app.build(args)\n"
     )
     bench.cluster.application["import_path"] = "changed_app:build"
     bench.cluster.application["runtime_env"] = {"env_vars": {"PYTHONPATH": str(home)}}
@@ -293,7 +294,7 @@ def _refused(bench: Bench) -> str | None:
 
 def _broken_code(bench: Bench) -> None:
     assert bench.cluster is not None
-    bench.cluster.application["import_path"] = "rlservo.serve_app.app:not_there"
+    bench.cluster.application["import_path"] = "rlservo.serve_app.ray_serve.app:not_there"
 
 
 def _broken_folder(bench: Bench) -> None:
@@ -324,7 +325,7 @@ def autoscale(bench: Bench, row: Row) -> None:
                 "downscale_delay_s": 5,
                 "metrics_interval_s": 1,
                 "look_back_period_s": 3,
-                "policy": {"policy_function": "rlservo.serve_app.scaling:by_load"},
+                "policy": {"policy_function": "rlservo.serve_app.ray_serve.autoscaling:by_load"},
             },
         }
     ]

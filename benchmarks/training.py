@@ -26,9 +26,9 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 
-import training_run
+import shared.training_run as training_run
 
-from rlservo.export.errors import RlservoError
+from rlservo.export.contract.errors import RlservoError
 
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
 

@@ -19,10 +19,10 @@ import typer
 
 import rlservo
 from rlservo.deploy import policy_commands, robot_commands, terminal
-from rlservo.export.errors import RlservoError, UsageError
+from rlservo.export.contract.errors import RlservoError, UsageError
 
 if TYPE_CHECKING:
-    from rlservo.serve_app.acting import ActingPolicy
+    from rlservo.serve_app.interface import ActingPolicy
 
 app = typer.Typer(
     name="rlservo",
@@ -138,10 +138,10 @@ def export(
         raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
     with terminal.errors().status("importing") as status, ExitStack() as fetching:
         with _extra("train"):
-            from rlservo.export.experiment import best_checkpoint
-            from rlservo.export.exporter import LOADING_RUNS_CODE, export_all_modules, export_checkpoint
-            from rlservo.export.remote import fetched
-            from rlservo.export.report import export_report, peak_memory_mb
+            from rlservo.export.checkpoints.experiment import best_checkpoint
+            from rlservo.export.checkpoints.remote import fetched
+            from rlservo.export.commands.export import LOADING_RUNS_CODE, export_all_modules, export_checkpoint
+            from rlservo.export.commands.report import export_report, peak_memory_mb
 
         if metric is not None:
             _note(LOADING_RUNS_CODE.format(path=checkpoint))
@@ -202,7 +202,7 @@ def prune(
     Example: `rlservo prune runs/PPO-.../checkpoint_000015 --out examples/checkpoints/mine`
     """
     with _extra("train"):
-        from rlservo.export.prune import prune_checkpoint
+        from rlservo.export.commands.prune import prune_checkpoint
 
     prune_checkpoint(checkpoint, out, module_id=module_id, app_dir=app_dir, notify=_note)
 
@@ -216,13 +216,13 @@ def inspect(
 
     Example: `rlservo inspect policies/ur5`
     """
-    from rlservo.export.bundle import load_bundle
+    from rlservo.export.contract.bundle import load_bundle
 
     loaded = load_bundle(bundle)
     if as_json:
         _print_json(loaded.contract.model_dump(mode="json"))
     else:
-        from rlservo.export.report import contract_report
+        from rlservo.export.commands.report import contract_report
 
         terminal.output().print(contract_report(loaded.contract))
         terminal.output().print(f"{loaded.path}: all hashes match", markup=False, highlight=False, soft_wrap=True)
@@ -243,8 +243,8 @@ def verify(
     Example: `rlservo verify policies/ur5 --checkpoint runs/best --env rlservo/EndEffectorPositioningURSim-v0`
     """
     with _extra("train"):
-        from rlservo.export.report import verification_report
-        from rlservo.export.verify import verify_bundle
+        from rlservo.export.commands.report import verification_report
+        from rlservo.export.commands.verify import verify_bundle
 
     with terminal.errors().status("reading the bundle") as status:
         result = verify_bundle(
@@ -299,8 +299,8 @@ def serve(
     `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`
     """
     with _extra("serve"):
-        from rlservo.serve_app.launcher import Served, serve_policies
-        from rlservo.serve_app.operator_key import key_file
+        from rlservo.serve_app.ray_serve.launcher import Served, serve_policies
+        from rlservo.serve_app.server.admin_key import key_file
 
     def ready(served: Served) -> None:
         for name, default in served.policies:
@@ -343,7 +343,7 @@ def key(
 
     Example: `rlservo key cell-7`; append the line to a file and name that in RLSERVO_API_KEYS_FILE
     """
-    from rlservo.serve_app.keys import new_key
+    from rlservo.serve_app.server.api_keys import new_key
 
     made, line = new_key(label, admin=admin)
     if as_json:
@@ -400,8 +400,8 @@ def rollout(
     if video is not None:
         choose_gl_backend()
     with _extra("sim"):
-        from rlservo.serve_app.rollout import rollout as run_rollout
-        from rlservo.serve_app.rollout_report import render_report
+        from rlservo.serve_app.rollout.control_loop import rollout as run_rollout
+        from rlservo.serve_app.rollout.report import render_report
 
     with _acting_policy(url, policy, bundle, transport, deadline_ms, server_state, api_key) as acting:
         report = run_rollout(
@@ -438,7 +438,7 @@ def demo(
     """
     choose_gl_backend()
     with _extra("all"):
-        from rlservo.deploy.demo import run_demo
+        from rlservo.deploy.demo.demo import run_demo
 
     run_demo(out, checkpoints=checkpoints, episodes=episodes, console=terminal.output())
 
@@ -458,12 +458,12 @@ def _acting_policy(
 ) -> ActingPolicy:
     """Return the policy to drive with; in process it needs no HTTP client."""
     if bundle is not None:
-        from rlservo.serve_app.policy import Policy
+        from rlservo.serve_app.runtime.policy import Policy
 
         return Policy.load(bundle)
     with _extra("client"):
-        from rlservo.serve_app.client import PolicyClient
-        from rlservo.serve_app.stream_client import StreamClient
+        from rlservo.serve_app.client.policy_client import PolicyClient
+        from rlservo.serve_app.client.stream_client import StreamClient
 
     kind = StreamClient if transport is TransportKind.ws else PolicyClient
     return kind(str(url), name, deadline_ms=deadline_ms, server_state=server_state, api_key=api_key)
@@ -472,7 +472,7 @@ def _acting_policy(
 def _with_fallback(policy: ActingPolicy, fallback: str | None) -> ActingPolicy:
     if fallback is None:
         return policy
-    from rlservo.serve_app.fallback import WithFallback
+    from rlservo.serve_app.rollout.fallback import WithFallback
 
     if fallback in ("hold", "zero", "stop"):
         return WithFallback(policy, fallback)

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlservo.deploy import terminal
-from rlservo.export.errors import UsageError
+from rlservo.export.contract.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from rlservo.serve_app.admin_client import AdminClient
+    from rlservo.serve_app.client.admin_client import AdminClient
 
 policy = typer.Typer(
     help="Say what a running server serves. Versions, aliases, rollback, canary, shadow; on all of its replicas.",
@@ -264,7 +264,7 @@ def _share(pair: str) -> tuple[str, float]:
 @contextlib.contextmanager
 def _client(url: str, key_file: Path | None) -> Iterator[AdminClient]:
     try:
-        from rlservo.serve_app.admin_client import AdminClient, find_key
+        from rlservo.serve_app.client.admin_client import AdminClient, find_key
     except ModuleNotFoundError as error:
         raise UsageError(
             f"this command needs the Python package {error.name!r}: pip install 'rlservo[client]'"

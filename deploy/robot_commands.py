@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from rlservo.deploy import terminal
-from rlservo.export.errors import RlservoError, UsageError
+from rlservo.export.contract.errors import RlservoError, UsageError
 
 robot_server = typer.Typer(
     help="Serve a simulated robot to robo-gym's environments. It is a drop-in for the ROS robot server.",

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 import yaml
-from help_text import DefaultsFormatter
+from shared.help_text import DefaultsFormatter
 
 import rlservo
-from rlservo.serve_app.rollout_report import EpisodeRow, wilson_interval
+from rlservo.serve_app.rollout.report import EpisodeRow, wilson_interval
 
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 EPISODES, SEED = 500, 20_000

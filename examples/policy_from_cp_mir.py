@@ -6,8 +6,8 @@ python examples/policy_from_cp_mir.py --bundle policies/mir100
 
 from __future__ import annotations
 
-import policy_from_cp
-from training_run import main_with_sentences
+import shared.policy_from_cp as policy_from_cp
+from shared.training_run import main_with_sentences
 
 
 def main() -> None:

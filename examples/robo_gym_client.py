@@ -30,8 +30,8 @@ import grpc
 import gymnasium as gym
 import numpy as np
 
-from rlservo.export.errors import RlservoError, UnavailableError
-from rlservo.serve_app.client import PolicyClient
+from rlservo.export.contract.errors import RlservoError, UnavailableError
+from rlservo.serve_app.client.policy_client import PolicyClient
 
 # robo-gym's names, and the policies that examples/robo_gym.md serves for them.
 POLICIES = {

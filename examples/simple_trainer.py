@@ -20,24 +20,24 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-import episode_traces
 import numpy as np
-import resources
-import search_space
-import training_run
+import shared.episode_traces as episode_traces
+import shared.resources as resources
+import shared.search_space as search_space
+import shared.training_run as training_run
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
-from help_text import DefaultsFormatter
 from ray import tune
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import FlattenObservations, MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.models.utils import get_filter_config
 from ray.tune.schedulers import ASHAScheduler, FIFOScheduler, MedianStoppingRule
-from resources import Room
-from training_run import RETURN, STEPS, Run
+from shared.help_text import DefaultsFormatter
+from shared.resources import Room
+from shared.training_run import RETURN, STEPS, Run
 
-from rlservo.export.errors import UsageError
-from rlservo.serve_app.rollout_env import make_env
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.rollout.environment import make_env
 
 ONLINE = ("PPO", "APPO", "IMPALA", "DQN", "SAC")
 ACTIONS: dict[str, tuple[type, ...]] = {"DQN": (Discrete,), "SAC": (Box, Discrete)}

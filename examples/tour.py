@@ -21,15 +21,15 @@ from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
-import training_run
+import shared.training_run as training_run
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordVideo
-from training_run import RETURN, STEPS, Run
+from shared.training_run import RETURN, STEPS, Run
 
 from rlservo import Policy
 from rlservo.deploy.cli import choose_gl_backend
-from rlservo.serve_app.rollout_env import control_rate_of
-from rlservo.serve_app.video import VideoFile
+from rlservo.serve_app.rollout.environment import control_rate_of
+from rlservo.serve_app.rollout.video import VideoFile
 
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
 SHIPPED = Path(__file__).resolve().parent / "checkpoints" / "ur5_positioning"

@@ -33,7 +33,7 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 import evaluate_shipped
 import ray
-import resources
+import shared.resources as resources
 import torch
 import yaml
 from ray import cloudpickle
@@ -41,7 +41,7 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.tune.registry import get_trainable_cls
-from training_run import main_with_sentences
+from shared.training_run import main_with_sentences
 
 from rlservo import Policy, export_checkpoint
 
@@ -249,7 +249,7 @@ def draw(rows: list[Row], title: str, path: Path) -> None:
 
 def install(name: str, folder: Path) -> None:
     """Replace the shipped checkpoint and curve by those of `folder`."""
-    from rlservo.export.prune import prune_checkpoint
+    from rlservo.export.commands.prune import prune_checkpoint
 
     pruned = folder / "pruned"
     shutil.rmtree(pruned, ignore_errors=True)

@@ -12,8 +12,8 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 
-from training_inference import argument_parser, run, shipped_task
-from training_run import main_with_sentences
+from shared.training_inference import argument_parser, run, shipped_task
+from shared.training_run import main_with_sentences
 
 NAVIGATION = shipped_task("mir100_navigation")
 # Its file stops at a success rate, which this script does not; no return is as high as this one.

@@ -10,8 +10,8 @@ settings, its README the command.
 
 from __future__ import annotations
 
-from training_inference import argument_parser, run, shipped_task
-from training_run import main_with_sentences
+from shared.training_inference import argument_parser, run, shipped_task
+from shared.training_run import main_with_sentences
 
 TASK = shipped_task("ur5_positioning")
 

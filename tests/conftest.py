@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+pytest_plugins = ["bundles"]
+
 ROBO_GYM = ["robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1"]
 # What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and
 # pip would settle that with an old robo-gym-server-modules that has no pin and does not work.

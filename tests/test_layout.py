@@ -13,33 +13,37 @@ FOLDERS = ("envs", "export", "serve_app", "deploy")
 # The one file (or folder) that may import a heavy library, by top-level module.
 ONLY_IN = {
     "ray.rllib": (
-        "export/checkpoint.py",
-        "export/pipelines.py",
-        "export/old_stack.py",
-        "export/old_models.py",
+        "export/rllib/new_stack.py",
+        "export/rllib/new_pipelines.py",
+        "export/rllib/old_stack.py",
+        "export/rllib/old_models.py",
         "examples/",
     ),
-    "ray.serve": ("serve_app/app.py", "serve_app/loopback.py", "serve_app/serve_endpoints.py"),
-    "ray.experimental": ("serve_app/ledger.py",),
+    "ray.serve": (
+        "serve_app/ray_serve/app.py",
+        "serve_app/ray_serve/loopback_ports.py",
+        "serve_app/ray_serve/closed_endpoints.py",
+    ),
+    "ray.experimental": ("serve_app/ray_serve/gcs_ledger.py",),
     "fastapi": (
-        "serve_app/http.py",
-        "serve_app/edge.py",
-        "serve_app/oip.py",
-        "serve_app/oip_config.py",
-        "serve_app/docs.py",
-        "serve_app/admin.py",
-        "serve_app/app.py",
+        "serve_app/protocols/json_act.py",
+        "serve_app/protocols/http_endpoint.py",
+        "serve_app/protocols/oip_infer.py",
+        "serve_app/protocols/oip_config.py",
+        "serve_app/protocols/docs_page.py",
+        "serve_app/protocols/admin_routes.py",
+        "serve_app/ray_serve/app.py",
     ),
     "mujoco": ("envs/",),
     "grpc": (
         "envs/robot_server/",
-        "serve_app/oip_grpc.py",
-        "serve_app/grpc_ingress.py",
-        "serve_app/serve_endpoints.py",
+        "serve_app/protocols/oip_grpc.py",
+        "serve_app/ray_serve/grpc_ingress.py",
+        "serve_app/ray_serve/closed_endpoints.py",
     ),
-    "google.protobuf": ("envs/robot_server/", "serve_app/oip_grpc.py", "serve_app/oip_messages.py"),
+    "google.protobuf": ("envs/robot_server/", "serve_app/protocols/oip_grpc.py", "serve_app/protocols/oip_messages.py"),
     "torch": ("export/",),
-    "pickle": ("export/unpickle.py",),
+    "pickle": ("export/checkpoints/unpickle.py",),
 }
 
 
@@ -71,11 +75,11 @@ def test_module_imports_only_what_the_design_allows(path: Path) -> None:
         "export": {"rlservo.export"},
         "serve_app": {
             "rlservo.serve_app",
-            "rlservo.export.errors",
-            "rlservo.export.regular_files",
-            "rlservo.export.bundle",
-            "rlservo.export.scores",
-            "rlservo.export.session",
+            "rlservo.export.contract.errors",
+            "rlservo.export.contract.regular_files",
+            "rlservo.export.contract.bundle",
+            "rlservo.export.contract.scores",
+            "rlservo.export.contract.onnx_session",
         },
         "deploy": {f"rlservo.{name}" for name in FOLDERS},
     }[folder]
@@ -97,7 +101,7 @@ def test_heavy_library_has_its_named_place(library: str) -> None:
 
 def test_client_imports_no_server_code() -> None:
     seen: set[str] = set()
-    queue = ["rlservo.serve_app.client"]
+    queue = ["rlservo.serve_app.client.policy_client"]
     while queue:
         name = queue.pop()
         path = ROOT / Path(*name.split(".")[1:]).with_suffix(".py")
@@ -105,7 +109,7 @@ def test_client_imports_no_server_code() -> None:
             continue
         seen.add(name)
         queue += [n for n in imports_of(path) if n.startswith("rlservo.")]
-    assert "rlservo.serve_app.client" in seen
+    assert "rlservo.serve_app.client.policy_client" in seen
     assert not seen & {f"rlservo.serve_app.{name}" for name in ("http", "app", "store", "launcher", "policy")}
 
 

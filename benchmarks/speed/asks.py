@@ -16,10 +16,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.bundle import load_bundle
-from rlservo.export.errors import DeadlineError, RlservoError, SessionError, SessionLostError, UnavailableError
-from rlservo.serve_app.arrays import unpack
-from rlservo.serve_app.policy import Policy
+from rlservo.export.contract.bundle import load_bundle
+from rlservo.export.contract.errors import DeadlineError, RlservoError, SessionError, SessionLostError, UnavailableError
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.wire.msgpack_arrays import unpack
 from speed.catalogue import Case, binary, plain
 from speed.loads import GrpcLine, HttpLine, LoadError, WebSocketLine
 from speed.rounds import session_of

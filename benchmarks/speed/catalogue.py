@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.bundle import ONNX_FILE, Bundle, load_bundle
-from rlservo.serve_app.arrays import pack
-from rlservo.serve_app.processes import free_ports
+from rlservo.export.contract.bundle import ONNX_FILE, Bundle, load_bundle
+from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.wire.msgpack_arrays import pack
 from speed.environments import InstallError, python_of
 from speed.servers import Exchange, Server
 

@@ -18,8 +18,8 @@ from typing import Any
 
 import yaml
 
-from rlservo.serve_app.haproxy import find_binary, prepare
-from rlservo.serve_app.processes import free_ports
+from rlservo.serve_app.ray_serve.haproxy_wrapper import find_binary, prepare
+from rlservo.serve_app.ray_serve.processes import free_ports
 from speed.catalogue import Case, asked
 from speed.servers import Server, environment
 

@@ -15,15 +15,15 @@ from __future__ import annotations
 
 TYPE_CHECKING = False  # type checkers read the name as true; importing it from `typing` takes milliseconds
 if TYPE_CHECKING:
-    from rlservo.export import errors
-    from rlservo.export.exporter import export_checkpoint
-    from rlservo.serve_app.acting import ActingPolicy
-    from rlservo.serve_app.admin_client import AdminClient
-    from rlservo.serve_app.client import PolicyClient
-    from rlservo.serve_app.fallback import WithFallback
-    from rlservo.serve_app.policy import Policy
-    from rlservo.serve_app.rollout import rollout
-    from rlservo.serve_app.stream_client import StreamClient
+    from rlservo.export.commands.export import export_checkpoint
+    from rlservo.export.contract import errors
+    from rlservo.serve_app.client.admin_client import AdminClient
+    from rlservo.serve_app.client.policy_client import PolicyClient
+    from rlservo.serve_app.client.stream_client import StreamClient
+    from rlservo.serve_app.interface import ActingPolicy
+    from rlservo.serve_app.rollout.control_loop import rollout
+    from rlservo.serve_app.rollout.fallback import WithFallback
+    from rlservo.serve_app.runtime.policy import Policy
 
     __version__: str
 
@@ -42,15 +42,15 @@ __all__ = [
 
 # Public name -> the module that holds it.
 _MODULES = {
-    "ActingPolicy": "rlservo.serve_app.acting",
-    "AdminClient": "rlservo.serve_app.admin_client",
-    "Policy": "rlservo.serve_app.policy",
-    "PolicyClient": "rlservo.serve_app.client",
-    "StreamClient": "rlservo.serve_app.stream_client",
-    "WithFallback": "rlservo.serve_app.fallback",
-    "errors": "rlservo.export",
-    "export_checkpoint": "rlservo.export.exporter",
-    "rollout": "rlservo.serve_app.rollout",
+    "ActingPolicy": "rlservo.serve_app.interface",
+    "AdminClient": "rlservo.serve_app.client.admin_client",
+    "Policy": "rlservo.serve_app.runtime.policy",
+    "PolicyClient": "rlservo.serve_app.client.policy_client",
+    "StreamClient": "rlservo.serve_app.client.stream_client",
+    "WithFallback": "rlservo.serve_app.rollout.fallback",
+    "errors": "rlservo.export.contract",
+    "export_checkpoint": "rlservo.export.commands.export",
+    "rollout": "rlservo.serve_app.rollout.control_loop",
 }
 
 # The extra that installs what a name needs beyond the in-process runtime.

@@ -21,11 +21,11 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from rich.console import Console
 
 import soak as soak_module
-from rlservo.serve_app.arrays import pack, unpack
-from rlservo.serve_app.http import create_app
-from rlservo.serve_app.processes import free_ports
-from rlservo.serve_app.settings import ServerSettings
-from rlservo.serve_app.store import PolicyStore
+from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 from soak import Track, mix, soak
 from speed import report
 from speed.catalogue import BARE, RLLIB, RLSERVO, TWO, Case, binary, case_of, plain

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from rlservo.deploy.cli import parse_env_arguments
-from rlservo.export.errors import UsageError
+from rlservo.export.contract.errors import UsageError
 
 ROOT = Path(__file__).resolve().parents[2]
 UR5 = ROOT / "examples" / "checkpoints" / "ur5_positioning"
@@ -253,8 +253,8 @@ def test_env_arguments_are_json_or_strings() -> None:
 
 
 def test_key_makes_a_key_and_the_line_that_the_server_accepts_it_by() -> None:
-    from rlservo.serve_app.keys import Keys, Role
-    from rlservo.serve_app.settings import ServerSettings
+    from rlservo.serve_app.server.api_keys import Keys, Role
+    from rlservo.serve_app.server.settings import ServerSettings
 
     done = rlservo("key", "operator", "--admin", "--json")
     assert done.returncode == 0, done.stderr

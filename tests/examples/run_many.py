@@ -20,7 +20,7 @@ sys.path.insert(0, str(EXAMPLES))
 
 def main(name: str) -> None:
     script = importlib.import_module(name)
-    from training_run import main_with_sentences
+    from shared.training_run import main_with_sentences
 
     done = []
     for arguments in json.load(sys.stdin):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.serve_app.policy import Policy
+from rlservo.serve_app.runtime.policy import Policy
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rlservo.export.exporter import export_checkpoint
+from rlservo.export.commands.export import export_checkpoint
 
 CHECKPOINTS = Path(__file__).resolve().parents[2] / "examples" / "checkpoints"
 ROBOTS = [("policy_from_cp_ur.py", "ur5_positioning"), ("policy_from_cp_mir.py", "mir100_navigation")]

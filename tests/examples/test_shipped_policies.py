@@ -19,8 +19,8 @@ from typing import Any
 import pytest
 import yaml
 
-from rlservo.export.exporter import export_checkpoint
-from rlservo.serve_app.policy import Policy
+from rlservo.export.commands.export import export_checkpoint
+from rlservo.serve_app.runtime.policy import Policy
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SHIPPED = EXAMPLES / "checkpoints"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.serve_app.policy import Policy
+from rlservo.serve_app.runtime.policy import Policy
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
@@ -54,7 +54,7 @@ def test_traces_are_whole_episodes_of_what_was_sent_to_the_environment(
     sweep: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    from episode_traces import read_traces
+    from shared.episode_traces import read_traces
 
     episodes = list(read_traces(sweep.home / "traces"))
     ended = [one for one in episodes if one.ended]
@@ -200,7 +200,7 @@ def test_fault_tolerance_and_evaluation_flags_become_rllibs(trainer: Any) -> Non
 
 
 def test_search_space_reads_values_and_ranges(trainer: Any, tmp_path: Path) -> None:
-    import search_space
+    import shared.search_space as search_space
 
     file = tmp_path / "space.yaml"
     file.write_text("lr: {loguniform: [1e-5, 1e-3]}\ngamma: [0.9, 0.99]\nminibatch_size: {choice: [64, 128]}\n")

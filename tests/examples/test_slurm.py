@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from rlservo.serve_app.processes import free_ports
+from rlservo.serve_app.ray_serve.processes import free_ports
 
 TINY = ("--set", "train_batch_size_per_learner=400", "--hidden", "16")
 ROOT = Path(__file__).resolve().parents[2]

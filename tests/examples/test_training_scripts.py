@@ -83,7 +83,7 @@ def test_scripts_train_with_the_settings_beside_the_policy_that_ships(
     script: str, task: str, policy: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    common = importlib.import_module("training_inference")
+    common = importlib.import_module("shared.training_inference")
     chosen = getattr(importlib.import_module(script), task)
     args = common.argument_parser(chosen, "").parse_args([])
     settings = yaml.safe_load((EXAMPLES / "checkpoints" / policy / "training.yaml").read_text())

@@ -14,9 +14,9 @@ from pathlib import Path
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 sys.path[:0] = [str(EXAMPLES), str(Path(__file__).parent / "app")]
 
-import episode_traces  # noqa: E402
+import shared.episode_traces as episode_traces  # noqa: E402
+import shared.training_run as training_run  # noqa: E402
 import simple_trainer  # noqa: E402
-import training_run  # noqa: E402
 
 RUNS = {
     "Float64": ["--set", "vf_clip_param=100.0", "--observation-filter", "MeanStdFilter"],

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from rlservo.export.threads import one_thread
+from rlservo.export.graph.one_thread import one_thread
 
-HERE = Path(__file__).parent
-APP = HERE / "app"
+ZOO = Path(__file__).resolve().parents[1] / "zoo"
+APP = ZOO / "app"
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -44,7 +44,7 @@ def trained(script: str) -> Iterator[Path]:
     folder = Path(tempfile.mkdtemp(prefix="zoo-"))
     # With the token in its environment Ray writes none to the user's home.
     environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
-    command = [sys.executable, "-W", "ignore", str(HERE / script), str(folder)]
+    command = [sys.executable, "-W", "ignore", str(ZOO / script), str(folder)]
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=580)
         assert done.returncode == 0, done.stderr[-3000:]

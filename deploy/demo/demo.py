@@ -1,0 +1,239 @@
+"""The whole path in one command: export two checkpoints, serve them, drive two robots, show what happened.
+
+Exporting and serving run as the very commands a user would type, in processes of their own; the loop runs here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from typing_extensions import Self
+
+from rlservo.deploy.demo.picture import Robot, RobotRun, Trace, draw_picture, film
+from rlservo.export.contract.bundle import Contract
+from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
+from rlservo.serve_app.interface import Observation
+from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.rollout.control_loop import rollout
+
+FIRST_SEED = 10_000  # not among the seeds the policies were trained with
+START_TIMEOUT_S = 120.0
+STOP_TIMEOUT_S = 30.0
+
+
+ROBOTS = (
+    Robot(
+        policy="ur5",
+        checkpoint="ur5_positioning",
+        env_id="rlservo/EndEffectorPositioningURSim-v0",
+        title="UR5",
+        success_distance_m=0.1,
+    ),
+    Robot(
+        policy="mir100",
+        checkpoint="mir100_navigation",
+        env_id="rlservo/NoObstacleNavigationMir100Sim-v0",
+        title="MiR100",
+        success_distance_m=0.2,
+    ),
+)
+
+
+def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -> None:
+    """Run the demo and leave bundles, `demo.png` and the server's log in `out`.
+
+    Raises UsageError when the checkpoints are not there, RlservoError when a step fails; the server is always stopped.
+    """
+    for robot in ROBOTS:
+        if not (checkpoints / robot.checkpoint).is_dir():
+            raise UsageError(
+                f"{checkpoints / robot.checkpoint} does not exist: run this in a checkout of rlservo, or name the "
+                "folder of its example checkpoints with --checkpoints"
+            )
+    repository = out / "policies"
+    shutil.rmtree(repository, ignore_errors=True)  # the only thing here that an earlier run would get in the way of
+    out.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic()
+
+    console.rule("1  export: RLlib checkpoint to policy bundle")
+    for robot in ROBOTS:
+        _command(
+            console, "export", str(checkpoints / robot.checkpoint), "--out", str(repository), "--name", robot.policy
+        )
+
+    console.rule("2  serve: both policies on one Ray Serve endpoint")
+    runs: list[RobotRun] = []
+    counts = ("--episodes", str(episodes), "--seed", str(FIRST_SEED))
+    with _ends_like_ctrl_c(), _server(console, repository, out / "server.log") as url:
+        console.rule(f"3  drive: {episodes} episodes each, every action over HTTP")
+        for robot in ROBOTS:
+            _show(console, "rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts)
+            with PolicyClient(url, robot.policy) as policy, console.status("driving ..."):
+                traces: list[Trace] = []
+                report = rollout(_Recorder(policy, traces), robot.env_id, episodes=episodes, seed=FIRST_SEED)
+                if report.interrupted:
+                    raise KeyboardInterrupt
+                longest = max(report.episodes, key=lambda row: (bool(row.success), row.steps))
+                frames = film(policy, robot.env_id, seed=FIRST_SEED + longest.index, note=console.print)
+                runs.append(RobotRun(robot, report, traces, frames))
+    picture = draw_picture(out / "demo.png", runs)
+    console.rule("4  result")
+    console.print(_table(runs))
+    console.print(
+        f"picture: {picture}   bundles: {repository}   {time.monotonic() - started:.0f} s in all", markup=False
+    )
+
+
+class _Recorder:
+    """Passes every call on to the policy and notes the observations, episode by episode."""
+
+    def __init__(self, policy: PolicyClient, traces: list[Trace]) -> None:
+        self._policy = policy
+        self._traces = traces
+
+    @property
+    def contract(self) -> Contract:
+        return self._policy.contract
+
+    def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> Any:
+        self._traces[-1].append(float(np.asarray(obs)[0]))  # both robots' first element is the distance to the target
+        return self._policy.act(obs, explore=explore, seed=seed)
+
+    def reset(self) -> None:
+        self._traces.append([])
+        self._policy.reset()
+
+    def close(self) -> None:
+        self._policy.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _command(console: Console, *words: str) -> None:
+    """Show and run one rlservo command; its output goes to the terminal."""
+    _show(console, *words)
+    done = subprocess.run([sys.executable, "-m", "rlservo.deploy.cli", *words])
+    if done.returncode != 0:
+        raise RlservoError(f"`rlservo {words[0]}` ended with exit code {done.returncode}")
+
+
+def _show(console: Console, *words: str) -> None:
+    console.print(f"$ rlservo {shlex.join(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
+    """Run `rlservo serve` on a free port until the block ends; stop it as Ctrl-C would."""
+    (port,) = free_ports(1)
+    words = ("serve", str(repository), "--port", str(port))
+    _show(console, *words)
+    url = f"http://127.0.0.1:{port}"
+    with log.open("wb") as stream:
+        # A session of its own: a Ctrl-C at the terminal reaches us alone, and we pass it on once.
+        server = subprocess.Popen(
+            [sys.executable, "-m", "rlservo.deploy.cli", *words],
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            preexec_fn=_end_with_parent,
+        )
+        try:
+            with console.status("starting Ray Serve (about 10 s) ..."):
+                _wait_until_ready(server, url, log)
+            console.print(f"serving at {url} (its log: {log})", markup=False)
+            yield url
+        finally:
+            with console.status("stopping the server ..."):
+                _stop(server)
+
+
+@contextmanager
+def _ends_like_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM and a closed terminal stop the server too, as Ctrl-C does."""
+
+    def interrupt(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end_with_parent() -> None:
+    """Have the kernel send the server SIGTERM when this process is killed (Linux: PR_SET_PDEATHSIG)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+
+
+def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> None:
+    deadline = time.monotonic() + START_TIMEOUT_S
+    with PolicyClient(url, ROBOTS[0].policy, timeout_s=2.0, retries=0) as probe:
+        while True:
+            if server.poll() is not None:
+                raise RlservoError(f"the server ended while starting: {_last_line(log)}")
+            try:
+                probe.wait_until_ready(timeout_s=1.0)
+                return
+            except UnavailableError:
+                if time.monotonic() > deadline:
+                    raise RlservoError(f"the server was not ready after {START_TIMEOUT_S:.0f} s: see {log}") from None
+
+
+def _last_line(log: Path) -> str:
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1] if lines else f"it printed nothing to {log}"
+
+
+def _stop(server: subprocess.Popen[bytes]) -> None:
+    if server.poll() is None:
+        server.send_signal(signal.SIGINT)
+    try:
+        server.wait(STOP_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        server.send_signal(signal.SIGTERM)
+        server.wait(STOP_TIMEOUT_S)
+
+
+def _table(runs: list[RobotRun]) -> Table:
+    table = Table(title="Every action asked of the server, random targets, means over the episodes")
+    table.add_column("robot", no_wrap=True)
+    for column in ("at the target", "return", "time", "answer p50", "answer p99", "later than 100 ms"):
+        table.add_column(column, justify="right")
+    for run in runs:
+        report = run.report
+        latency = report.latency_ms
+        rate = report.control_rate_hz or 10.0
+        table.add_row(
+            run.robot.title,
+            f"{report.successes} of {len(report.episodes)}",
+            f"{report.return_mean:.2f}",
+            f"{(report.length_mean or 0.0) / rate:.1f} s",
+            f"{latency.p50:.2f} ms" if latency else "-",
+            f"{latency.p99:.2f} ms" if latency else "-",
+            f"{report.deadline_misses} of {report.steps}",
+        )
+    return table

@@ -1,0 +1,115 @@
+"""The demo's picture: each robot at the start, midway and at the end of an episode, and all episodes as curves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.interface import ActingPolicy
+from rlservo.serve_app.rollout.environment import make_env
+from rlservo.serve_app.rollout.report import RolloutReport
+from rlservo.serve_app.rollout.video import rgb_frame
+
+Trace: TypeAlias = list[float]  # distance to the target [m] before each action of one episode
+Frame: TypeAlias = NDArray[np.uint8]  # (height, width, 3)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One shipped policy and the simulator it drives."""
+
+    policy: str
+    checkpoint: str
+    env_id: str
+    title: str
+    success_distance_m: float
+
+
+@dataclass(frozen=True)
+class RobotRun:
+    """What the demo saw of one robot; `frames` is empty where the machine cannot draw."""
+
+    robot: Robot
+    report: RolloutReport
+    traces: list[Trace]
+    frames: list[Frame]
+
+
+def film(policy: ActingPolicy, env_id: str, *, seed: int, note: Callable[[str], object]) -> list[Frame]:
+    """Return the first, middle and last picture of one episode; none, with a note, where the machine cannot draw."""
+    try:
+        env = make_env(env_id, {}, render=True)
+    except UsageError as error:
+        note(f"no pictures of the robots: {error.message}")
+        return []
+    frames: list[Frame] = []
+    try:
+        obs, _ = env.reset(seed=seed)
+        policy.reset()
+        frames.append(rgb_frame(env))
+        ended = False
+        while not ended:
+            obs, _, terminated, truncated, _ = env.step(policy.act(obs))
+            frames.append(rgb_frame(env))
+            ended = terminated or truncated
+    except UsageError as error:
+        note(f"no pictures of the robots: {error.message}")
+        return []
+    finally:
+        env.close()
+    return [frames[0], frames[len(frames) // 2], frames[-1]]
+
+
+def draw_picture(file: Path, runs: list[RobotRun]) -> Path:
+    """Write the picture as PNG and return its path."""
+    from matplotlib.figure import Figure  # the object interface: no window system, no global state
+
+    filmed = any(run.frames for run in runs)
+    columns = 4 if filmed else 1
+    figure = Figure(figsize=(4.0 * columns + (1.5 if filmed else 4.0), 3.6 * len(runs)), layout="constrained")
+    grid = figure.add_gridspec(len(runs), columns, width_ratios=[1, 1, 1, 1.3][-columns:])
+    for row, run in enumerate(runs):
+        for column, frame in enumerate(run.frames):
+            axes = figure.add_subplot(grid[row, column])
+            height = frame.shape[0]
+            axes.imshow(frame[height // 8 : -height // 8])  # sky above and floor below say little
+            axes.set_axis_off()
+            axes.set_title(f"{run.robot.title}, {('start', 'midway', 'end')[column]}", fontsize=10)
+        _draw_curves(figure.add_subplot(grid[row, -1]), run)
+    figure.savefig(file, dpi=110)
+    return file
+
+
+def _draw_curves(axes: Any, run: RobotRun) -> None:
+    rate = run.report.control_rate_hz or 10.0
+    for trace, episode in zip(run.traces, run.report.episodes, strict=True):
+        seconds = np.arange(len(trace)) / rate
+        axes.plot(seconds, trace, color="#2a6fb0" if episode.success else "#c0392b", alpha=0.6, linewidth=1.2)
+        axes.plot(seconds[-1:], trace[-1:], "o", color="#2a6fb0" if episode.success else "#c0392b", markersize=3)
+    axes.axhline(run.robot.success_distance_m, color="#2e7d32", linestyle="--", linewidth=1)
+    axes.text(
+        0.99,
+        run.robot.success_distance_m,
+        "success ",
+        color="#2e7d32",
+        ha="right",
+        va="bottom",
+        fontsize=8,
+        transform=axes.get_yaxis_transform(),
+    )
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("distance to target before each action [m]")
+    axes.set_ylim(bottom=0)
+    axes.set_xlim(left=0)
+    axes.grid(alpha=0.25)
+    latency = run.report.latency_ms
+    answer = f", answer in {latency.p50:.2f} ms (median)" if latency else ""
+    axes.set_title(
+        f"{run.robot.title}: {run.report.successes} of {len(run.report.episodes)} at the target{answer}", fontsize=10
+    )

@@ -1,0 +1,1 @@
+"""Library of the example scripts: training runs, command lines, search spaces, episode traces."""

@@ -1,0 +1,249 @@
+"""Find the files of a checkpoint: from whatever folder a person points at to the folders the exporter reads.
+
+This file only looks at names. It opens no pickle and knows nothing of RLlib, so it can say what is wrong with a path
+before anything heavy is imported or any code in the checkpoint is run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal, TypeAlias
+
+from rlservo.export.checkpoints.old_location import OldStackFiles, locate_policy, old_stack_root, policy_ids
+from rlservo.export.contract.errors import CheckpointError, UnsupportedError
+
+MODULES = Path("learner_group") / "learner" / "rl_module"
+RUNNERS = ("env_runner", "eval_env_runner")
+"""Where the connectors are; an algorithm that trains from recorded data has a runner only if it was evaluated."""
+ENV_TO_MODULE = "env_to_module_connector"
+MODULE_TO_ENV = "module_to_env_connector"
+CTOR_FILE = "class_and_ctor_args.pkl"
+STATE_STEMS = {"module": "module_state", "connector": "state"}
+STATE_SUFFIXES = (".pkl", ".msgpack")
+DEFAULT_MODULE = "default_policy"
+FACTS_FILE = "rlservo_facts.json"
+"""Written by `prune.py` in place of RLlib's own configuration pickles."""
+
+_BEFORE_COMPONENTS = Path("learner") / "module_state"
+_TUNE_CHECKPOINT = re.compile(r"checkpoint_(\d{6,})")
+
+
+@dataclass(frozen=True)
+class CheckpointFiles:
+    """The folders of one policy in one new-stack algorithm checkpoint, or of one RLModule alone.
+
+    An algorithm that trains from recorded data may have no environment runner, and then no connector folders either.
+    """
+
+    api_stack: ClassVar[Literal["new"]] = "new"
+
+    root: Path
+    module_id: str
+    alone: bool = False
+    part: bool = False  # of a MultiRLModule that was saved by itself
+    agent_id: str | None = None
+    """The agent that was asked for, where the module serves several."""
+
+    @property
+    def is_one_of_several(self) -> bool:
+        """Whether the policy goes by an id of its own, and may have others beside it."""
+        return self.module_id != DEFAULT_MODULE and (self.part or not self.alone)
+
+    @property
+    def module(self) -> Path:
+        return self.root if self.alone else self.root / MODULES / self.module_id
+
+    @property
+    def runner(self) -> Path:
+        """The environment runner's folder, which holds the connector pipelines; it may not exist."""
+        return next((self.root / name for name in RUNNERS if (self.root / name).is_dir()), self.root / RUNNERS[0])
+
+    @property
+    def has_pipelines(self) -> bool:
+        """Whether the checkpoint holds the connector pipelines, with what they have learned."""
+        return self.runner.is_dir()
+
+    @property
+    def env_to_module(self) -> Path:
+        return self.runner / ENV_TO_MODULE
+
+    @property
+    def module_to_env(self) -> Path:
+        return self.runner / MODULE_TO_ENV
+
+    def files(self) -> list[Path]:
+        """Return every file that decides what the policy does, in a fixed order."""
+        folders = (self.module, self.env_to_module, self.module_to_env)
+        found = {file for folder in folders for file in folder.rglob("*") if file.is_file()}
+        if not self.has_pipelines and not self.alone:
+            found.add(self.root / CTOR_FILE)  # the configuration they are built from
+        if self.is_one_of_several and self.together.is_file():
+            found.add(self.together)
+        return sorted(found)
+
+    @property
+    def together(self) -> Path:
+        """The file that says of which class the modules are parts."""
+        return self.root / MODULES / CTOR_FILE
+
+    def sha256(self) -> str:
+        """Return a hash over those files' names and contents: the same for a checkpoint and its pruned copy."""
+        digest = hashlib.sha256()
+        for file in self.files():
+            digest.update(file.relative_to(self.root).as_posix().encode() + b"\0")
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+        return digest.hexdigest()
+
+
+Files: TypeAlias = CheckpointFiles | OldStackFiles
+"""Where one policy is, on either API stack."""
+
+
+def locate_checkpoint(path: str | Path, module_id: str | None = None, agent_id: str | None = None) -> Files:
+    """Return the files of one policy.
+
+    `path` may be an algorithm checkpoint of either API stack, a folder inside one (such as its RLModule or policy
+    folder), an old-stack policy's folder on its own, or a Tune trial folder, of which the newest `checkpoint_NNNNNN` is
+    taken.
+
+    Raises CheckpointError when there is nothing to read, UnsupportedError when it is of a kind that is not exported.
+    """
+    given = Path(path).expanduser().absolute()
+    if not given.exists():
+        raise CheckpointError(f"{given} does not exist: expected the folder of an RLlib checkpoint")
+    if not given.is_dir():
+        raise CheckpointError(f"{given} is a file: expected the folder of an RLlib checkpoint")
+    root = _find_root(given)
+    if _is_module(root):
+        parts = _parts(root)
+        if parts:
+            module_id = _choose(root, parts, module_id)
+            root /= module_id
+        alone = CheckpointFiles(root, module_id or DEFAULT_MODULE, alone=True, part=bool(parts))
+        _check_complete(alone)
+        return alone
+    if not (root / MODULES).is_dir():
+        if agent_id is not None:
+            raise CheckpointError(f"{root} is of the old API stack, whose policies filter alike for all their agents: "
+                                  "leave --agent-id out")  # fmt: skip
+        return locate_policy(root, given, module_id)
+    if root != given and (root / MODULES) in given.parents and module_id is None:
+        module_id = given.relative_to(root / MODULES).parts[0]
+    files = CheckpointFiles(root, _choose_module(root, module_id), agent_id=agent_id)
+    _check_complete(files)
+    return files
+
+
+def locate_modules(path: str | Path) -> list[Files]:
+    """Return the files of every policy of a checkpoint, by module id (old API stack: policy id).
+
+    Raises what `locate_checkpoint` raises.
+    """
+    given = Path(path).expanduser().absolute()
+    root = _find_root(given) if given.is_dir() else given
+    ids = _present_modules(root) or policy_ids(root) or (_parts(root) if root.is_dir() else [])
+    return [locate_checkpoint(root, module_id) for module_id in ids] or [locate_checkpoint(given)]
+
+
+def _find_root(given: Path) -> Path:
+    """Return the algorithm checkpoint that `given` is, lies in, or holds."""
+    for folder in (given, *given.parents):
+        if (folder / MODULES).is_dir():
+            return folder
+    if (given / _BEFORE_COMPONENTS).is_dir():
+        raise UnsupportedError(
+            f"{given} holds its modules in {_BEFORE_COMPONENTS}/, as a Ray before 2.33 wrote them on the new API "
+            "stack, without connectors and in a form today's RLlib cannot restore: train again with a later Ray and "
+            "export that"
+        )
+    if old := old_stack_root(given):
+        return old
+    if newest := _newest_checkpoint(given):
+        return _find_root(newest)
+    if _is_module(given):
+        return given
+    trials = [trial for trial in sorted(given.iterdir()) if trial.is_dir() and _newest_checkpoint(trial)]
+    if len(trials) == 1:
+        return _find_root(trials[0])
+    if trials:
+        names = ", ".join(trial.name for trial in trials[:4]) + (", ..." if len(trials) > 4 else "")
+        raise CheckpointError(f"{given} holds {len(trials)} trials with checkpoints ({names}): name one of them")
+    raise CheckpointError(
+        f"{given} is not an RLlib checkpoint: looked for {MODULES}/ (an algorithm checkpoint of the new API stack), "
+        "policies/ (the old stack) and checkpoint_NNNNNN/ (a Tune trial), found none of them"
+    )
+
+
+def _is_module(folder: Path) -> bool:
+    """Return whether `folder` is an RLModule that was saved, or copied, by itself."""
+    return any((folder / f"{STATE_STEMS['module']}{suffix}").is_file() for suffix in STATE_SUFFIXES)
+
+
+def _parts(folder: Path) -> list[str]:
+    """Return the modules in the folder of a MultiRLModule that was saved by itself."""
+    return sorted(child.name for child in folder.iterdir() if child.is_dir() and _is_module(child))
+
+
+def _newest_checkpoint(folder: Path) -> Path | None:
+    numbered = [
+        (int(match[1]), child)
+        for child in folder.iterdir()
+        if (match := _TUNE_CHECKPOINT.fullmatch(child.name)) and child.is_dir()
+    ]
+    return max(numbered)[1] if numbered else None
+
+
+def _present_modules(root: Path) -> list[str]:
+    folder = root / MODULES
+    return sorted(child.name for child in folder.iterdir() if (child / CTOR_FILE).is_file()) if folder.is_dir() else []
+
+
+def _choose_module(root: Path, module_id: str | None) -> str:
+    present = _present_modules(root)
+    if not present and module_id is None:
+        raise CheckpointError(f"{root / MODULES} holds no module: looked for <module id>/{CTOR_FILE}")
+    return _choose(root, present, module_id)
+
+
+def _choose(root: Path, present: Sequence[str], module_id: str | None) -> str:
+    """Return the module that is asked for, or the only one. Raises CheckpointError."""
+    if module_id is not None and module_id not in present:
+        raise CheckpointError(f"{root} has no module '{module_id}': it holds {', '.join(present) or 'none'}")
+    if module_id is None and len(present) > 1:
+        raise CheckpointError(
+            f"{root} holds {len(present)} modules ({', '.join(present)}): name the one to export with --module-id, or "
+            "export each of them with --all-modules"
+        )
+    return module_id or present[0]
+
+
+def _check_complete(files: CheckpointFiles) -> None:
+    if (files.module / "state.pkl").is_file() and not _is_module(files.module):
+        raise UnsupportedError(
+            f"{files.module} holds its weights in state.pkl, as the first Rays with such checkpoints wrote them "
+            "(2.33 and some after it), where today's RLlib looks for module_state.pkl: it cannot restore them; train "
+            "again with a later Ray and export that"
+        )
+    needed = [(files.module, STATE_STEMS["module"], "the weights")]
+    pipelines = (
+        (files.env_to_module, STATE_STEMS["connector"], "the observation filter and other steps before the network"),
+        (files.module_to_env, STATE_STEMS["connector"], "the action scaling and other steps after the network"),
+    )
+    if files.has_pipelines:
+        needed += pipelines
+    elif not files.alone and not (files.root / CTOR_FILE).is_file():
+        raise CheckpointError(
+            f"{files.root} is incomplete: it has neither {RUNNERS[0]}/ (the connector pipelines) nor "
+            f"{CTOR_FILE} (the configuration they are built from)"
+        )
+    for folder, stem, what in needed:
+        for present, name in (
+            ((folder / CTOR_FILE).is_file(), CTOR_FILE),
+            (any((folder / f"{stem}{suffix}").is_file() for suffix in STATE_SUFFIXES), f"{stem}.pkl"),
+        ):
+            if not present:
+                raise CheckpointError(f"{files.root} is incomplete: {folder.relative_to(files.root) / name} ({what})")

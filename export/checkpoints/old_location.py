@@ -1,0 +1,130 @@
+"""Find the files of an old-API-stack checkpoint: `policies/<policy id>/policy_state.pkl`, or such a folder on its own.
+
+Like `location.py` it only looks at names, opens no pickle and knows nothing of RLlib.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from rlservo.export.contract.errors import CheckpointError, UnsupportedError
+
+POLICIES = "policies"
+POLICY_STATE = "policy_state.pkl"
+ALGORITHM_STATE = "algorithm_state.pkl"
+DEFAULT_POLICY = "default_policy"
+
+_MARKER = "rllib_checkpoint.json"
+_MSGPACK_STATES = ("policy_state.msgpck", "policy_state.msgpack")
+
+
+@dataclass(frozen=True)
+class OldStackFiles:
+    """One policy of an old-stack checkpoint; its state file exists."""
+
+    api_stack: ClassVar[Literal["old"]] = "old"
+
+    root: Path
+    """The algorithm checkpoint; the policy's own folder where that is all there is."""
+    module_id: str
+    """The policy's id, under the name the rest of the exporter has for it."""
+    agent_id: ClassVar[None] = None
+
+    @property
+    def is_one_of_several(self) -> bool:
+        """Whether the policy goes by an id of its own, and may have others beside it."""
+        return self.policy != self.root and self.module_id != DEFAULT_POLICY
+
+    @property
+    def policy(self) -> Path:
+        inside = self.root / POLICIES / self.module_id
+        return inside if inside.is_dir() else self.root
+
+    @property
+    def state(self) -> Path:
+        return self.policy / POLICY_STATE
+
+    def files(self) -> list[Path]:
+        """Return every file that decides what the policy does."""
+        return [self.state]
+
+    def sha256(self) -> str:
+        """Return a hash over the state's contents: the same for a checkpoint, its pruned copy and its policy folder."""
+        return hashlib.sha256(self.state.read_bytes()).hexdigest()
+
+
+def old_stack_root(given: Path) -> Path | None:
+    """Return the algorithm checkpoint (or lone policy folder) of the old stack that `given` is or lies in, if any.
+
+    Raises UnsupportedError for one that is too old to say what surrounds its network.
+    """
+    inside = {POLICIES: given.parent} if given.name == POLICIES else {}
+    if given.parent.name == POLICIES:
+        inside[POLICIES] = given.parent.parent
+    for folder in (given, *inside.values()):
+        if policy_ids(folder):
+            return folder
+    if _has_state(given):
+        return given
+    if any(re.fullmatch(r"checkpoint-\d+", child.name) for child in given.iterdir()) or _major_version(given) == "0":
+        raise UnsupportedError(
+            f"{given} was written by a Ray before 2.1, whose checkpoints do not hold the connectors that filter "
+            "observations and scale actions: restore it in the Ray that wrote it, train on or save again with a later "
+            "one, and export that"
+        )
+    if _major_version(given) == "1":
+        raise CheckpointError(
+            f"{given} is incomplete: a checkpoint of RLlib's old API stack holds "
+            f"{POLICIES}/<policy id>/{POLICY_STATE}, and this one holds no policy"
+        )
+    return None
+
+
+def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFiles:
+    """Return one policy of the checkpoint at `root`: the one asked for, the one `given` lies in, or the only one.
+
+    Raises CheckpointError when there is no such policy, or several to choose from.
+    """
+    present = policy_ids(root)
+    if not present:
+        present = [policy_id or root.name]  # a policy's folder on its own, which does not tell its id
+    elif given.parent == root / POLICIES and policy_id is None:
+        policy_id = given.name
+    if policy_id is not None and policy_id not in present:
+        raise CheckpointError(f"{root} has no policy '{policy_id}': it holds {', '.join(present)}")
+    if policy_id is None and len(present) > 1:
+        raise CheckpointError(
+            f"{root} holds {len(present)} policies ({', '.join(present)}): name the one to export with --module-id, "
+            "or export each of them with --all-modules"
+        )
+    files = OldStackFiles(root, policy_id or present[0])
+    if not files.state.is_file():
+        raise UnsupportedError(
+            f"{files.policy} holds its state as msgpack, which is not exported: only {POLICY_STATE}, RLlib's default, "
+            "is; restore the algorithm with RLlib (and msgpack_numpy) and save it again without msgpack"
+        )
+    return files
+
+
+def policy_ids(root: Path) -> list[str]:
+    """Return the ids of the policies that an old-stack checkpoint holds; a policy's folder on its own holds none."""
+    folder = root / POLICIES
+    return sorted(child.name for child in folder.iterdir() if _has_state(child)) if folder.is_dir() else []
+
+
+def _has_state(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in (POLICY_STATE, *_MSGPACK_STATES))
+
+
+def _major_version(folder: Path) -> str | None:
+    """Return the major checkpoint version in rllib_checkpoint.json, if that can be read."""
+    try:
+        recorded = json.loads((folder / _MARKER).read_text(encoding="utf-8"))
+        return str(recorded["checkpoint_version"]).split(".")[0]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,74 @@
+"""Open a checkpoint's pickles, and say in one sentence why one cannot be opened.
+
+Loading a pickle runs the code it names; callers say so first. This file knows nothing of what is in them.
+"""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rlservo.export.contract.errors import CheckpointError, UsageError, first_line
+
+TRUNCATED = "the file is truncated or damaged ({})"
+
+
+@contextmanager
+def user_code(app_dir: str | Path) -> Iterator[Path]:
+    """Let the checkpoint import the user's own modules from `app_dir`, before anything else of that name.
+
+    Gives the folder's absolute path. Raises UsageError where it is not a folder.
+    """
+    folder = str(Path(app_dir).expanduser().absolute())
+    if not Path(folder).is_dir():
+        raise UsageError(f"{folder} is not a folder: expected the one that holds your own classes (--app-dir)")
+    sys.path.insert(0, folder)
+    try:
+        yield Path(folder)
+    finally:
+        if folder in sys.path:  # imported code may have changed the path itself
+            sys.path.remove(folder)
+
+
+def unpickle(file: Path) -> Any:
+    """Return the object pickled in `file` (cloudpickle writes ordinary pickles).
+
+    Raises CheckpointError when the file is missing or damaged, or the code it names cannot be imported.
+    """
+    try:
+        with file.open("rb") as stream:
+            return pickle.load(stream)
+    except OSError as error:
+        raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # a damaged pickle raises almost anything, and so does the code it runs
+        damaged = isinstance(error, UnicodeDecodeError | IndexError | KeyError | MemoryError)
+        reason = TRUNCATED.format(first_line(error)) if damaged else explain(error)
+        raise CheckpointError(f"{file} cannot be loaded: {reason}") from error
+
+
+def explain(error: BaseException) -> str:
+    """Return in one clause why loading failed: the file, the code it names, or what that code raised."""
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        return (
+            f"it needs the Python module '{error.name}', which was not found in {searched()}; "
+            "give the folder that holds it with --app-dir"
+        )
+    if isinstance(error, ImportError | AttributeError):
+        return (
+            f"its code does not fit what is installed ({first_line(error)}); looked in {searched()}, and --app-dir "
+            "names another folder"
+        )
+    if isinstance(error, EOFError | pickle.UnpicklingError):
+        return TRUNCATED.format(first_line(error))
+    return first_line(error)
+
+
+def searched() -> str:
+    """Return the import path as a person reads it: without the standard library, which holds no user code."""
+    hidden = ("lib/python", "__editable__", ".zip")
+    own = [entry or "." for entry in sys.path if not any(part in entry for part in hidden)]
+    return ", ".join(dict.fromkeys([*own, "the installed packages"]))

@@ -1,0 +1,93 @@
+"""What the numbers of an observation and an action are called: asked of the environment's class, never of an instance.
+
+An environment tells by a classmethod `describe(**env_config)` that returns
+`{"observation": [{"name", "unit"}, ...], "action": [...], "control_rate_hz": 10.0}`. Names help people and change
+nothing about the policy, so whatever is missing or wrong here is a notice and not an error.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+from gymnasium.spaces import Box
+from pydantic import ValidationError
+
+from rlservo.export.contract.bundle import Element
+from rlservo.export.contract.errors import first_line
+from rlservo.export.recipe.recipe import Recipe
+
+
+@dataclass(frozen=True)
+class ElementNames:
+    """Element names in row-major order, empty where unknown, and the rate the environment asks for actions at [Hz]."""
+
+    observation: tuple[Element, ...] = ()
+    action: tuple[Element, ...] = ()
+    control_rate_hz: float | None = None
+
+
+def read_elements(
+    env_id: str | None, env_config: Mapping[str, Any], recipe: Recipe, notify: Callable[[str], None]
+) -> ElementNames:
+    """Return what the environment's class says of its elements."""
+    if env_id is None:
+        return ElementNames()
+    try:
+        describe = getattr(_env_class(env_id), "describe", None)
+        if describe is None:
+            return ElementNames()
+        told = describe(**env_config)
+        observation = _elements(told.get("observation", ()))
+        action = _elements(told.get("action", ()))
+        rate = _rate(told.get("control_rate_hz"))
+    except (Exception, SystemExit) as error:  # importing and asking run the user's own code
+        notify(
+            f"the elements stay without names, which changes nothing else: environment {env_id} cannot be asked for "
+            f"them ({first_line(error)})"
+        )
+        return ElementNames()
+    spaces = {"observation": recipe.observation_space, "action": recipe.action_space}
+    wanted = {which: math.prod(space.shape) if isinstance(space, Box) else 0 for which, space in spaces.items()}
+    named = {"observation": observation, "action": action}
+    for which, elements in named.items():
+        if elements and len(elements) != wanted[which]:
+            notify(
+                f"environment {env_id} names {len(elements)} {which} elements, the policy has {wanted[which]}: "
+                "they stay unnamed"
+            )
+            named[which] = ()
+    return ElementNames(named["observation"], named["action"], rate)
+
+
+def _env_class(env_id: str) -> Any:
+    """Return the class behind a Gymnasium id or a `module:Class` path, importing its module but making nothing."""
+    is_path = ":" in env_id and env_id not in gymnasium.registry
+    entry_point = env_id if is_path else gymnasium.spec(env_id).entry_point
+    if not isinstance(entry_point, str):
+        return entry_point
+    module, _, name = entry_point.partition(":")
+    found: Any = importlib.import_module(module)
+    for part in name.split("."):
+        found = getattr(found, part)
+    return found
+
+
+def _elements(told: Any) -> tuple[Element, ...]:
+    try:
+        return tuple(Element(name=one["name"], unit=one.get("unit", "")) for one in told)
+    except (ValidationError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"expected a list of {{'name', 'unit'}}, got {told!r:.80}") from error
+
+
+def _rate(told: Any) -> float | None:
+    if told is None:
+        return None
+    rate = float(told)
+    if not (math.isfinite(rate) and rate > 0):
+        raise ValueError(f"control_rate_hz must be a positive number, got {told!r}")
+    return rate

@@ -1,0 +1,362 @@
+"""Turn a checkpoint into a policy bundle: restore, build the graph, write it, prove it, and only then give it its name.
+
+Everything is written into a temporary folder beside the target, which is renamed at the end or removed: a bundle is
+there whole or not at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import logging
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+import rlservo
+from rlservo.export.checkpoints.facts import CheckpointFacts, read_facts
+from rlservo.export.checkpoints.location import Files, locate_checkpoint, locate_modules
+from rlservo.export.checkpoints.remote import fetched, is_uri
+from rlservo.export.checkpoints.unpickle import user_code
+from rlservo.export.commands.element_names import read_elements
+from rlservo.export.commands.naming import bundle_name, check_names, choose_target, default_name
+from rlservo.export.contract.bundle import (
+    CONTRACT_KEY,
+    ONNX_FILE,
+    TORCHSCRIPT_FILE,
+    Contract,
+    Distribution,
+    Parity,
+    Provenance,
+    TensorSpec,
+    contract_json,
+    load_bundle,
+    write_contract,
+    write_golden,
+)
+from rlservo.export.contract.errors import CheckpointError, ParityError, UsageError
+from rlservo.export.graph.one_thread import one_thread
+from rlservo.export.proof.parity import GraphLoop, Outputs, Recorded, Runner, prove, record, record_moved, replay, ties
+from rlservo.export.recipe.describe import baked_steps
+from rlservo.export.recipe.recipe import Recipe, loose_bounds
+from rlservo.export.recipe.samples import BATCH_SIZES, Inputs, draw_batches
+from rlservo.export.recipe.to_contract import space_spec, state_spec
+
+if TYPE_CHECKING:
+    from rlservo.export.rllib.restore import Restored
+
+logger = logging.getLogger(__name__)
+
+GOLDEN_SAMPLES = {"likely": 48, "wide": 8, "extreme": 8}
+GOLDEN_BYTES = 2_000_000  # of images a few observations are as much as a bundle should carry
+SEED = 20240
+LOADING_RUNS_CODE = "loading {path}: checkpoints are pickles and run code when loaded; export only those you trust"
+
+
+Say: TypeAlias = Callable[[str], None]
+"""Takes one sentence for a person."""
+
+
+def _silent(_stage: str) -> None:
+    """Nobody watches the progress."""
+
+
+@dataclass(frozen=True)
+class ExportResult:
+    """The bundle that was written."""
+
+    path: Path
+    contract: Contract
+
+
+@dataclass(frozen=True)
+class _Order:
+    """What all bundles of one export share."""
+
+    out: Path
+    name: str | None
+    version: str | None
+    description: str
+    value: bool
+    notify: Say
+    progress: Say
+
+
+def export_checkpoint(
+    checkpoint: str | Path,
+    out: str | Path,
+    *,
+    name: str | None = None,
+    version: str | None = None,
+    description: str = "",
+    module_id: str | None = None,
+    agent_id: str | None = None,
+    app_dir: str | Path = ".",
+    value: bool = True,
+    notify: Say = logger.warning,
+    progress: Say = _silent,
+) -> ExportResult:
+    """Export one policy of an RLlib checkpoint to `out/<name>/<version>/`.
+
+    `checkpoint` is what `locate_checkpoint` takes, or a URI of such a folder. `name` defaults to the environment's (of
+    several policies with the module's behind it), `version` to the next integer after the newest one present.
+    `app_dir` holds the user's own classes, if the checkpoint needs any. `value` False leaves the value head out, which
+    costs a third of a small policy's time. `notify` gets one sentence for each thing a person should know (by default
+    they are logged), `progress` what is being done.
+
+    Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
+    cannot be exported, ParityError when the graph does not give RLlib's own actions. Nothing is left behind then.
+    """
+    with fetched(checkpoint, progress) as local:
+        files = locate_checkpoint(local, module_id, agent_id)
+        order = _Order(Path(out), name, version, description, value, notify, progress)
+        return _export([files], order, app_dir, checkpoint)[0]
+
+
+def export_all_modules(
+    checkpoint: str | Path,
+    out: str | Path,
+    *,
+    name: str | None = None,
+    version: str | None = None,
+    description: str = "",
+    app_dir: str | Path = ".",
+    value: bool = True,
+    notify: Say,
+    progress: Say = _silent,
+) -> list[ExportResult]:
+    """Export every policy of a checkpoint, each to `out/<name>-<module id>/<version>/`: all of them, or none.
+
+    A module whose agents are treated differently gives a bundle an agent, `<name>-<module id>-<agent id>`. The rest is
+    as for `export_checkpoint`.
+    """
+    with fetched(checkpoint, progress) as local:
+        order = _Order(Path(out), name, version, description, value, notify, progress)
+        return _export(locate_modules(local), order, app_dir, checkpoint, name_all=True)
+
+
+def _export(
+    found: Sequence[Files], order: _Order, app_dir: str | Path, checkpoint: str | Path, *, name_all: bool = False
+) -> list[ExportResult]:
+    """Write a bundle for each of `found`; they get their names when all of them are proven."""
+    check_names(order.name, order.version)
+    root = found[0].root
+    order.notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else root))
+    with user_code(app_dir) as folder, contextlib.ExitStack() as folders:
+        order.progress("reading the checkpoint")
+        facts = read_facts(root, order.notify)
+        base = order.name or default_name(facts.env_id, root)
+        written: list[tuple[Path, ExportResult]] = []
+        waiting = list(found)
+        while waiting:
+            files = waiting.pop(0)
+            extended = files.is_one_of_several and (name_all or not order.name)
+            name = bundle_name(base, files.module_id, files.agent_id) if extended else base
+            target = choose_target(order.out, name, order.version)
+            if any(result.path == target for _, result in written):
+                raise UsageError(f"two modules would both be written to {target}: export them one by one, with --name")
+            try:
+                written.append(_build(files, facts, folder, target, order, folders))
+            except CheckpointError as error:
+                if not name_all or "agents" not in error.details:
+                    raise
+                waiting[:0] = [dataclasses.replace(files, agent_id=agent) for agent in error.details["agents"]]
+        _publish(written)
+    return [result for _, result in written]
+
+
+def _publish(written: Sequence[tuple[Path, ExportResult]]) -> None:
+    """Give every finished folder its name, or none."""
+    named: list[Path] = []
+    try:
+        for folder, result in written:
+            folder.rename(result.path)
+            named.append(result.path)
+    except BaseException:
+        for path in named:
+            shutil.rmtree(path, ignore_errors=True)
+        raise
+
+
+def _build(
+    files: Files, facts: CheckpointFacts, app_dir: Path, target: Path, order: _Order, folders: contextlib.ExitStack
+) -> tuple[Path, ExportResult]:
+    """Return the finished bundle in a folder that only wants its name."""
+    order.progress(f"restoring '{files.module_id}' (importing torch and RLlib takes seconds)")
+    restored = _load(files, app_dir, order.notify, order.value)
+    for warning in loose_bounds(restored.recipe):
+        order.notify(warning)
+    elements = read_elements(facts.env_id, facts.env_config, restored.recipe, order.notify)
+    folder = folders.enter_context(_temporary_folder(target))
+    with one_thread():
+        labels = [element.name for element in elements.action]
+        parity, golden = _write_graphs(folder, restored, labels, files.api_stack, order.progress)
+        recipe = restored.recipe
+        contract = Contract(
+            name=target.parent.name,
+            version=target.name,
+            description=order.description,
+            observation_space=space_spec(recipe.observation_space, elements.observation),
+            action_space=space_spec(recipe.action_space, elements.action, action=True),
+            inputs=tuple(_tensor(name, values) for name, values in golden.inputs.items()),
+            outputs=tuple(_tensor(output, values) for output, values in golden.outputs.items()),
+            state=tuple(state_spec(leaf) for leaf in recipe.state),
+            distribution=(
+                Distribution(kind=recipe.distribution, transform=recipe.transform) if recipe.distribution else None
+            ),
+            baked_in=baked_steps(recipe, restored.module_class, restored.network.module),
+            control_rate_hz=elements.control_rate_hz,
+            provenance=_provenance(files, facts, restored),
+            parity=parity,
+        )
+        _write_rest(folder, contract, golden)
+    return folder, ExportResult(target, contract)
+
+
+def _load(files: Files, app_dir: Path, notify: Callable[[str], None], value: bool) -> Restored:
+    # Here and not at the top: torch and RLlib take seconds to import, and a wrong path should not have to wait for it.
+    from rlservo.export.rllib.restore import restore
+
+    return restore(files, app_dir, notify, value=value)
+
+
+@contextlib.contextmanager
+def _temporary_folder(target: Path) -> Iterator[Path]:
+    """Give a folder beside `target`; whatever happens, it and the parents made for it are gone or in use afterwards."""
+    made = [parent for parent in (target.parent, target.parent.parent) if not parent.exists()]
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=".export-", dir=target.parent))
+        folder.chmod(0o755)  # mkdtemp's own mode would keep a server under another user out
+    except OSError as error:
+        raise UsageError(f"{target.parent} cannot be written: {error.strerror or error}") from error
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        for parent in made:
+            with contextlib.suppress(OSError):  # not empty: the export succeeded
+                parent.rmdir()
+
+
+@dataclass(frozen=True)
+class _Golden:
+    inputs: Inputs
+    outputs: Outputs
+
+
+def _write_graphs(
+    folder: Path, restored: Restored, labels: list[str], api_stack: str, progress: Say
+) -> tuple[Parity, _Golden]:
+    """Write both formats, prove them, and return the proof and the golden vectors."""
+    from rlservo.export.graph.onnx_file import run_onnx, write_onnx
+    from rlservo.export.graph.policy_graph import PolicyGraph
+    from rlservo.export.graph.torchscript_file import run_torchscript, write_torchscript
+    from rlservo.export.graph.why_not_exportable import why_different
+
+    recipe = restored.recipe
+    graph = PolicyGraph(recipe, restored.network)
+    batches = draw_batches(recipe, SEED)
+    progress(f"asking RLlib itself for {sum(len(batch) for batch in batches):,} actions")
+    recorded = record(restored.reference, batches, restored.loop, recipe.observation_leaves)
+    pair = next(batch for batch in batches if len(batch) == BATCH_SIZES[1])
+    example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(len(pair), np.bool_))
+    progress("writing TorchScript and ONNX")
+    frozen = write_torchscript(graph, example, folder / TORCHSCRIPT_FILE)
+    write_onnx(graph, example, folder / ONNX_FILE)
+    onnx = run_onnx(folder / ONNX_FILE)
+    script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
+    progress("proving both against RLlib's actions")
+    moved = partial(record_moved, restored.reference, recorded, restored.loop)
+    try:
+        parity = prove(recipe, recorded, {"onnx": onnx, "torchscript": script}, labels, api_stack, moved)
+    except ParityError as error:
+        if why := why_different(restored.reference, recorded, frozen):
+            raise ParityError(f"{error.message}; {why}", error.details) from error
+        raise
+    inputs = _golden_inputs(recipe, recorded, onnx)
+    outputs = onnx(inputs)
+    ordered = {name: inputs[name] for name in graph.input_names}
+    return parity, _Golden(ordered, {name: outputs[name] for name in graph.output_names})
+
+
+def _golden_inputs(recipe: Recipe, recorded: list[Recorded], run: Runner) -> Inputs:
+    """Return inputs of every kind; those where two choices tie stay out, as another machine may choose either.
+
+    A policy with a memory gives steps of its sequences, each with the state it met there.
+    """
+    pools: dict[str, list[Inputs]] = {kind: [] for kind in GOLDEN_SAMPLES}
+    discrete = any(not isinstance(space, Box) for space in recipe.action_leaves.values())
+    everything: list[Inputs] = []
+    for one, (inputs, _) in zip(recorded, replay(recorded, run, recipe.state), strict=True):
+        clear = ~ties(recipe, one.outputs) if discrete else np.ones(len(one.batch), np.bool_)
+        pools[one.batch.kind].append({name: values[clear] for name, values in inputs.items()})
+        everything.append(inputs)
+    size = sum(values[0].nbytes for values in everything[0].values())
+    chosen: list[Inputs] = []
+    for kind, count in GOLDEN_SAMPLES.items():
+        if pools[kind]:
+            chosen.append(_some(_joined(pools[kind]), max(2, min(count, GOLDEN_BYTES // (3 * max(1, size))))))
+    golden = _joined(chosen)
+    # A policy that never has a clear favourite still needs vectors; its runtime excuses ties as the gate does.
+    return golden if len(next(iter(golden.values()))) else _some(_joined(everything), sum(GOLDEN_SAMPLES.values()))
+
+
+def _joined(parts: list[Inputs]) -> Inputs:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _some(inputs: Inputs, count: int) -> Inputs:
+    """Return `count` rows, evenly spread."""
+    rows = len(next(iter(inputs.values())))
+    picked = np.unique(np.linspace(0, rows - 1, min(count, rows)).astype(int)) if rows else np.zeros(0, int)
+    return {name: values[picked] for name, values in inputs.items()}
+
+
+def _tensor(name: str, values: NDArray[Any]) -> TensorSpec:
+    return TensorSpec(name=name, dtype=str(values.dtype), shape=(-1, *values.shape[1:]))
+
+
+def _provenance(files: Files, facts: CheckpointFacts, restored: Restored) -> Provenance:
+    import ray
+    import torch
+
+    return Provenance(
+        algorithm=facts.algorithm,
+        api_stack=files.api_stack,
+        module_id=files.module_id,
+        agents=restored.agents,
+        module_class=restored.module_class,
+        checkpoint_sha256=files.sha256(),
+        training_iterations=facts.training_iterations,
+        env_steps=facts.env_steps,
+        env_id=facts.env_id,
+        env_config=facts.env_config,
+        ray_version=facts.ray_version or ray.__version__,
+        torch_version=torch.__version__,
+        rlservo_version=rlservo.__version__,
+        exported_at=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+    )
+
+
+def _write_rest(folder: Path, contract: Contract, golden: _Golden) -> None:
+    """Write golden vectors, contract and hashes, and check that the finished files are what was proven."""
+    from rlservo.export.graph.onnx_file import add_metadata, run_onnx
+
+    add_metadata(folder / ONNX_FILE, {CONTRACT_KEY: contract_json(contract)})
+    write_golden(folder, golden.inputs, golden.outputs)
+    write_contract(folder, contract)
+    inputs, outputs = load_bundle(folder).golden()
+    replayed = run_onnx(folder / ONNX_FILE)(inputs)
+    for name, values in outputs.items():
+        if not np.array_equal(values, replayed[name], equal_nan=True):
+            raise ParityError(f"the finished file's '{name}' is not what was proven: is the disk full or failing?")

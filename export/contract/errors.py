@@ -1,0 +1,206 @@
+"""Every error a user of rlservo can meet, in one tree.
+
+It knows nothing of HTTP or of the command line: one table in `serve_app/protocols/json_act.py` maps these to status
+codes, and one handler in `deploy/cli.py` maps them to exit codes.
+
+    RlservoError                  error
+    ├── CheckpointError           checkpoint-unreadable    not a checkpoint, damaged, or its code cannot be imported
+    │   └── UnsupportedError      checkpoint-unsupported   readable, but cannot be exported faithfully
+    ├── ParityError               parity-failed            the exported graph differs from RLlib's own actions
+    ├── BundleError               bundle-invalid           missing, truncated or malformed bundle
+    │   ├── BundleTamperedError   bundle-tampered          a file's hash differs from the recorded one
+    │   └── GoldenMismatchError   golden-mismatch          this machine does not reproduce the golden vectors
+    ├── UnknownPolicyError        unknown-policy
+    │   └── UnknownVersionError   unknown-version
+    ├── RequestError              bad-request              the request itself is malformed
+    │   ├── MediaTypeError        wrong-media-type
+    │   └── TooLargeError         too-large
+    ├── ObservationError          bad-observation          shape, dtype, non-finite or misnamed element
+    ├── ActionError               unsafe-action            the policy produced an action that must not leave
+    ├── DeadlineError             deadline-passed
+    ├── ConflictError             conflict                 a change of what is served that contradicts what is
+    │   └── RefusedError              version-refused      a version or configuration that cannot be served
+    ├── SessionError              session-conflict         a session's requests contradict each other
+    │   └── SessionLostError      session-lost             the server has no such session (any more)
+    ├── UnavailableError          unavailable              not ready, or the server cannot be reached
+    │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
+    │   ├── LateError             late                     the observation waited too long: send a newer one
+    │   └── PartlyAppliedError    partly-applied           a change that some replicas could not follow
+    └── UsageError                bad-usage                an argument or the machine's state prevents the start
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+
+class RlservoError(Exception):
+    """An error with a sentence for people, a kebab-case code and details for programs."""
+
+    code: ClassVar[str] = "error"
+
+    def __init__(self, message: str, details: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.details: dict[str, Any] = dict(details or {})
+
+
+class CheckpointError(RlservoError):
+    """The path holds no checkpoint that can be read."""
+
+    code = "checkpoint-unreadable"
+
+
+class UnsupportedError(CheckpointError):
+    """The checkpoint can be read, but not exported without losing something."""
+
+    code = "checkpoint-unsupported"
+
+
+class ParityError(RlservoError):
+    """The exported graph does not give RLlib's own actions; nothing was written."""
+
+    code = "parity-failed"
+
+
+class BundleError(RlservoError):
+    """The path holds no usable policy bundle."""
+
+    code = "bundle-invalid"
+
+
+class BundleTamperedError(BundleError):
+    """A bundle file's hash differs from the one recorded at export."""
+
+    code = "bundle-tampered"
+
+
+class GoldenMismatchError(BundleError):
+    """The loaded graph does not reproduce the bundle's golden vectors on this machine."""
+
+    code = "golden-mismatch"
+
+
+class UnknownPolicyError(RlservoError):
+    """No policy of that name is loaded."""
+
+    code = "unknown-policy"
+
+
+class UnknownVersionError(UnknownPolicyError):
+    """The policy is loaded, but not in that version."""
+
+    code = "unknown-version"
+
+
+class RequestError(RlservoError):
+    """The request cannot be understood."""
+
+    code = "bad-request"
+
+
+class MediaTypeError(RequestError):
+    """The body is not of a type this endpoint reads."""
+
+    code = "wrong-media-type"
+
+
+class TooLargeError(RequestError):
+    """The body exceeds the configured size."""
+
+    code = "too-large"
+
+
+class ObservationError(RlservoError):
+    """The observation does not fit the policy's contract."""
+
+    code = "bad-observation"
+
+
+class ActionError(RlservoError):
+    """The policy's action is not finite or not in the action space."""
+
+    code = "unsafe-action"
+
+
+class DeadlineError(RlservoError):
+    """The answer could not have arrived in time, so the work was not done."""
+
+    code = "deadline-passed"
+
+
+class SessionError(RlservoError):
+    """The request does not fit where its session stands."""
+
+    code = "session-conflict"
+
+
+class SessionLostError(SessionError):
+    """The server does not know the session: its memory is gone, and only a new episode can follow."""
+
+    code = "session-lost"
+
+
+class UnavailableError(RlservoError):
+    """The server is not ready, over capacity, or out of reach."""
+
+    code = "unavailable"
+
+
+class OverloadedError(UnavailableError):
+    """The server has as much work as it takes on; nothing was computed."""
+
+    code = "over-capacity"
+
+
+class LateError(UnavailableError):
+    """The observation waited longer than the server answers as fresh; nothing was computed."""
+
+    code = "late"
+
+
+class PartlyAppliedError(UnavailableError):
+    """A change was accepted, and some replicas have not followed it."""
+
+    code = "partly-applied"
+
+
+class ConflictError(RlservoError):
+    """A change of what is served that contradicts what is served now."""
+
+    code = "conflict"
+
+
+class RefusedError(ConflictError):
+    """A version or a configuration cannot be served, so what ran before goes on."""
+
+    code = "version-refused"
+
+
+class UsageError(RlservoError):
+    """An argument, or something already running on the machine, prevents the start."""
+
+    code = "bad-usage"
+
+
+class UnauthenticatedError(RlservoError):
+    """The request carries no key, or one that is not known."""
+
+    code = "unauthenticated"
+
+
+class ForbiddenError(RlservoError):
+    """The key, or the page the request comes from, may not do this."""
+
+    code = "forbidden"
+
+
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an exception's text without colours, with its type where the text alone says little."""
+    text = (_COLOURS.sub("", str(error)).strip() or type(error).__name__).splitlines()[0][:300]
+    return f"{type(error).__name__}: {text}" if isinstance(error, LookupError) else text

@@ -1,0 +1,40 @@
+"""Where an action's numbers lie in `action_dist_inputs` or `q_values`, for whoever samples or compares choices.
+
+It knows numpy and the contract's spaces only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.bundle import DiscreteSpec, LeafSpec, MultiDiscreteSpec, SpaceSpec, leaf_specs
+
+
+def parameter_count(leaf: LeafSpec) -> int:
+    """Return how many distribution parameters one action leaf has: a mean and a scale each, or a score a choice."""
+    if isinstance(leaf, DiscreteSpec):
+        return leaf.n
+    return sum(leaf.nvec) if isinstance(leaf, MultiDiscreteSpec) else 2 * leaf.size
+
+
+def split_parameters(parameters: NDArray[Any], space: SpaceSpec) -> Iterator[tuple[str, LeafSpec, NDArray[Any]]]:
+    """Yield (tensor name, leaf, its `[batch, n]`) for each leaf of an action space."""
+    begin = 0
+    for name, leaf in leaf_specs(space, "action").items():
+        yield name, leaf, parameters[:, begin : begin + parameter_count(leaf)]
+        begin += parameter_count(leaf)
+
+
+def split_scores(scores: NDArray[Any], space: SpaceSpec) -> dict[str, list[NDArray[Any]]]:
+    """Return each discrete leaf's scores `[batch, choices]`, one array an element, by tensor name."""
+    found: dict[str, list[NDArray[Any]]] = {}
+    for name, leaf, part in split_parameters(scores, space):
+        if isinstance(leaf, DiscreteSpec):
+            found[name] = [part]
+        elif isinstance(leaf, MultiDiscreteSpec):
+            found[name] = np.split(part, np.cumsum(leaf.nvec)[:-1], axis=-1)
+    return found

@@ -1,0 +1,1 @@
+"""Torch graph of a whole policy, written as ONNX and TorchScript."""

@@ -1,0 +1,207 @@
+"""RLlib's env-to-module connectors as torch modules: what happens to an observation before the network sees it.
+
+Each takes the observation so far, a tree of tensors `[batch, ...]`, and the policy's memory by name, in which a
+stateful one replaces its own entry. It knows torch and the recipe's steps; nothing of RLlib.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from torch import Tensor, nn
+
+from rlservo.export.recipe.recipe import Flatten, FrameStack, ObservationFilter, Preprocess, Previous, Recipe, UserStep
+from rlservo.export.recipe.trees import Tree, space_leaves, tree_leaves
+
+# What may be left out of the filter's mean, in units of the filtered observation: below float32's step near 1.
+NEGLIGIBLE = 1e-7
+ATARI_RAM = (128,)
+
+
+class ObservationNode(nn.Module, abc.ABC):
+    """One step before the network."""
+
+    @abc.abstractmethod
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:
+        """Return the next observation."""
+
+
+def observation_nodes(recipe: Recipe) -> nn.ModuleList:
+    """Return one node a step of the recipe."""
+    space = recipe.observation_space
+    dtype = torch.from_numpy(np.zeros(0, space.dtype)).dtype if isinstance(space, Box) else torch.int64
+    nodes = nn.ModuleList()
+    for step in recipe.steps:
+        if isinstance(step, ObservationFilter):
+            nodes.append(FilterNode(step, dtype))
+        elif isinstance(step, Flatten):
+            nodes.append(FlattenNode(step))
+            dtype = torch.float32
+        elif isinstance(step, Preprocess):
+            nodes.append(PreprocessNode(step))
+            dtype = torch.float32
+        elif isinstance(step, FrameStack):
+            nodes.append(FrameStackNode(step))
+        elif isinstance(step, Previous):
+            nodes.append(PreviousNode(step))
+        else:
+            nodes.append(UserNode(step))
+    return nodes
+
+
+class FlattenNode(ObservationNode):
+    """Every leaf as float32 `[batch, n]`, side by side; Discrete and MultiDiscrete leaves one-hot."""
+
+    def __init__(self, step: Flatten) -> None:
+        super().__init__()
+        self.without = step.without
+        space = step.space
+        leaves = {"obs": None} if space is None else space_leaves(space, "obs")
+        removed = tuple(f"obs.{key}" for key in step.without)
+        kept = [
+            leaf for name, leaf in leaves.items() if not any(name == r or name.startswith(f"{r}.") for r in removed)
+        ]
+        self.codes: list[Callable[[Tensor], Tensor]] = [_code(leaf) for leaf in kept]
+
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
+        if self.without:
+            obs = {key: value for key, value in obs.items() if key not in self.without}
+        parts = [code(leaf) for code, leaf in zip(self.codes, tree_leaves(obs), strict=True)]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+
+
+def _code(space: Any) -> Callable[[Tensor], Tensor]:
+    """Return how FlattenObservations turns one leaf into float32 `[batch, n]`."""
+    if isinstance(space, Discrete):
+        return lambda leaf: _one_hot(leaf, int(space.n), below_zero=int(space.start) < 0)
+    if isinstance(space, MultiDiscrete):
+        sizes = [int(n) for n in space.nvec]
+        below = bool((np.asarray(space.start) < 0).any())
+        return lambda leaf: torch.cat([_one_hot(leaf[:, i], n, below_zero=below) for i, n in enumerate(sizes)], dim=-1)
+    return lambda leaf: _float(leaf.flatten(1) if leaf.dim() > 1 else leaf.unsqueeze(1))
+
+
+def _one_hot(leaf: Tensor, depth: int, *, below_zero: bool) -> Tensor:
+    """RLlib's numpy indexing: an index below zero counts from the end."""
+    index = leaf.long()
+    if below_zero:
+        index = torch.remainder(index, depth)
+    return torch.eq(index.unsqueeze(-1), torch.arange(depth)).float()
+
+
+class PreprocessNode(ObservationNode):
+    """The old API stack's preprocessor."""
+
+    def __init__(self, step: Preprocess) -> None:
+        super().__init__()
+        self.leaves = list(space_leaves(step.space, "obs").values())
+
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
+        parts = [_preprocess(leaf, space) for leaf, space in zip(tree_leaves(obs), self.leaves, strict=True)]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+
+
+def _preprocess(leaf: Tensor, space: Any) -> Tensor:
+    """Return one leaf as float32 `[batch, n]`."""
+    if isinstance(space, Discrete):
+        return _one_hot(leaf - int(space.start), int(space.n), below_zero=False)
+    if isinstance(space, MultiDiscrete):
+        index = leaf.flatten(1) - torch.from_numpy(np.asarray(space.start).ravel().astype(np.int64))
+        sizes = [int(n) for n in space.nvec.ravel()]
+        return torch.cat([_one_hot(index[:, i], n, below_zero=False) for i, n in enumerate(sizes)], dim=-1)
+    row = _float(leaf.flatten(1) if leaf.dim() > 1 else leaf.unsqueeze(1))
+    return (row - 128.0) / 128.0 if tuple(space.shape) == ATARI_RAM else row
+
+
+class FilterNode(ObservationNode):
+    """RLlib's frozen MeanStdFilter, on an observation that is a single array.
+
+    RLlib subtracts in double precision. With single-precision observations the same is reached by subtracting the mean
+    in two parts: the nearest float32, then what that left over (Dekker 1971), where the rest matters at all. Integers
+    are filtered in double precision and cut back to integers, as RLlib does it.
+    """
+
+    offset: Tensor
+    rest: Tensor
+    scale: Tensor
+    divisor: Tensor
+
+    def __init__(self, frozen: ObservationFilter, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.clip = frozen.clip
+        self.integer = None if dtype.is_floating_point else dtype
+        if self.integer is not None:
+            dtype = torch.float64
+        offset, scale = frozen.offset(), 1.0 / frozen.divisor().astype(np.float64)
+        rest = offset - offset.astype(np.float32)
+        self.has_rest = dtype == torch.float32 and bool(np.max(np.abs(rest) * scale, initial=0.0) > NEGLIGIBLE)
+        self.register_buffer("offset", torch.tensor(offset, dtype=dtype))
+        self.register_buffer("rest", torch.tensor(rest, dtype=dtype))
+        self.register_buffer("scale", torch.tensor(scale, dtype=dtype))
+        self.register_buffer("divisor", torch.tensor(frozen.divisor(), dtype=dtype))
+
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
+        if self.integer is not None:
+            obs = (obs.double() - self.offset) / self.divisor
+        else:
+            obs = obs - self.offset
+            if self.has_rest:
+                obs = obs - self.rest
+            obs = obs * self.scale
+        if self.clip is not None:
+            obs = torch.clamp(obs, -self.clip, self.clip)
+        return obs if self.integer is None else obs.to(self.integer)
+
+
+class FrameStackNode(ObservationNode):
+    """The last frames side by side; the memory holds all but the newest."""
+
+    def __init__(self, step: FrameStack) -> None:
+        super().__init__()
+        self.depth = step.shape[2]
+
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:
+        stacked = torch.cat((memory["frames"], obs), dim=3)
+        memory["frames"] = stacked[:, :, :, self.depth :]
+        return stacked
+
+
+class PreviousNode(ObservationNode):
+    """The observation beside the last actions' codes and the last rewards; the graph itself remembers its action."""
+
+    def __init__(self, step: Previous) -> None:
+        super().__init__()
+        self.step = step
+
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:
+        original, actions, rewards = self.step.keys
+        augmented = {original: obs}
+        if self.step.actions:
+            augmented[actions] = memory["previous_actions"]
+        if self.step.rewards:
+            known = memory["reward"].unsqueeze(-1)
+            if self.step.rewards > 1:
+                known = torch.cat((memory["previous_rewards"], known), dim=-1)
+                memory["previous_rewards"] = known[:, 1:]
+            augmented[rewards] = known
+        return augmented
+
+
+class UserNode(ObservationNode):
+    """The user's own function of tensors."""
+
+    def __init__(self, step: UserStep) -> None:
+        super().__init__()
+        self.function = step.function
+
+    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
+        return self.function(obs)
+
+
+def _float(leaf: Tensor) -> Tensor:
+    return leaf if leaf.dtype == torch.float32 else leaf.float()

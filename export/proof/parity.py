@@ -1,0 +1,403 @@
+"""The gate: an exported policy gives RLlib's own numbers, or it is not written.
+
+It compares functions from observations to named outputs and does not know what is behind them. A policy with a memory
+is compared over whole sequences, each side fed with its own state.
+
+A difference passes when it is at most `RTOL * max(|reference|, scale) + ATOL`. The scale is half the range of a
+bounded action element; elsewhere the largest number in the same row of the output, at least 1, because the rounding
+of a matrix product grows with its terms and not with their sum. `value` has one number a row, which may be a small
+difference of large terms: its scale is the largest value seen over all observations. A discrete action must be the
+same, unless RLlib's own scores for the two choices are that close.
+
+Far outside the usual, a network takes the small difference of huge terms, and no two orders of adding them agree. What
+is still rounding there, RLlib itself tells: a difference also passes when it is at most ROUNDING times what RLlib's own
+numbers for that sample move by when every floating-point observation moves by its last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from rlservo.export.contract.bundle import FormatParity, Parity
+from rlservo.export.contract.errors import ParityError, UnsupportedError, first_line
+from rlservo.export.contract.scores import split_scores
+from rlservo.export.recipe.recipe import Recipe, StateLeaf
+from rlservo.export.recipe.samples import BATCH_SIZES, Batch, Inputs
+from rlservo.export.recipe.to_contract import space_spec
+
+RTOL = 1e-5
+ATOL = 1e-6
+ROUNDING = 8.0
+MASKED = 1e30
+"""A score beyond this stands for 'not allowed' (RLlib's action masks add -3.4e38); it measures nothing."""
+RULE = (
+    "a difference passes up to rtol * scale + atol; the scale is half the range of a bounded action, else the largest "
+    "number in the output's row (of value: over all observations), at least 1; also up to 8 times what RLlib's own "
+    "numbers move by when the observation moves by its last bit"
+)
+"""What the contract says of the tolerances."""
+REFERENCES: dict[str, str] = {
+    "new": "RLlib's own env-to-module connectors, inference forward and module-to-env connectors, restored from the "
+    "checkpoint, observation filter frozen, exploration off",
+    "old": "RLlib's own agent connectors, compute_actions_from_input_dict and action connectors (old API stack), "
+    "restored from the checkpoint, observation filter frozen, exploration off",
+}
+"""What an export is compared with, by API stack."""
+
+Outputs: TypeAlias = dict[str, NDArray[Any]]
+Runner: TypeAlias = Callable[[Inputs], Outputs]
+"""Every input of the graph by name to every output by name."""
+
+
+class Loop(Protocol):
+    """Something that acts step after step and remembers."""
+
+    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
+        """Return the outputs for one step of every row; rows in `restart` begin an episode with it."""
+        ...
+
+
+class GraphLoop:
+    """An exported graph fed with its own state."""
+
+    def __init__(self, run: Runner, state: Sequence[StateLeaf]) -> None:
+        self._run = run
+        self._state = {f"state_in.{leaf.name}": leaf.initial for leaf in state}
+        self._now: Inputs = {}
+
+    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
+        """Return the graph's outputs, its next state among them."""
+        outputs = self._run(self.complete(inputs, restart))
+        self._now = {name: outputs[name.replace("state_in.", "state_out.", 1)] for name in self._state}
+        return outputs
+
+    def complete(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Inputs:
+        """Return the inputs with the state they meet."""
+        rows = len(restart)
+        full = dict(inputs)
+        for name, initial in self._state.items():
+            start = np.repeat(initial[None], rows, axis=0)
+            now = self._now.get(name, start)
+            full[name] = np.where(restart.reshape((rows, *[1] * initial.ndim)), start, now).astype(initial.dtype)
+        return full
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One batch and what RLlib computed for it."""
+
+    batch: Batch
+    outputs: Outputs
+
+
+def record(
+    reference: Runner,
+    batches: Sequence[Batch],
+    loop: Callable[[], Loop] | None = None,
+    spaces: Mapping[str, Any] | None = None,
+) -> list[Recorded]:
+    """Run RLlib on every batch; sequences need `loop`, which starts RLlib's own.
+
+    The gate's wide and extreme observations leave the space, where RLlib's own pipeline may fail (the logarithm of an
+    action mask below zero): then all of them are cut back into the bounds of `spaces`, which are by input name.
+
+    The observations are copied: a connector may write into what it is given. Raises UnsupportedError when RLlib's own
+    pipeline fails on an observation of the policy's own space.
+    """
+    try:
+        return _record(reference, batches, loop)
+    except Exception:  # RLlib's own connectors and the user's raise anything
+        inside = [replace(batch, inputs=_inside(batch.inputs, spaces or {})) for batch in batches]
+    try:
+        return _record(reference, inside, loop)
+    except Exception as error:
+        raise UnsupportedError(
+            f"RLlib's own pipeline fails on an observation of the policy's space: {first_line(error)}"
+        ) from error
+
+
+def _record(reference: Runner, batches: Sequence[Batch], loop: Callable[[], Loop] | None) -> list[Recorded]:
+    recorded: list[Recorded] = []
+    running: Loop | None = None
+    for batch in batches:
+        inputs = _copied(batch.inputs)
+        if batch.restart is None:
+            outputs = reference(inputs)
+        else:
+            assert loop is not None, "a policy with a memory needs a reference that remembers"
+            if running is None or len(recorded[-1].batch) != len(batch):
+                running = loop()
+            outputs = running.step(inputs, batch.restart)
+        recorded.append(Recorded(batch, outputs))
+    return recorded
+
+
+def record_moved(
+    reference: Runner, recorded: Sequence[Recorded], loop: Callable[[], Loop] | None = None
+) -> list[Recorded]:
+    """Return what RLlib computes when every floating-point observation is moved up or down by its last bit."""
+    rng = np.random.default_rng(0)
+    moved = [
+        replace(one.batch, inputs={name: _by_last_bit(values, rng) for name, values in one.batch.inputs.items()})
+        for one in recorded
+    ]
+    return _record(reference, moved, loop)
+
+
+def _by_last_bit(values: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
+    if values.dtype.kind != "f":
+        return values
+    single = values.astype(np.float32)  # what the network computes with
+    towards = np.where(rng.random(values.shape) < 0.5, np.float32(np.inf), np.float32(-np.inf))
+    return np.asarray(np.nextafter(single, towards), values.dtype)
+
+
+def _inside(inputs: Inputs, spaces: Mapping[str, Any]) -> Inputs:
+    """Return the observations within their Box's bounds."""
+    boxes = {name: space for name, space in spaces.items() if isinstance(space, Box)}
+    return {
+        name: np.clip(values, boxes[name].low, boxes[name].high).astype(values.dtype) if name in boxes else values
+        for name, values in inputs.items()
+    }
+
+
+def replay(recorded: Sequence[Recorded], run: Runner, state: Sequence[StateLeaf]) -> Iterator[tuple[Inputs, Outputs]]:
+    """Run an exported graph over what was recorded; yield its full inputs and its outputs for each batch."""
+    loop, size = GraphLoop(run, state), 0
+    for one in recorded:
+        inputs, restart = _copied(one.batch.inputs), one.batch.restart
+        if restart is None:
+            yield inputs, run(inputs)
+            continue
+        if len(restart) != size:
+            loop, size = GraphLoop(run, state), len(restart)
+        yield loop.complete(inputs, restart), loop.step(inputs, restart)
+
+
+def prove(
+    recipe: Recipe,
+    recorded: Sequence[Recorded],
+    formats: Mapping[str, Runner],
+    labels: Sequence[str] = (),
+    api_stack: str = "new",
+    moved: Callable[[], list[Recorded]] | None = None,
+) -> Parity:
+    """Compare every format with what was recorded and return the largest differences.
+
+    `labels` name the action's elements for the message; `moved` is asked, once and only where a difference is too
+    large, for what `record_moved` gives. Raises ParityError at the first output that differs, saying
+    which element of which sample by how much.
+    """
+    rounding = _Rounding(recorded, moved)
+    results = {name: _prove_format(name, recipe, recorded, run, labels, rounding) for name, run in formats.items()}
+    return Parity(
+        reference=REFERENCES[api_stack],
+        samples=sum(len(one.batch) for one in recorded),
+        batch_sizes=BATCH_SIZES,
+        rtol=RTOL,
+        atol=ATOL,
+        rule=RULE,
+        formats=results,
+    )
+
+
+class _Rounding:
+    """How far RLlib's own numbers move when the observations move by their last bit; asked for when first needed."""
+
+    def __init__(self, recorded: Sequence[Recorded], moved: Callable[[], list[Recorded]] | None) -> None:
+        self._recorded = recorded
+        self._ask = moved
+        self._moved: list[Recorded] | None = None
+
+    def of(self, number: int, output: str) -> NDArray[np.float64]:
+        """Return the largest movement in each row of an output, broadcastable to it."""
+        if self._ask is None:
+            return np.zeros(())
+        if self._moved is None:
+            self._moved = self._ask()
+        before, after = (one[number].outputs[output].astype(np.float64) for one in (self._recorded, self._moved))
+        with np.errstate(invalid="ignore"):
+            by = np.nan_to_num(np.abs(after - before), nan=0.0, posinf=0.0)
+        return np.asarray(by.max(axis=tuple(range(1, by.ndim)), keepdims=True) if by.ndim > 1 else by)
+
+
+def _prove_format(
+    name: str,
+    recipe: Recipe,
+    recorded: Sequence[Recorded],
+    run: Runner,
+    labels: Sequence[str],
+    rounding: _Rounding,
+) -> FormatParity:
+    max_abs = max_rel = 0.0
+    largest_value = max((_largest(one.outputs["value"]) for one in recorded if "value" in one.outputs), default=1.0)
+    actions = recipe.action_leaves
+    running = replay(recorded, run, recipe.state)
+    for number, one in enumerate(recorded):
+        where = f"{name}, a batch of {len(one.batch)} {one.batch.kind} observations"
+        if one.batch.restart is not None:
+            where += f" (step {number} of the sequences)"
+        try:
+            got = next(running)[1]
+        except Exception as error:  # a shape baked into the graph ends in onnxruntime's or torch's own exceptions
+            raise ParityError(f"{where}: the exported graph does not run: {str(error).splitlines()[0]}") from error
+        for output, expected in one.outputs.items():
+            space = actions.get(output)
+            _check_form(where, output, got.get(output), expected, space)
+            if space is not None and not isinstance(space, Box):
+                scores = "q_values" if "q_values" in one.outputs else "action_dist_inputs"
+                _check_choices(where, output, got[output], one, recipe, partial(rounding.of, number, scores))
+                continue
+            least = largest_value if output == "value" else 1.0
+            moves = partial(rounding.of, number, output)
+            difference, scale = _compare(where, output, got[output], expected, space, one, labels, least, moves)
+            max_abs = max(max_abs, float(difference.max(initial=0.0)))
+            max_rel = max(max_rel, float((difference / scale).max(initial=0.0)))
+    return FormatParity(max_abs=max_abs, max_rel=max_rel)
+
+
+def _check_form(where: str, output: str, got: NDArray[Any] | None, expected: NDArray[Any], space: Any) -> None:
+    if got is None:
+        raise ParityError(f"{where}: the exported graph has no output '{output}'")
+    if got.shape != expected.shape:
+        raise ParityError(f"{where}: output '{output}' has shape {got.shape}, RLlib's has {expected.shape}")
+    if space is not None:
+        dtype = np.dtype(space.dtype) if isinstance(space, Box) else np.dtype(np.int64)
+        if got.dtype != dtype:
+            raise ParityError(f"{where}: the action is {got.dtype}, the action space wants {dtype}")
+
+
+def _compare(
+    where: str,
+    output: str,
+    got: NDArray[Any],
+    expected: NDArray[Any],
+    space: Any,
+    one: Recorded,
+    labels: Sequence[str],
+    least_scale: float,
+    moves: Callable[[], NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (difference, scale), both of the output's shape."""
+    a, b = got.astype(np.float64), expected.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        same = (a == b) | (np.isnan(a) & np.isnan(b))  # overflow in both is no difference
+        difference = np.where(same, 0.0, np.abs(a - b))
+    scale = np.maximum(np.where(np.isfinite(b), np.abs(b), 1.0), _scale(b, space, least_scale))
+    allowed = RTOL * scale + ATOL
+    bad = ~(difference <= allowed)
+    if bad.any():
+        allowed = allowed + ROUNDING * moves()
+        bad = ~(difference <= allowed)
+    if bad.any():
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        row, element = index[0], int(np.ravel_multi_index(index[1:], b.shape[1:])) if b.ndim > 1 else 0
+        label = f"{element} ({labels[element]})" if output == "action" and element < len(labels) else str(element)
+        raise ParityError(
+            f"{where}: output '{output}', element {label}, sample {row}: the export gives {a[index]:.9g}, RLlib "
+            f"{b[index]:.9g} (allowed difference {allowed[index]:.2g}); {len(np.unique(np.argwhere(bad)[:, 0]))} of "
+            f"{len(b)} samples differ",
+            {
+                "output": output, "element": element, "sample": row, "exported": float(a[index]),
+                "reference": float(b[index]), "observation": _row(one.batch, row),
+            },
+        )  # fmt: skip
+    return difference, scale
+
+
+def _scale(expected: NDArray[np.float64], space: Any, least: float) -> NDArray[np.float64]:
+    """Return the size of number that rounding is measured against, broadcastable to `expected`."""
+    if isinstance(space, Box) and bool((space.bounded_below & space.bounded_above).all()):
+        return (space.high.astype(np.float64) - space.low.astype(np.float64))[None] / 2
+    measured = np.isfinite(expected) & (np.abs(np.nan_to_num(expected)) < MASKED)
+    finite = np.where(measured, np.abs(expected), 0.0)
+    axes = tuple(range(1, expected.ndim))
+    return np.maximum(finite.max(axis=axes, keepdims=True) if axes else finite, least)
+
+
+def _largest(values: NDArray[Any]) -> float:
+    finite = values[np.isfinite(values)]
+    return max(1.0, float(np.abs(finite).max(initial=0.0)))
+
+
+def _row(batch: Batch, row: int) -> Any:
+    rows = {name: values[row].tolist() for name, values in batch.inputs.items()}
+    return rows["obs"] if set(rows) == {"obs"} else rows
+
+
+def _check_choices(
+    where: str,
+    output: str,
+    got: NDArray[Any],
+    one: Recorded,
+    recipe: Recipe,
+    moves: Callable[[], NDArray[np.float64]],
+) -> None:
+    """Compare discrete actions; a tie in RLlib's scores excuses a difference, and so do scores that are no numbers."""
+    columns = _columns(one.outputs[output])
+    scored = choice_scores(recipe, one.outputs).get(output) or [np.full((len(c), 1), np.inf) for c in columns]
+    for part, (exported, wanted, scores) in enumerate(zip(_columns(got), columns, scored, strict=True)):
+        width = _tie_width(scores)
+        for row in np.flatnonzero(exported != wanted):
+            chosen, right = int(exported[row]), int(wanted[row])
+            if np.isnan(scores[row]).any():
+                continue
+            apart = abs(scores[row, chosen] - scores[row, right]) if 0 <= chosen < scores.shape[1] else np.inf
+            if not apart <= width[row] and not apart <= width[row] + ROUNDING * _at(moves(), int(row)):
+                element = f", element {part}" if len(columns) > 1 else ""
+                raise ParityError(
+                    f"{where}: output '{output}'{element}, sample {row}: the export chooses {chosen}, RLlib {right}",
+                    {"output": output, "sample": int(row), "exported": chosen, "reference": right},
+                )
+
+
+def _at(by_row: NDArray[np.float64], row: int) -> float:
+    return float(by_row[row].max()) if by_row.ndim else float(by_row)
+
+
+def ties(recipe: Recipe, outputs: Outputs) -> NDArray[np.bool_]:
+    """Return for each sample whether any discrete choice has two best scores that are the same within tolerance."""
+    rows = len(next(iter(outputs.values())))
+    tied = np.zeros(rows, np.bool_)
+    for parts in choice_scores(recipe, outputs).values():
+        for scores in parts:
+            tied |= _tied(scores) | np.isnan(scores).any(axis=1)
+    return tied
+
+
+def choice_scores(recipe: Recipe, outputs: Outputs) -> dict[str, list[NDArray[np.float64]]]:
+    """Return the scores `[batch, choices]` of every discrete choice, by action leaf and element.
+
+    A module that computes its actions itself gives none.
+    """
+    if recipe.mode == "given":
+        return {}
+    scores = outputs["q_values" if "q_values" in outputs else "action_dist_inputs"].astype(np.float64)
+    return split_scores(scores, space_spec(recipe.action_space, action=True))
+
+
+def _columns(choices: NDArray[Any]) -> list[NDArray[Any]]:
+    return [choices] if choices.ndim == 1 else list(choices.reshape(len(choices), -1).T)
+
+
+def _tied(scores: NDArray[np.float64]) -> NDArray[np.bool_]:
+    if scores.shape[1] < 2:
+        return np.zeros(len(scores), np.bool_)
+    best = np.sort(scores, axis=1)[:, -2:]
+    return np.asarray(best[:, 1] - best[:, 0] <= _tie_width(scores))
+
+
+def _tie_width(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    measured = np.where(np.abs(np.nan_to_num(scores)) < MASKED, np.abs(np.nan_to_num(scores)), 0.0)
+    return np.asarray(RTOL * np.maximum(measured.max(axis=1), 1.0) + ATOL)
+
+
+def _copied(inputs: Inputs) -> Inputs:
+    return {name: values.copy() for name, values in inputs.items()}

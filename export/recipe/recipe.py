@@ -1,0 +1,207 @@
+"""What RLlib does around the network, in plain numbers: the observation steps before it and the action rule after it.
+
+`new_stack.py` fills a `Recipe` in from RLlib's saved connector pipelines and `policy_graph.py` turns it into a graph.
+This file knows neither of them: numpy and Gymnasium spaces only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from numpy.typing import NDArray
+
+from rlservo.export.recipe.trees import space_leaves
+
+# ray/rllib/utils/numpy.py (ray 2.60): keeps the filter from dividing by zero.
+SMALL_NUMBER = 1e-6
+
+
+AnyDiscrete: TypeAlias = "Discrete[Any]"
+"""A Discrete of whichever integer type; quoted because only newer Gymnasium can index the class."""
+
+
+@dataclass(frozen=True)
+class ObservationFilter:
+    """RLlib's MeanStdFilter, frozen: `clip((x - mean) / (std + 1e-6), -clip, clip)` (ray/rllib/utils/filter.py)."""
+
+    count: int
+    """How many observations the statistics were gathered from."""
+    mean: NDArray[np.float64]
+    """Of the observation's shape, in its units."""
+    std: NDArray[np.float32]
+    """Unbiased (n - 1), zero for n <= 1, and single precision because RLlib computes it so."""
+    clip: float | None
+    demean: bool = True
+    """Whether the mean is subtracted at all (`de_mean_to_zero`)."""
+    destd: bool = True
+    """Whether the standard deviation divides at all (`de_std_to_one`)."""
+
+    def offset(self) -> NDArray[np.float64]:
+        """Return what is subtracted, of the observation's shape."""
+        return self.mean if self.demean else np.zeros_like(self.mean)
+
+    def divisor(self) -> NDArray[np.float32]:
+        """Return what divides, of the observation's shape."""
+        return self.std + np.float32(SMALL_NUMBER) if self.destd else np.ones_like(self.std)
+
+
+@dataclass(frozen=True)
+class Flatten:
+    """RLlib's FlattenObservations: one float32 row, discrete parts one-hot, Dict keys in sorted order.
+
+    `space` is what comes in; None is a single Box. `without` are top-level keys that are left out.
+    """
+
+    space: Any = None
+    without: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class FrameStack:
+    """RLlib's FrameStacking: the last `frames` observations `[..., 1]` side by side on the third axis, zeros before."""
+
+    frames: int
+    shape: tuple[int, ...]
+    dtype: str
+
+
+@dataclass(frozen=True)
+class Previous:
+    """RLlib's PrevActionsPrevRewards: a dict of the observation, the last actions' one-hot codes and last rewards."""
+
+    actions: int
+    choices: int
+    """How many actions there are to choose from: the width of a one-hot code."""
+    rewards: int
+    keys: tuple[str, str, str] = ("_orig_obs", "prev_n_actions", "prev_n_rewards")
+
+
+@dataclass(frozen=True)
+class UserStep:
+    """A stateless connector of the user's own, as a function of torch tensors `[batch, ...]` in the space's form."""
+
+    name: str
+    function: Callable[[Any], Any] = field(compare=False)
+
+
+@dataclass(frozen=True)
+class Preprocess:
+    """The old API stack's preprocessor: one float32 row of the space's leaves, Dict keys in sorted order.
+
+    Discrete leaves are one-hot from their start on. A Box of 128 numbers is taken for an Atari console's memory:
+    `(x - 128) / 128` (ray/rllib/models/preprocessors.py, ray 2.60).
+    """
+
+    space: Any
+
+
+ObservationStep: TypeAlias = ObservationFilter | Flatten | FrameStack | Previous | UserStep | Preprocess
+
+Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax", "given"]
+"""How the deterministic action comes out of the distribution's parameters (or Q-values), or that it is given."""
+
+Transform: TypeAlias = Literal["none", "unsquash", "clip"]
+"""What RLlib does to that action before `env.step`; Box leaves that are not bounded all round are not unsquashed."""
+
+DistributionKind: TypeAlias = Literal["diag_gaussian", "squashed_gaussian", "categorical", "multi_categorical", "multi"]
+
+
+@dataclass(frozen=True)
+class StateLeaf:
+    """One array a policy carries from step to step, and what it is at an episode's start."""
+
+    name: str
+    initial: NDArray[Any]
+    kind: Literal["recurrent", "frames", "previous_actions", "previous_rewards"] = "recurrent"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything between a raw observation and `env.step`, except the network."""
+
+    observation_space: Any
+    """A Box, Discrete, MultiDiscrete or MultiBinary, or a Dict or Tuple of such, nested at will."""
+    action_space: Any
+    """A Box, Discrete or MultiDiscrete, or a Dict or Tuple of such."""
+    steps: tuple[ObservationStep, ...]
+    mode: Mode
+    """Of the Box leaves (discrete ones are always argmax); of the whole action where it is only one leaf."""
+    transform: Transform
+    distribution: DistributionKind | None
+    """None where the module picks its action itself and offers no distribution (DQN)."""
+    network_state: tuple[StateLeaf, ...] = ()
+    """A recurrent network's state, in the order the network takes and gives it."""
+    action_steps: tuple[UserStep, ...] = ()
+    """The user's own connectors between the distribution's mode and unsquashing."""
+
+    @property
+    def filter(self) -> ObservationFilter | None:
+        """The observation filter, if there is one."""
+        return next((step for step in self.steps if isinstance(step, ObservationFilter)), None)
+
+    @property
+    def observation_leaves(self) -> dict[str, Any]:
+        """The observation's leaf spaces by the graph's input names."""
+        return space_leaves(self.observation_space, "obs")
+
+    @property
+    def action_leaves(self) -> dict[str, Any]:
+        """The action's leaf spaces by the graph's output names."""
+        return space_leaves(self.action_space, "action")
+
+    @property
+    def state(self) -> tuple[StateLeaf, ...]:
+        """All that is carried from step to step: of the observation steps first, then of the network."""
+        carried: list[StateLeaf] = []
+        for step in self.steps:
+            if isinstance(step, FrameStack):
+                past = (*step.shape[:2], (step.frames - 1) * step.shape[2], *step.shape[3:])
+                carried.append(StateLeaf("frames", np.zeros(past, step.dtype), "frames"))
+            elif isinstance(step, Previous):
+                if step.actions:
+                    codes = np.zeros(step.actions * step.choices, np.float32)
+                    carried.append(StateLeaf("previous_actions", codes, "previous_actions"))
+                if step.rewards > 1:
+                    earlier = np.zeros(step.rewards - 1, np.float32)
+                    carried.append(StateLeaf("previous_rewards", earlier, "previous_rewards"))
+        return (*carried, *self.network_state)
+
+    @property
+    def needs_reward(self) -> bool:
+        """Whether the graph has an input `reward`: the reward that the last action brought, 0 at an episode's start."""
+        return any(isinstance(step, Previous) and step.rewards > 0 for step in self.steps)
+
+
+def parameter_count(space: Any) -> int:
+    """Return how many distribution parameters one action leaf has."""
+    if isinstance(space, Box):
+        return 2 * math.prod(space.shape)
+    if isinstance(space, MultiDiscrete):
+        return int(space.nvec.sum())
+    return int(space.n)
+
+
+def leaf_transform(space: Any, transform: Transform) -> Transform:
+    """Return what happens to one action leaf: only a Box is touched, and unsquashed only if bounded on all sides."""
+    if not isinstance(space, Box):
+        return "none"
+    if transform == "unsquash" and not bool((space.bounded_below & space.bounded_above).all()):
+        return "none"
+    return transform
+
+
+def loose_bounds(recipe: Recipe) -> list[str]:
+    """Return a sentence for each action leaf whose bounds RLlib does not enforce."""
+    return [
+        f"{name}: RLlib sends the network's own numbers to env.step, whether inside {space} or not, and so does the "
+        "graph; rlservo's runtime refuses an action outside"
+        for name, space in recipe.action_leaves.items()
+        if isinstance(space, Box)
+        and bool((space.bounded_below | space.bounded_above).any())
+        and leaf_transform(space, recipe.transform) == "none"
+    ]

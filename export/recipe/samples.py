@@ -1,0 +1,162 @@
+"""The observations an export is proven on: likely ones, wide ones, and extremes that make every clip engage.
+
+A policy with a memory is shown sequences, in which episodes end and begin at different steps in different rows. It
+draws numbers from a recipe's observation space and filter; it runs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
+from numpy.typing import NDArray
+
+from rlservo.export.recipe.recipe import ObservationFilter, Recipe
+
+BATCH_SIZES = (1, 2, 257)
+UNBOUNDED = 1e6  # a bound beyond this (CartPole's 3.4e38) says nothing of the values that occur
+WIDE = 10.0  # standard deviations
+EXTREME = 1e3
+SEQUENCE_STEPS = {1: 200, 2: 200, 257: 3}
+NEW_EPISODE = 0.02  # the chance of a row's episode to end at a step, beside the ends that are certain
+
+Inputs: TypeAlias = dict[str, NDArray[Any]]
+"""Arrays `[batch, ...]` by the graph's input names."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Observations by input name in the space's dtypes, and what kind they are.
+
+    In a sequence, `restart` says which rows begin an episode; the other rows go on from the batch before. None is a
+    batch of its own.
+    """
+
+    kind: str
+    inputs: Inputs
+    restart: NDArray[np.bool_] | None = None
+
+    def __len__(self) -> int:
+        return len(next(iter(self.inputs.values())))
+
+    @property
+    def obs(self) -> NDArray[Any]:
+        """The observation of a policy that has only one input."""
+        (only,) = self.inputs.values()
+        return only
+
+
+def draw_batches(recipe: Recipe, seed: int) -> list[Batch]:
+    """Return batches of every kind and every size in BATCH_SIZES; the same seed draws the same.
+
+    For a policy with a memory they are sequences of SEQUENCE_STEPS batches of one size.
+    """
+    rng = np.random.default_rng(seed)
+    if recipe.state:
+        return [batch for size in BATCH_SIZES for batch in _sequence(recipe, rng, size)]
+    one, two, many = BATCH_SIZES
+    sizes = [many, *[one] * 4, *[two] * 2]
+    return [Batch(kind, _observations(recipe, kind, rng, size)) for kind in KINDS for size in sizes]
+
+
+def _sequence(recipe: Recipe, rng: np.random.Generator, size: int) -> Iterator[Batch]:
+    for step in range(SEQUENCE_STEPS[size]):
+        kind = str(rng.choice(list(KINDS), p=[0.8, 0.1, 0.1]))
+        inputs = _observations(recipe, kind, rng, size)
+        restart = rng.random(size) < NEW_EPISODE
+        if step in (0, 60, 61):
+            restart[:] = True
+        if recipe.needs_reward:
+            rewards = rng.standard_normal(size).astype(np.float32)
+            inputs["reward"] = np.where(restart, np.float32(0.0), rewards)
+        yield Batch(kind, inputs, restart)
+
+
+def _observations(recipe: Recipe, kind: str, rng: np.random.Generator, size: int) -> Inputs:
+    return {
+        name: _draw(kind, _Leaf(space, recipe.filter), rng, size) for name, space in recipe.observation_leaves.items()
+    }
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    space: Any
+    filter: ObservationFilter | None
+
+
+def _draw(kind: str, leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[Any]:
+    space = leaf.space
+    if isinstance(space, Discrete):
+        return np.asarray(rng.integers(space.start, space.start + space.n, size), np.int64)
+    if isinstance(space, MultiDiscrete):
+        low = np.asarray(space.start)
+        return np.asarray(rng.integers(low, low + space.nvec, (size, *space.shape)), space.dtype)
+    if isinstance(space, MultiBinary):
+        return rng.integers(0, 2, (size, *space.shape)).astype(space.dtype)
+    assert isinstance(space, Box)
+    if np.dtype(space.dtype).kind in "iu":
+        return _integers(kind, space, rng, size)
+    if np.dtype(space.dtype).kind == "b":
+        return np.asarray(rng.random((size, *space.shape)) < 0.5)
+    return KINDS[kind](leaf, rng, size).astype(space.dtype)
+
+
+def _integers(kind: str, space: Box, rng: np.random.Generator, size: int) -> NDArray[Any]:
+    """Whole numbers of the space: anywhere in it, or (extremes) only its bounds."""
+    low = np.maximum(space.low.astype(np.float64), -UNBOUNDED).astype(np.int64)
+    high = np.minimum(space.high.astype(np.float64), UNBOUNDED).astype(np.int64)
+    shape = (size, *space.shape)
+    if kind == "extreme":
+        return np.where(rng.random(shape) < 0.5, low, high).astype(space.dtype)
+    return rng.integers(low, high, shape, endpoint=True).astype(space.dtype)
+
+
+def _likely(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    """Uniform in the space where it is bounded, else as the filter has seen them (without one: standard normal)."""
+    low, high, bounded = _bounds(leaf)
+    centre, spread = _centre_and_spread(leaf)
+    shape = (size, *low.shape)
+    uniform = rng.uniform(np.where(bounded, low, 0.0), np.where(bounded, high, 1.0), shape)
+    return np.where(bounded, uniform, centre + spread * rng.standard_normal(shape))
+
+
+def _wide(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    """Normal about the centre, ten standard deviations wide: about a third of the elements reach the filter's clip."""
+    centre, spread = _centre_and_spread(leaf)
+    return centre + WIDE * spread * rng.standard_normal((size, *centre.shape))
+
+
+def _extreme(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    """Corners of the space; in half of the rows some elements at 0.0 or -0.0 and some a thousand times too large."""
+    low, high, bounded = _bounds(leaf)
+    centre, spread = _centre_and_spread(leaf)
+    shape = (size, *low.shape)
+    corner = np.where(rng.random(shape) < 0.5, np.where(bounded, low, centre), np.where(bounded, high, centre))
+    huge = rng.choice([-1.0, 1.0], shape) * EXTREME * np.maximum(spread, 1.0)
+    dice = rng.random(shape)
+    zero = np.copysign(0.0, huge)  # angles and divisions tell the two zeros apart
+    spoiled = np.where(dice < 0.1, zero, np.where(dice < 0.3, huge, corner))
+    rows = rng.random((size, *[1] * low.ndim)) < 0.5
+    return np.where(rows, spoiled, corner)
+
+
+KINDS: dict[str, Callable[[_Leaf, np.random.Generator, int], NDArray[np.float64]]] = {
+    "likely": _likely,
+    "wide": _wide,
+    "extreme": _extreme,
+}
+
+
+def _bounds(leaf: _Leaf) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    low, high = leaf.space.low.astype(np.float64), leaf.space.high.astype(np.float64)
+    return low, high, (np.abs(low) < UNBOUNDED) & (np.abs(high) < UNBOUNDED)
+
+
+def _centre_and_spread(leaf: _Leaf) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    shape = leaf.space.shape
+    if leaf.filter is None or leaf.filter.mean.size != int(np.prod(shape)):
+        return np.zeros(shape), np.ones(shape)
+    return leaf.filter.mean.reshape(shape), leaf.filter.std.astype(np.float64).reshape(shape)

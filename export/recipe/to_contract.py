@@ -1,0 +1,69 @@
+"""Translate Gymnasium's spaces, and what a policy remembers, into the contract's terms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+from numpy.typing import NDArray
+
+from rlservo.export.contract.bundle import (
+    BoxSpec,
+    DictSpec,
+    DiscreteSpec,
+    Element,
+    MultiBinarySpec,
+    MultiDiscreteSpec,
+    SpaceSpec,
+    StateSpec,
+    TupleSpec,
+)
+from rlservo.export.recipe.recipe import StateLeaf
+
+
+def space_spec(space: Any, elements: Sequence[Element] = (), *, action: bool = False) -> SpaceSpec:
+    """Return the contract's form of `space`; only a leaf names `elements`.
+
+    An action's Discrete loses its `start`: the contract says what goes to `env.step`, and RLlib sends 0 .. n - 1.
+    """
+    if isinstance(space, Dict):
+        return DictSpec(spaces={key: space_spec(space.spaces[key], action=action) for key in sorted(space.spaces)})
+    if isinstance(space, Tuple):
+        return TupleSpec(spaces=tuple(space_spec(child, action=action) for child in space.spaces))
+    named = tuple(elements)
+    if isinstance(space, Discrete):
+        return DiscreteSpec(n=int(space.n), start=0 if action else int(space.start), dtype="int64", elements=named)
+    shape = tuple(int(size) for size in space.shape)
+    if isinstance(space, MultiDiscrete):
+        start = np.zeros(shape) if action else np.broadcast_to(np.asarray(space.start), shape)
+        return MultiDiscreteSpec(
+            shape=shape,
+            nvec=tuple(int(n) for n in space.nvec.ravel()),
+            start=tuple(int(first) for first in start.ravel()),
+            dtype="int64" if action else str(space.dtype),
+            elements=named,
+        )
+    if isinstance(space, MultiBinary):
+        return MultiBinarySpec(shape=shape, dtype=str(space.dtype), elements=named)
+    assert isinstance(space, Box)
+    return BoxSpec(shape=shape, dtype=str(space.dtype), low=_bound(space.low), high=_bound(space.high), elements=named)
+
+
+def state_spec(leaf: StateLeaf) -> StateSpec:
+    """Return the contract's form of what a policy remembers."""
+    flat = leaf.initial.ravel().tolist()
+    return StateSpec(
+        name=leaf.name,
+        dtype=str(leaf.initial.dtype),
+        shape=tuple(leaf.initial.shape),
+        initial=float(flat[0]) if len(set(flat)) == 1 else tuple(float(value) for value in flat),
+        kind=leaf.kind,
+    )
+
+
+def _bound(values: NDArray[Any]) -> float | tuple[float | None, ...] | None:
+    """Return one number where all elements share it, None for infinity."""
+    flat = [float(value) if np.isfinite(value) else None for value in values.ravel()]
+    return flat[0] if len(set(flat)) == 1 else tuple(flat)

@@ -1,0 +1,69 @@
+"""Find out, by asking, how a distribution's deterministic action comes out of its parameters. It knows no RLlib.
+
+Where it is none of the known rules, the distribution itself goes into the graph (mode "given"), if it gives the same
+action twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from gymnasium.spaces import Box
+from torch import Tensor
+
+from rlservo.export.contract.errors import UnsupportedError, first_line
+from rlservo.export.recipe.recipe import Mode, parameter_count
+from rlservo.export.recipe.trees import Tree, space_leaves, tree_leaves
+
+
+def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: Any, given: Tensor) -> Mode:
+    """Return how the deterministic action of distribution `name` comes out of its parameters.
+
+    `deterministic` gives it for parameters `[batch, n]`, such as the network's own `given`; "given" means that no known
+    rule does and the distribution has to be asked. Raises UnsupportedError where it fails or answers at random.
+
+    RLlib 2.60 sends SAC's bare mean on the new API stack where
+    the old one and other versions send its tanh: the class in the checkpoint decides.
+    """
+    spaces = space_leaves(action_space, "action")
+    widths = [parameter_count(space) for space in spaces.values()]
+    generator = torch.Generator().manual_seed(0)
+    probe = 2.0 * torch.randn((7, sum(widths)), generator=generator)
+    try:
+        first, second = (tree_leaves(deterministic(given.clone())) for _ in range(2))
+    except Exception as error:  # a user's distribution may raise anything
+        raise UnsupportedError(
+            f"the action distribution {name} does not take the {given.shape[-1]} numbers that the network gives for "
+            f"{action_space}: {first_line(error)}"
+        ) from error
+    if not all(torch.equal(one, other) for one, other in zip(first, second, strict=True)):
+        raise UnsupportedError(
+            f"the action distribution {name} draws its deterministic action at random: there is no one action to prove "
+            "an export with; its deterministic form has to give the same action each time"
+        )
+    if given.shape[-1] != sum(widths):
+        return "given"
+    actions = tree_leaves(deterministic(probe.clone()))
+    found: set[Mode] = set()
+    for space, action, part in zip(spaces.values(), actions, torch.split(probe, widths, dim=-1), strict=True):
+        if (mode := _known(space, action, part)) is None:
+            return "given"
+        found.add(mode)
+    found.discard("argmax")
+    if len(found) > 1:
+        return "given"
+    return found.pop() if found else "argmax"
+
+
+def _known(space: Any, action: Tensor, part: Tensor) -> Mode | None:
+    """Return the rule by which `action` comes out of `part`, its parameters."""
+    if not isinstance(space, Box):
+        sizes = [int(n) for n in space.nvec] if hasattr(space, "nvec") else [int(space.n)]
+        best = torch.stack([torch.argmax(one, dim=-1) for one in torch.split(part, sizes, dim=-1)], dim=-1)
+        return "argmax" if best.numel() == action.numel() and torch.equal(best.reshape(action.shape), action) else None
+    mean = part.chunk(2, dim=-1)[0]
+    if torch.equal(action, mean):
+        return "mean"
+    return "tanh_mean" if action.shape == mean.shape and torch.allclose(action, torch.tanh(mean), atol=1e-6) else None

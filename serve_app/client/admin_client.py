@@ -1,0 +1,95 @@
+"""The commands of `/v1/admin` as methods: what `rlservo policy` calls. It knows nothing of what the server does."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+from urllib.parse import urlsplit
+
+from typing_extensions import Self
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.client.http_transport import Transport, encode
+from rlservo.serve_app.server.admin_key import key_file, read_key
+from rlservo.serve_app.server.api_keys import is_loopback
+
+KEY_VARIABLE = "RLSERVO_ADMIN_KEY"
+TIMEOUT_S = 90.0  # every replica loads and proves a version before the server answers
+
+
+class AdminClient:
+    """Changes what a server serves. Every method raises the error that the server names."""
+
+    def __init__(self, url: str, *, api_key: str, timeout_s: float = TIMEOUT_S) -> None:
+        """Nothing is sent before the first call."""
+        # Not retried: a change that was made and not answered would be made twice.
+        self._transport = Transport(url, timeout_s=timeout_s, retries=0, api_key=api_key)
+
+    def replicas(self) -> list[dict[str, Any]]:
+        """Return what every replica serves, as its `GET /v1/policies` would tell."""
+        listings: list[dict[str, Any]] = self._transport.get("v1", "admin", "policies")
+        return listings
+
+    def load(self, name: str, version: str | None = None) -> dict[str, Any]:
+        """Load and prove a version; None is the repository's newest."""
+        return self._command(name, "load", {"version": version})
+
+    def unload(self, name: str, version: str | None = None) -> dict[str, Any]:
+        """Drop a version, or with None the policy."""
+        return self._command(name, "unload", {"version": version})
+
+    def alias(self, name: str, alias: str, version: str | None) -> dict[str, Any]:
+        """Let an alias lead to a loaded version, or with None remove it."""
+        return self._command(name, "alias", {"alias": alias, "version": version})
+
+    def rollback(self, name: str, alias: str) -> dict[str, Any]:
+        """Let an alias lead where it led before; once, even if the proxy should send the command twice."""
+        policies = [policy for replica in self.replicas() for policy in replica["policies"] if policy["name"] == name]
+        expected = policies[0]["aliases"].get(alias) if policies else None
+        return self._command(name, "rollback", {"alias": alias, "expected": expected})
+
+    def canary(self, name: str, version: str | None, share: float | None = None) -> dict[str, Any]:
+        """Send a share of the sessions to a version, or with None end that."""
+        return self._command(name, "canary", {"version": version, "share": share})
+
+    def shadow(self, name: str, version: str | None) -> dict[str, Any]:
+        """Let a version compute along, or with None end that."""
+        return self._command(name, "shadow", {"version": version})
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._transport.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
+        reply: dict[str, Any] = self._transport.post("v1", "admin", "policies", name, command, body=encode(document))
+        return reply
+
+
+def find_key(url: str, file: Path | None) -> str:
+    """Return the admin key: of the file, of RLSERVO_ADMIN_KEY, or of the server that this user runs on that port.
+
+    Raises UsageError when there is none.
+    """
+    if file is not None:
+        return read_key(file)
+    given = os.environ.get(KEY_VARIABLE)
+    if given:
+        return given
+    parts = urlsplit(url)
+    own = key_file(parts.port or 80)
+    if is_loopback(parts.hostname or "") and own.exists():
+        return read_key(own)
+    raise UsageError(
+        f"administration needs an admin key: name its file with --key-file or set {KEY_VARIABLE} "
+        "('rlservo serve' writes one and says where; 'rlservo key LABEL --admin' makes one for other servers)"
+    )

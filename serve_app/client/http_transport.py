@@ -1,0 +1,277 @@
+"""One HTTP conversation with a policy server: JSON out, JSON in, a time budget, bounded retries, our own errors.
+
+Used by `client`. It knows nothing of policies, observations or contracts; httpx is imported here and nowhere else.
+A call takes `timeout_s` at most, retries and waits included, however slowly the server's bytes trickle in, and an
+answer that was not complete by then is never returned.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+from urllib.parse import quote, urlsplit
+from urllib.request import getproxies, proxy_bypass
+
+import numpy as np
+
+from rlservo.export.contract.errors import (
+    DeadlineError,
+    RequestError,
+    RlservoError,
+    TooLargeError,
+    UnavailableError,
+    UsageError,
+)
+
+try:
+    import httpx
+except ModuleNotFoundError as missing:
+    raise UsageError("the HTTP client needs httpx: pip install 'rlservo[client]'") from missing
+
+from rlservo.serve_app.client.deadline_backend import DeadlineBackend  # needs httpx's httpcore
+
+try:  # three times faster than the standard library on an image; not a requirement of the client
+    import orjson
+except ModuleNotFoundError:
+    orjson = None  # type: ignore[assignment]
+
+FIRST_WAIT_S = 0.05  # before the second attempt; doubles each time
+LONGEST_WAIT_S = 2.0
+MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; keeps a wrong URL from filling the memory
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+
+class Transport:
+    """A kept-alive connection (a pool of them, when several threads call) to one server. Thread-safe."""
+
+    def __init__(self, url: str, *, timeout_s: float, retries: int, api_key: str | None = None) -> None:
+        """Check the arguments; nothing is sent before the first call.
+
+        `api_key` travels as `Authorization: Api-Key <key>`, as openpi's clients send it.
+        """
+        self.url = _checked_url(url)
+        if not timeout_s > 0:
+            raise UsageError(f"timeout_s must be above 0 seconds, got {timeout_s}")
+        if retries < 0:
+            raise UsageError(f"retries must be 0 or more, got {retries}")
+        self._timeout_s = timeout_s
+        self._retries = retries
+        # The replies are a few hundred bytes: compressing them costs more than it saves.
+        self._headers = {"accept": "application/json", "accept-encoding": "identity", "user-agent": "rlservo-client"}
+        if api_key is not None:
+            self._headers["authorization"] = f"Api-Key {api_key}"
+        # httpx.Client's cookies, redirects and merging would cost a control loop 0.2 ms of 0.7 per request.
+        self._http = httpx.HTTPTransport(
+            verify=self.url.startswith("https"),  # reading the certificates takes 20 ms; http has no use for them
+            proxy=_proxy_of(self.url),
+            limits=httpx.Limits(max_connections=100),
+        )
+        self._backend = DeadlineBackend()
+        # httpx has no argument for it; httpcore, below it, has. Its own time-outs are for each read, not for all.
+        self._http._pool._network_backend = self._backend
+        self._closed = False
+
+    @property
+    def reconnects(self) -> int:
+        """How many connections were made after the first."""
+        return max(0, self._backend.connections - 1)
+
+    def get(self, *path: str, timeout_s: float | None = None, retries: int | None = None) -> Any:
+        """Return the JSON at `/path[0]/path[1]/...`."""
+        return self._call("GET", path, None, timeout_s, retries)
+
+    def post(self, *path: str, body: bytes, timeout_s: float | None = None) -> Any:
+        """Send a JSON document and return the JSON answer."""
+        return self._call("POST", path, body, timeout_s, None)
+
+    def close(self) -> None:
+        """Close the connections. A call after that raises UsageError."""
+        self._closed = True
+        self._http.close()
+
+    def _call(
+        self, method: str, path: tuple[str, ...], body: bytes | None, timeout_s: float | None, retries: int | None
+    ) -> Any:
+        """Try until answered, out of time or out of retries.
+
+        Raises DeadlineError when the answer did not come in time (never retried: the server may still be at work),
+        UnavailableError when the server cannot be reached or stays at 503, and else the error the server names.
+        """
+        if self._closed:
+            raise UsageError("the client is closed: make a new one")
+        url = "/".join((self.url, *(quote(part, safe="") for part in path)))
+        budget = self._timeout_s if timeout_s is None else timeout_s
+        deadline = time.monotonic() + budget
+        for attempt, wait in enumerate(_waits(self._retries if retries is None else retries)):
+            try:
+                status, headers, content = self._once(method, url, body, deadline, budget)
+            except UnavailableError as error:
+                failure = error
+                # A server that closed an idle connection is probably there: ask again at once, the first time.
+                if attempt == 0 and error.details.get("dropped"):
+                    wait = None if wait is None else 0.0
+            else:
+                if status < 300:
+                    return self._parse(content, url, status)
+                answered = self._error(content, url, status)
+                if status != 503:
+                    raise answered
+                failure = UnavailableError(answered.message, answered.details)
+                asked = _retry_after_s(headers)
+                if asked is not None:
+                    failure.details["retry_after_s"] = asked
+                    wait = None if wait is None else asked
+            # Waiting longer than the caller will is no use: say so now.
+            if wait is None or time.monotonic() + wait >= deadline:
+                raise failure
+            time.sleep(wait)
+        raise AssertionError("the last wait is None")
+
+    def _once(
+        self, method: str, url: str, body: bytes | None, deadline: float, budget: float
+    ) -> tuple[int, Mapping[str, str], bytes]:
+        """Return (status, headers, body) of one attempt."""
+        remaining = deadline - time.monotonic()
+        late = DeadlineError(f"{self.url} did not answer within {budget:g} s", {"timeout_s": budget})
+        if remaining <= 0:
+            raise late
+        headers = self._headers if body is None else {**self._headers, "content-type": "application/json"}
+        timeout = dict.fromkeys(("connect", "read", "write", "pool"), remaining)
+        request = httpx.Request(method, url, headers=headers, content=body, extensions={"timeout": timeout})
+        self._backend.deadline = deadline
+        try:
+            response = self._http.handle_request(request)
+            try:
+                content = b""
+                for chunk in response.iter_raw():
+                    content += chunk
+                    if time.monotonic() > deadline:
+                        raise late
+                    if len(content) > MAX_REPLY_BYTES:
+                        raise TooLargeError(f"{url} answered more than {MAX_REPLY_BYTES >> 20} MiB: is it rlservo?")
+            finally:
+                response.close()  # an unread rest closes the connection: a late answer cannot meet the next request
+        except (httpx.ReadTimeout, httpx.WriteTimeout) as error:
+            raise late from error
+        except httpx.ConnectTimeout as error:
+            raise UnavailableError(f"{self.url} cannot be reached within {budget:g} s", {"url": self.url}) from error
+        except httpx.TransportError as error:
+            dropped = isinstance(error, httpx.RemoteProtocolError | httpx.ReadError | httpx.WriteError)
+            what = "dropped the connection" if dropped else "cannot be reached"
+            why = str(error) or type(error).__name__
+            raise UnavailableError(f"{self.url} {what}: {why}", {"url": self.url, "dropped": dropped}) from error
+        finally:
+            self._backend.deadline = None
+        if time.monotonic() > deadline:
+            raise late
+        return response.status_code, response.headers, content
+
+    def _parse(self, content: bytes, url: str, status: int) -> Any:
+        try:
+            return json.loads(content) if orjson is None else orjson.loads(content)
+        except ValueError as error:
+            raise UnavailableError(
+                f"{url} answered {status} with {_shown(content)}, which is not JSON: is it an rlservo server?"
+            ) from error
+
+    def _error(self, content: bytes, url: str, status: int) -> RlservoError:
+        """Turn an error's body back into the class that the server raised."""
+        try:
+            document = json.loads(content)
+        except ValueError:
+            document = None
+        told = error_from(document, status) if isinstance(document, dict) else None
+        if told is not None:
+            return told
+        if status == 404:  # Ray Serve's own answer while the application is being deployed
+            return UnavailableError(f"{url} answered 404 with {_shown(content)}: no rlservo server is there (yet)")
+        return error_of_status(status)(f"{url} answered {status} with {_shown(content)}: is it an rlservo server?")
+
+
+def error_from(document: Mapping[str, Any], status: int) -> RlservoError | None:
+    """Turn `{"error", "code", "details"?}` back into the class that the server raised; None if it is not that."""
+    if not isinstance(document.get("error"), str):
+        return None
+    details = document.get("details")
+    kind = error_classes().get(str(document.get("code")), error_of_status(status))
+    return kind(document["error"], details if isinstance(details, dict) else None)
+
+
+def encode(document: Mapping[str, Any]) -> bytes:
+    """Return `document` as JSON; numpy arrays become nested lists of numbers that read back bit for bit."""
+    if orjson is not None:
+        return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY, default=_plain)
+    return json.dumps(document, default=_plain, allow_nan=False).encode()
+
+
+def error_classes() -> dict[str, type[RlservoError]]:
+    """Return every error class by its code, as the wire names it."""
+    found = {RlservoError.code: RlservoError}
+    waiting = [RlservoError]
+    while waiting:
+        for kind in waiting.pop().__subclasses__():
+            found[kind.code] = kind
+            waiting.append(kind)
+    return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be sent as JSON")
+
+
+def _waits(retries: int) -> Iterator[float | None]:
+    """Yield the wait after each attempt; None after the last. Jitter keeps a fleet of robots from returning at once."""
+    for attempt in range(retries):
+        yield min(FIRST_WAIT_S * 2**attempt, LONGEST_WAIT_S) * random.uniform(0.75, 1.25)
+    yield None
+
+
+def _retry_after_s(headers: Mapping[str, str]) -> float | None:
+    """Return Retry-After in seconds; None when absent or a date, which no server of ours sends."""
+    try:
+        seconds = float(headers.get("retry-after", ""))
+    except ValueError:
+        return None
+    return seconds if seconds >= 0 else None  # also refuses NaN
+
+
+def error_of_status(status: int) -> type[RlservoError]:
+    """Return the error for an answer that carries no code of ours, a proxy's for example."""
+    if status in (401, 403):
+        return UsageError
+    if status in (408, 504):
+        return DeadlineError
+    if status == 413:
+        return TooLargeError
+    return UnavailableError if status >= 500 or status < 400 else RequestError
+
+
+def _proxy_of(url: str) -> str | None:
+    """Return the proxy that HTTP_PROXY, HTTPS_PROXY and NO_PROXY ask for; none for the server on this very machine."""
+    parts = urlsplit(url)
+    if parts.hostname in LOOPBACK or proxy_bypass(parts.netloc):
+        return None
+    return getproxies().get(parts.scheme)
+
+
+def _shown(content: bytes) -> str:
+    text = content[:80].decode("utf-8", "replace")
+    return f"{text!r}{'...' if len(content) > 80 else ''}" if text else "an empty body"
+
+
+def _checked_url(url: str) -> str:
+    parts = urlsplit(url)
+    try:
+        port_is_one = parts.port != 0
+    except ValueError:
+        port_is_one = False
+    if parts.scheme not in ("http", "https") or not parts.hostname or not port_is_one:
+        raise UsageError(f"{url!r} is not a server address: expected for example 'http://127.0.0.1:8000'")
+    if parts.query or parts.fragment:
+        raise UsageError(f"{url!r} has a query or fragment: expected only scheme, host, port and path")
+    return url.rstrip("/")

@@ -1,0 +1,167 @@
+"""One WebSocket conversation with a policy server: binary frames out, frames in, each within a deadline.
+
+Used by `stream_client`. The protocol is the package `websockets`' own, without its input and output: here is a plain
+socket whose every operation ends at the deadline it is given, whatever arrives meanwhile: nothing, half a frame, bytes
+one at a time. It knows nothing of policies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import ssl
+import time
+
+from rlservo.export.contract.errors import DeadlineError, UnavailableError, UsageError
+
+try:
+    from websockets.client import ClientProtocol
+    from websockets.exceptions import InvalidHandshake, InvalidStatus
+    from websockets.frames import Frame, Opcode
+    from websockets.uri import parse_uri
+except ModuleNotFoundError as missing:
+    raise UsageError("the WebSocket client needs websockets: pip install 'rlservo[client]'") from missing
+
+MAX_FRAME_BYTES = 64 << 20  # far above any action or contract
+READ_BYTES = 65536
+
+
+class WebSocket:
+    """An open connection; any failure closes it and raises BrokenError."""
+
+    def __init__(self, url: str, *, api_key: str | None, deadline: float) -> None:
+        """Connect and shake hands by `deadline` (`time.monotonic`).
+
+        Raises BrokenError, or RefusedError when the server answers with an HTTP error.
+        """
+        self._url = url
+        uri = parse_uri(url)
+        self._protocol = ClientProtocol(uri, max_size=MAX_FRAME_BYTES)
+        self._pieces: list[bytes] = []
+        self._text = False
+        try:
+            self._socket = socket.create_connection((uri.host, uri.port), timeout=_left(deadline))
+        except OSError as error:
+            raise BrokenError(f"{url} cannot be reached: {error}") from error
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if uri.secure:
+                self._socket = ssl.create_default_context().wrap_socket(self._socket, server_hostname=uri.host)
+            request = self._protocol.connect()
+            request.headers["User-Agent"] = "rlservo-client"
+            if api_key is not None:
+                request.headers["Authorization"] = f"Api-Key {api_key}"
+            self._protocol.send_request(request)
+            self._flush(deadline)
+            while not self._protocol.handshake_exc and self._protocol.state.name == "CONNECTING":
+                self._read(deadline)
+            failed = self._protocol.handshake_exc
+            if isinstance(failed, InvalidStatus):
+                raise RefusedError(failed.response.status_code, bytes(failed.response.body or b""))
+            if isinstance(failed, InvalidHandshake):
+                raise BrokenError(f"{url} is not a stream: {failed}: is it an rlservo server?")
+            if failed is not None:
+                raise BrokenError(f"{url} dropped the connection: {failed}")
+        except (OSError, ssl.SSLError) as error:
+            self.close()
+            raise BrokenError(f"{url} cannot be reached: {error}") from error
+        except BaseException:
+            self.close()
+            raise
+        self._events = self._protocol.events_received()[1:]  # the first is the handshake's response
+        self.heard_at = time.monotonic()
+        """When the server's last bytes came."""
+
+    def send(self, content: bytes, deadline: float) -> None:
+        """Send one binary frame. Raises BrokenError or DeadlineError; the connection is then closed."""
+        try:
+            self._protocol.send_binary(content)
+            self._flush(deadline)
+        except TimeoutError:
+            self.close()  # half a frame is on its way: nothing can follow it
+            raise DeadlineError(f"{self._url} did not take the request in time") from None
+        except Exception as error:  # the protocol's own refuse to send on a closed connection
+            self.close()
+            raise BrokenError(f"{self._url} dropped the connection: {error}") from error
+
+    def receive(self, deadline: float) -> bytes | str:
+        """Return the next message.
+
+        Raises DeadlineError when it was not complete in time (the connection stays, and a later call goes on where this
+        one stopped), or BrokenError when the connection is gone.
+        """
+        while True:
+            while self._events:
+                message = self._message(self._events.pop(0))
+                if message is not None:
+                    return message
+            try:
+                self._read(deadline)
+                self._events += self._protocol.events_received()
+                self._flush(deadline)  # the answer to a ping, or to a close
+            except TimeoutError:
+                raise DeadlineError(f"{self._url} did not answer in time") from None
+            except OSError as error:
+                self.close()
+                raise BrokenError(f"{self._url} dropped the connection: {error}") from error
+            if not self._events and self._protocol.state.name in ("CLOSING", "CLOSED"):
+                code = self._protocol.close_code
+                self.close()
+                raise BrokenError(f"{self._url} closed the connection (code {code})")
+
+    def close(self) -> None:
+        """Close, telling the server if it takes no time."""
+        with contextlib.suppress(Exception):
+            self._protocol.send_close(1000)
+            self._flush(time.monotonic() + 0.05)
+        with contextlib.suppress(OSError):
+            self._socket.close()
+
+    def _message(self, frame: object) -> bytes | str | None:
+        """Return a message when `frame` completes one."""
+        if not isinstance(frame, Frame) or frame.opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+            return None
+        if frame.opcode is not Opcode.CONT:
+            self._pieces, self._text = [], frame.opcode is Opcode.TEXT
+        self._pieces.append(bytes(frame.data))
+        if not frame.fin:
+            return None
+        content = b"".join(self._pieces)
+        return content.decode("utf-8", "replace") if self._text else content
+
+    def _read(self, deadline: float) -> None:
+        self._socket.settimeout(_left(deadline))
+        data = self._socket.recv(READ_BYTES)
+        self.heard_at = time.monotonic()
+        if data:
+            self._protocol.receive_data(data)
+        else:
+            self._protocol.receive_eof()
+
+    def _flush(self, deadline: float) -> None:
+        for data in self._protocol.data_to_send():
+            if data:
+                self._socket.settimeout(_left(deadline))
+                self._socket.sendall(data)
+
+
+class BrokenError(UnavailableError):
+    """There is no connection, or none any more: another one may be made."""
+
+    code = "connection-broken"
+
+
+class RefusedError(Exception):
+    """The server answered the upgrade with an HTTP error."""
+
+    def __init__(self, status: int, body: bytes) -> None:
+        super().__init__(f"the server answered {status}")
+        self.status = status
+        self.body = body
+
+
+def _left(deadline: float) -> float:
+    left = deadline - time.monotonic()
+    if left <= 0:
+        raise TimeoutError("the deadline has passed")
+    return left

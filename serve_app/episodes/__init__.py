@@ -1,0 +1,1 @@
+"""Recurrent state between requests: sessions, streams, and state carried by the client."""

@@ -1,0 +1,68 @@
+"""A memory that a client carries: what it holds beside the numbers, so that it is fed to nobody else's network.
+
+A reply's state names the graph that it belongs to, and, where the step from one action to the next is limited, holds
+the last action. Both stand under names that no recurrent state has, so a client that sends back what it got needs to
+know neither. It knows nothing of protocols.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rlservo.export.contract.errors import RequestError
+from rlservo.serve_app.runtime.policy import Policy, Step
+from rlservo.serve_app.runtime.recurrent_state import State
+from rlservo.serve_app.wire.state_names import BELONGS_TO, LAST_ACTION, MARK
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """A state as a request brought it, taken apart."""
+
+    arrays: Mapping[str, Any]
+    """By state name."""
+
+    begins: bool = False
+    """Whether it was empty: an episode begins."""
+
+    belongs_to: str | None = None
+    """The identity of the policy that gave it; None where the client has dropped it."""
+
+    last_action: Any = None
+
+    @classmethod
+    def read(cls, state: Mapping[str, Any]) -> Carried:
+        """Take a request's state apart. Raises RequestError."""
+        if not state:
+            return NOTHING
+        arrays = {name: value for name, value in state.items() if not str(name).startswith(MARK)}
+        if len(arrays) == len(state):
+            return cls(arrays)
+        unknown = [name for name in state if name not in arrays and name not in (BELONGS_TO, LAST_ACTION)]
+        if unknown:
+            raise RequestError(
+                f"the state has the unknown entry '{str(unknown[0])[:64]}': send back what the last reply gave"
+            )
+        belongs_to = state.get(BELONGS_TO)
+        if belongs_to is not None and type(belongs_to) is not str:
+            raise RequestError(f"the state's '{BELONGS_TO}' must be the string that the last reply gave")
+        return cls(arrays, belongs_to=belongs_to, last_action=state.get(LAST_ACTION))
+
+
+NOTHING = Carried({}, begins=True)
+
+
+def carry(policy: Policy, step: Step) -> dict[str, Any]:
+    """Return the state that a client is to send with its next request."""
+    carried: dict[str, Any] = dict(step.state if step.batch is not None else first_row(step.state))
+    carried[BELONGS_TO] = policy.identity
+    if policy.limited:
+        carried[LAST_ACTION] = step.action
+    return carried
+
+
+def first_row(state: State) -> State:
+    """Return the state of the one episode there is, without the batch axis."""
+    return {name: leaf[0, ...] for name, leaf in state.items()}

@@ -1,0 +1,1 @@
+"""Wire protocols: JSON, Open Inference Protocol over HTTP and gRPC, WebSocket, administration."""

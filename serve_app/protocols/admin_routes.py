@@ -1,0 +1,203 @@
+"""Administration over HTTP: load, unload, aliases, rollback, canary, shadow, on every replica at once.
+
+Every command answers when all replicas serve the change, or says which do not and why. `api_keys.Guard` lets nobody in
+without an admin key. The Open Inference Protocol's `load` and `unload` are two of these under other names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any, TypeVar
+
+import orjson
+from fastapi import Depends, FastAPI, Request
+from fastapi.responses import Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from rlservo.export.contract.errors import RequestError, RlservoError
+from rlservo.serve_app.protocols import json_messages, oip_infer
+from rlservo.serve_app.protocols.http_endpoint import KEY, error_models, json_only, peer_of, request_id
+from rlservo.serve_app.server import listing
+from rlservo.serve_app.server.api_keys import Access, grant
+from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.request_log import administered
+from rlservo.serve_app.versions import plan
+from rlservo.serve_app.versions.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
+from rlservo.serve_app.versions.replica_versions import Change, Control
+
+Route = TypeVar("Route", bound=Callable[..., Any])
+
+
+class _Command(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class LoadCommand(_Command):
+    version: Version | None = Field(None, description="The repository's newest when left out.")
+
+
+class UnloadCommand(_Command):
+    version: Version | None = Field(None, description="The whole policy when left out.")
+
+
+class AliasCommand(_Command):
+    alias: Alias = Field(description="`production` is the default version; it can be moved, not removed.")
+    version: Version | None = Field(description="A loaded version; null removes the alias.")
+
+
+class RollbackCommand(_Command):
+    alias: Alias = PRODUCTION
+    expected: Version | None = Field(
+        None, description="Where the alias leads now; when it does not, nothing changes. Makes a repeated command safe."
+    )
+
+
+class CanaryCommand(_Command):
+    version: Reference | None = Field(description="A loaded version or an alias; null ends the canary.")
+    share: float | None = Field(None, ge=0, le=1, description="Of the sessions; 0 ends the canary.")
+
+
+class ShadowCommand(_Command):
+    version: Reference | None = Field(description="A loaded version or an alias; null ends the shadow.")
+
+
+class Changed(BaseModel):
+    """A change that every replica serves."""
+
+    generation: int
+    policy: str
+    default: str | None = Field(description="The default version; null when the policy is no longer served.")
+    versions: list[str]
+    aliases: dict[str, str]
+    canary: Canary | None
+    shadow: str | None
+
+
+def add_admin(app: FastAPI, core: Core, control: Control) -> None:
+    """Add /v1/admin and the repository extension's load and unload to the application."""
+    errors = error_models(404, 409, 415, 503)
+
+    def command(path: str, summary: str) -> Callable[[Route], Route]:
+        return app.post(
+            f"/v1/admin/policies/{{name}}/{path}",
+            tags=["admin"],
+            summary=summary,
+            response_model=Changed,
+            responses=errors,
+            dependencies=[Depends(json_only)],
+        )
+
+    async def apply(request: Request, what: str, command: Awaitable[Plan]) -> Plan:
+        key = request.scope.get(KEY)
+        log = partial(
+            administered,
+            what,
+            key="" if key is None else key.label,
+            peer=peer_of(request.scope),
+            request_id=request_id(request.scope),
+        )
+        try:
+            after = await command
+        except RlservoError as error:
+            log(error.code)
+            raise
+        log("ok", generation=after.generation)
+        return after
+
+    async def changed(request: Request, name: str, what: str, change: Change) -> Response:
+        return _answer(name, await apply(request, what, control.change(change, what=what)))
+
+    @app.get(
+        "/v1/admin/policies",
+        tags=["admin"],
+        summary="What every replica serves",
+        response_model=list[listing.PolicyList],
+        responses=errors,
+    )
+    @grant(Access.admin)
+    async def status() -> Response:
+        replies = [listing.describe(core)] if control.gather is None else await control.gather()
+        return Response(orjson.dumps(replies), media_type="application/json")
+
+    @command("load", "Load a version, prove it, and keep it ready: not in use until an alias leads to it")
+    @grant(Access.admin)
+    async def load(request: Request, name: str, given: LoadCommand) -> Response:
+        what = f"load {name} {given.version or 'newest'}"
+        return _answer(name, await apply(request, what, control.load(name, given.version, what=what)))
+
+    @command("unload", "Drop a version, or the policy")
+    @grant(Access.admin)
+    async def unload(request: Request, name: str, given: UnloadCommand) -> Response:
+        version = given.version
+        return await changed(request, name, f"unload {name} {version or ''}", lambda p: plan.unload(p, name, version))
+
+    @command("alias", "Let an alias lead to a loaded version")
+    @grant(Access.admin)
+    async def alias(request: Request, name: str, given: AliasCommand) -> Response:
+        what = f"alias {name} {given.alias}={given.version or ''}"
+        return await changed(request, name, what, lambda p: plan.set_alias(p, name, given.alias, given.version))
+
+    @command("rollback", "Let an alias lead where it led before")
+    @grant(Access.admin)
+    async def rollback(request: Request, name: str, given: RollbackCommand) -> Response:
+        what = f"rollback {name} {given.alias}"
+        alias, expected = given.alias, given.expected
+        return await changed(request, name, what, lambda p: plan.roll_back(p, name, alias, expected=expected))
+
+    @command("canary", "Send a share of the sessions to another version")
+    @grant(Access.admin)
+    async def canary(request: Request, name: str, given: CanaryCommand) -> Response:
+        if given.version is not None and given.share is None:
+            raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
+        ended = given.version is None or not given.share
+        chosen = None if ended else Canary(version=str(given.version), share=given.share or 0)
+        what = f"canary {name} {given.version or 'off'} {given.share or ''}"
+        return await changed(request, name, what, lambda p: plan.set_canary(p, name, chosen))
+
+    @command("shadow", "Let another version compute along")
+    @grant(Access.admin)
+    async def shadow(request: Request, name: str, given: ShadowCommand) -> Response:
+        what = f"shadow {name} {given.version or 'off'}"
+        return await changed(request, name, what, lambda p: plan.set_shadow(p, name, given.version))
+
+    # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: nobody reads it.
+    def repository(path: str, summary: str) -> Callable[[Route], Route]:
+        return app.post(
+            f"/v2/repository/models/{{name}}/{path}",
+            tags=["open inference protocol"],
+            summary=summary,
+            response_class=Response,
+            responses=errors,
+            dependencies=[Depends(oip_infer.media_type)],
+        )
+
+    # As a Triton that serves what its configuration pins: loading changes what clients get only where the model was not
+    # there at all. Moving `production` is /v1/admin's, with a way back.
+    @repository("load", "Load a model's newest version; in use at once only if the model was not served")
+    @grant(Access.admin)
+    async def load_model(request: Request, name: str) -> Response:
+        what = f"load {name} newest"
+        await apply(request, what, control.load(name, None, what=what))
+        return Response(b"{}", media_type="application/json")
+
+    @repository("unload", "Unload a model, all its versions")
+    @grant(Access.admin)
+    async def unload_model(request: Request, name: str) -> Response:
+        what = f"unload {name}"
+        await apply(request, what, control.change(lambda p: plan.unload(p, name, None), what=what))
+        return Response(b"{}", media_type="application/json")
+
+
+def _answer(name: str, after: Plan) -> Response:
+    policy = after.policies.get(name) or PolicyPlan(versions={})
+    document = {
+        "generation": after.generation,
+        "policy": name,
+        "default": policy.default,
+        "versions": list(policy.versions),
+        "aliases": policy.aliases,
+        "canary": policy.canary and policy.canary.model_dump(),
+        "shadow": policy.shadow,
+    }
+    return Response(json_messages.encode_json(document), media_type="application/json")

@@ -1,0 +1,449 @@
+"""The Open Inference Protocol over gRPC: the methods of `GRPCInferenceService`, which Ray Serve's gRPC ingress calls.
+
+The same policies, options and errors as over HTTP (`oip_infer.py`); an error's HTTP status becomes the gRPC status
+here, its code goes into the trailing metadata. Messages are `oip_messages.py`'s; tensors come raw or typed and go as
+they came.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import logging
+import math
+import secrets
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import Any
+from urllib.parse import unquote
+
+import grpc
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from rlservo.export.contract.errors import (
+    ActionError,
+    DeadlineError,
+    ForbiddenError,
+    ObservationError,
+    RequestError,
+    RlservoError,
+    TooLargeError,
+)
+from rlservo.serve_app.protocols import oip_config, oip_infer
+from rlservo.serve_app.protocols import oip_messages as messages
+from rlservo.serve_app.protocols.http_endpoint import BUG, RETRY_AFTER_S, status_of
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, MAX_AXES, datatype_of, from_bytes
+from rlservo.serve_app.ray_serve.grpc_ingress import Incoming
+from rlservo.serve_app.server.api_keys import Access
+from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.request_checks import presented_key
+
+logger = logging.getLogger(__name__)
+
+PROTOCOL = "grpc"
+REQUEST_ID, SESSION = "x-request-id", "x-session-id"
+CODES = {
+    400: grpc.StatusCode.INVALID_ARGUMENT,
+    401: grpc.StatusCode.UNAUTHENTICATED,
+    403: grpc.StatusCode.PERMISSION_DENIED,
+    404: grpc.StatusCode.NOT_FOUND,
+    408: grpc.StatusCode.DEADLINE_EXCEEDED,
+    409: grpc.StatusCode.FAILED_PRECONDITION,
+    410: grpc.StatusCode.FAILED_PRECONDITION,
+    413: grpc.StatusCode.RESOURCE_EXHAUSTED,  # what gRPC itself says of a message beyond its limit
+    415: grpc.StatusCode.INVALID_ARGUMENT,
+    422: grpc.StatusCode.INVALID_ARGUMENT,
+    503: grpc.StatusCode.UNAVAILABLE,
+}
+OPEN = frozenset({"ServerLive", "ServerReady"})  # what orchestrators probe; every other method wants the keys' `act`
+# The field of InferTensorContents that holds a datatype; FP16 has none and comes raw.
+FIELDS = {
+    "BOOL": "bool_contents",
+    **dict.fromkeys(("INT8", "INT16", "INT32"), "int_contents"),
+    "INT64": "int64_contents",
+    **dict.fromkeys(("UINT8", "UINT16", "UINT32"), "uint_contents"),
+    "UINT64": "uint64_contents",
+    "FP32": "fp32_contents",
+    "FP64": "fp64_contents",
+}
+
+
+class InferenceService:
+    """The methods, for Serve to find on the deployment's class; `serve_grpc` gives them their policies."""
+
+    _grpc: Grpc
+
+    def serve_grpc(self, core: Core, *, local_only: bool) -> None:
+        """Answer from `core`; with `local_only`, only callers on this machine."""
+        self._grpc = Grpc(core, local_only=local_only)
+
+    async def ServerLive(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("ServerLive", request, grpc_context)
+
+    async def ServerReady(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("ServerReady", request, grpc_context)
+
+    async def ServerMetadata(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("ServerMetadata", request, grpc_context)
+
+    async def ModelReady(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("ModelReady", request, grpc_context)
+
+    async def ModelMetadata(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("ModelMetadata", request, grpc_context)
+
+    async def ModelConfig(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("ModelConfig", request, grpc_context)
+
+    async def ModelStatistics(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("ModelStatistics", request, grpc_context)
+
+    async def ModelInfer(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("ModelInfer", request, grpc_context)
+
+    async def RepositoryIndex(self, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer("RepositoryIndex", request, grpc_context)
+
+    async def ModelStreamInfer(self, requests: AsyncIterator[bytes], grpc_context: Any) -> AsyncIterator[Any]:
+        async for reply in self._grpc.stream(requests, grpc_context):
+            yield reply
+
+
+class Grpc:
+    """Answers gRPC calls from the core."""
+
+    def __init__(self, core: Core, *, local_only: bool = False) -> None:
+        """Take the core. `local_only`: Serve binds its gRPC ports to every interface, whatever host it is given."""
+        self._core = core
+        self._local_only = local_only
+        self._methods: dict[str, Callable[[Incoming], Any]] = {
+            "ServerLive": lambda _request: messages.ServerLiveResponse(live=True),
+            "ServerReady": lambda _request: messages.ServerReadyResponse(ready=core.ready),
+            "ServerMetadata": lambda _request: messages.ServerMetadataResponse(**oip_infer.server_metadata()),
+            "ModelReady": self._model_ready,
+            "ModelMetadata": self._model_metadata,
+            "ModelConfig": self._model_config,
+            "ModelStatistics": self._model_statistics,
+            "RepositoryIndex": self._index,
+        }
+
+    async def answer(self, method: str, request: Incoming, context: Any) -> Any:
+        """Return the reply to one call. An error sets the status, and the empty reply is not looked at."""
+        try:
+            request_id, session, waited = self._check(method, context)
+            if request_id is not None:
+                context.set_trailing_metadata([(REQUEST_ID, request_id)])  # in addition to Serve's own
+            if method == "ModelInfer":
+                return await self._infer(request, request_id, session, waited)
+            return self._methods[method](request)
+        except Exception as error:
+            _fail(context, error)
+            return messages.ServerLiveResponse()
+
+    async def stream(self, requests: AsyncIterator[bytes], context: Any) -> AsyncIterator[Any]:
+        """Yield a reply to each request of a stream; an error is one, too, and the stream goes on, as Triton's does.
+
+        A stream that says nothing for `stream_idle_s` is ended.
+        """
+        idle_s = self._core.settings.stream_idle_s
+        key_changes = self._core.keys.changes
+        try:
+            request_id, session, _ = self._check("ModelStreamInfer", context)
+            session = session or secrets.token_hex(8)  # all of a stream is one version's where a canary runs
+            counted = self._core.admission.streaming()
+            counted.__enter__()
+        except Exception as error:
+            _fail(context, error)
+            return
+        self._core.metrics.stream("", 1)
+        try:
+            while True:
+                try:
+                    content = await asyncio.wait_for(anext(requests), idle_s)
+                except StopAsyncIteration:
+                    return
+                except asyncio.TimeoutError:
+                    _fail(context, DeadlineError(f"the stream was silent for {idle_s:g} s: open another one"))
+                    return
+                if key_changes != self._core.keys.changes:  # the key may be no longer accepted
+                    key_changes = self._core.keys.changes
+                    try:
+                        self._check("ModelStreamInfer", context)
+                    except RlservoError as error:
+                        _fail(context, error)
+                        return
+                try:
+                    yield messages.ModelStreamInferResponse(
+                        infer_response=await self._infer((content, None), request_id, session)
+                    )
+                except Exception as error:
+                    sentence = _explain(error)[1]
+                    yield messages.ModelStreamInferResponse(
+                        error_message=sentence, infer_response=messages.ModelInferResponse(id=_id_of(content))
+                    )
+        finally:
+            counted.__exit__(None, None, None)
+            self._core.metrics.stream("", -1)
+
+    def _check(self, method: str, context: Any) -> tuple[str | None, str | None, float | None]:
+        """Return the caller's (request id, session), where given, and how long the call has waited, where known.
+
+        Raises ForbiddenError or UnauthenticatedError.
+        """
+        if self._local_only and not is_local(context.peer()):
+            raise ForbiddenError(
+                "this server listens on this machine only: serve it with --host to reach it from others"
+            )
+        metadata = context.invocation_metadata()
+        headers = [(name.encode(), _bytes(value)) for name, value in metadata]
+        given = {name: value for name, value in metadata if type(value) is str}
+        try:
+            self._core.guard.check(presented_key(headers), Access.open if method in OPEN else Access.act)
+        except RlservoError as error:
+            self._core.kept_out(PROTOCOL, error, given.get(REQUEST_ID), peer=_caller(context.peer(), metadata))
+            raise
+        return given.get(REQUEST_ID), given.get(SESSION), self._core.admission.age.waited(headers)
+
+    def _model_ready(self, request: Incoming) -> Any:
+        asked = _parse(messages.ModelReadyRequest, request[0])
+        return messages.ModelReadyResponse(ready=self._core.has(asked.name, asked.version or None))
+
+    def _model_metadata(self, request: Incoming) -> Any:
+        asked = _parse(messages.ModelMetadataRequest, request[0])
+        return messages.ModelMetadataResponse(**oip_infer.model_metadata(self._core, asked.name, asked.version or None))
+
+    def _model_config(self, request: Incoming) -> Any:
+        asked = _parse(messages.ModelConfigRequest, request[0])
+        config = oip_config.model_config(self._core, asked.name, asked.version or None)
+        return messages.ModelConfigResponse(config=_numbered(config))
+
+    def _model_statistics(self, request: Incoming) -> Any:
+        asked = _parse(messages.ModelStatisticsRequest, request[0])
+        found = oip_config.statistics(self._core, asked.name or None, asked.version or None)
+        return messages.ModelStatisticsResponse(model_stats=found)
+
+    def _index(self, request: Incoming) -> Any:
+        asked = _parse(messages.RepositoryIndexRequest, request[0])
+        return messages.RepositoryIndexResponse(models=oip_infer.repository_index(self._core, ready=asked.ready))
+
+    async def _infer(
+        self, request: Incoming, request_id: str | None, session: str | None, waited: float | None = None
+    ) -> Any:
+        content, remaining_s = request
+        name, version = "", None
+        try:
+            received = self._core.admission.enter(waited)
+            if len(content) > self._core.settings.max_body_bytes:
+                limit = self._core.settings.max_body_bytes
+                raise TooLargeError(f"the message is larger than {limit} bytes", {"max_bytes": limit})
+            asked = _parse(messages.ModelInferRequest, content)
+            name, version = asked.model_name, asked.model_version or None
+            self._core.store().get(name, version)
+            document = {
+                "parameters": _parameters(asked.parameters),
+                "outputs": [
+                    {"name": output.name, "parameters": _parameters(output.parameters)} for output in asked.outputs
+                ],
+            }
+            answer = await oip_infer.decide(
+                self._core,
+                name,
+                version,
+                document,
+                _inputs(asked),
+                received=received,
+                deadline_ms=None if remaining_s is None else remaining_s * 1e3,
+                session=session,
+            )
+        except RlservoError as error:
+            self._core.failed(PROTOCOL, name, version, error.code)
+            self._core.log.failed(PROTOCOL, name, version, error.code, error.message, request_id=request_id)
+            raise
+        except Exception:
+            self._core.metrics.failed(PROTOCOL, "", "", "internal")
+            raise
+        decision = answer.decision
+        reply = _reply(answer, asked.id, raw=bool(asked.raw_input_contents))
+        taken, batch = time.perf_counter() - received, decision.batch or 1
+        self._core.metrics.answered(PROTOCOL, decision, batch, taken)
+        if self._core.log.every:
+            self._core.log.answered(
+                PROTOCOL, decision.name, decision.version, taken, batch=batch, request_id=request_id
+            )
+        return reply
+
+
+def _numbered(document: Any) -> Any:
+    """Return a configuration with the names of its data types as the numbers that stand for them in a message."""
+    if isinstance(document, dict):
+        return {
+            key: messages.DATA_TYPES[value] if key == "data_type" else _numbered(value)
+            for key, value in document.items()
+        }
+    return [_numbered(each) for each in document] if isinstance(document, list) else document
+
+
+def _reply(answer: oip_infer.Answer, request_id: str, *, raw: bool) -> Any:
+    decision = answer.decision
+    reply = messages.ModelInferResponse(model_name=decision.name, model_version=decision.version, id=request_id)
+    for name, value in answer.parameters.items():
+        _set(reply.parameters[name], value)
+    arrays = {name: np.ascontiguousarray(array) for name, array in answer.outputs.items()}
+    datatypes = {name: datatype_of(array.dtype.name) for name, array in arrays.items()}
+    # A reply is bytes altogether or typed fields altogether, and not every type has a field.
+    raw = raw or any(datatype not in FIELDS for datatype in datatypes.values())
+    for name, array in arrays.items():
+        output = reply.outputs.add(name=name, datatype=datatypes[name], shape=array.shape)
+        if raw:
+            reply.raw_output_contents.append(array.astype(DTYPES[datatypes[name]], copy=False).tobytes())
+        else:
+            getattr(output.contents, FIELDS[datatypes[name]]).extend(array.ravel().tolist())
+    return reply
+
+
+def _set(parameter: Any, value: Any) -> None:
+    if isinstance(value, bool):
+        parameter.bool_param = value
+    elif isinstance(value, int):
+        setattr(parameter, "int64_param" if value < 2**63 else "uint64_param", value)
+    elif isinstance(value, float):
+        parameter.double_param = value
+    else:
+        parameter.string_param = str(value)
+
+
+def _inputs(asked: Any) -> dict[str, NDArray[Any]]:
+    """Return the inputs by name. Raises RequestError where the form is wrong, ObservationError where numbers are."""
+    raw = asked.raw_input_contents
+    if not asked.inputs:
+        raise RequestError("'inputs' must hold at least one tensor, with name, datatype and shape")
+    if raw and len(raw) != len(asked.inputs):
+        raise RequestError(
+            f"there are {len(asked.inputs)} inputs and {len(raw)} raw_input_contents: one for each, or none"
+        )
+    seen: set[str] = set()
+    for tensor in asked.inputs:
+        if tensor.name in seen:
+            raise RequestError(f"input '{tensor.name[:64]}' is there twice")
+        seen.add(tensor.name)
+    inputs: dict[str, NDArray[Any]] = {}
+    for index, tensor in enumerate(asked.inputs):
+        label, shape = tensor.name[:64], tuple(tensor.shape)
+        if tensor.datatype == "BYTES":
+            raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")
+        dtype = DTYPES.get(tensor.datatype)
+        if dtype is None:
+            raise RequestError(
+                f"input '{label}': datatype must be one of {', '.join(DTYPES)}, got '{tensor.datatype[:64]}'"
+            )
+        if len(shape) > MAX_AXES or not all(0 <= n < 2**31 for n in shape):
+            raise RequestError(f"input '{label}': 'shape' must be sizes such as [1, 27]")
+        if tensor.parameters and "shared_memory_region" in tensor.parameters:
+            raise RequestError(f"input '{label}' is in shared memory, which this server does not read: send the data")
+        if raw:
+            expected = math.prod(shape) * dtype.itemsize
+            if len(raw[index]) != expected:
+                raise RequestError(
+                    f"input '{label}' of shape {list(shape)} and datatype {tensor.datatype} is {expected} bytes, "
+                    f"but its raw_input_contents are {len(raw[index])}"
+                )
+            inputs[tensor.name] = from_bytes(memoryview(raw[index]), shape, dtype)
+        else:
+            inputs[tensor.name] = _typed(label, tensor, shape, dtype)
+    return inputs
+
+
+def _typed(label: str, tensor: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    field = FIELDS.get(tensor.datatype)
+    if field is None:
+        raise RequestError(f"input '{label}': datatype {tensor.datatype} has no typed contents: use raw_input_contents")
+    others = [given.name for given, _ in tensor.contents.ListFields() if given.name != field]
+    if others:
+        raise RequestError(f"input '{label}' of datatype {tensor.datatype} belongs into '{field}', not '{others[0]}'")
+    values = getattr(tensor.contents, field)
+    if len(values) != math.prod(shape):
+        raise ObservationError(
+            f"input '{label}': '{field}' has {len(values)} numbers, not the {math.prod(shape)} of shape {list(shape)}",
+            {"expected_shape": list(shape), "numbers": len(values)},
+        )
+    array: NDArray[Any] = np.array(values)
+    if dtype.kind in "iu" and array.size:
+        info = np.iinfo(dtype)
+        if array.min() < info.min or array.max() > info.max:
+            raise ObservationError(f"input '{label}': a number is not in {info.min}..{info.max} ({tensor.datatype})")
+    return array.astype(dtype).reshape(shape)
+
+
+def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters as plain values; one without a value is left out."""
+    plain = {}
+    for name, value in given.items():
+        choice = value.WhichOneof("parameter_choice")
+        if choice is not None:
+            plain[name] = getattr(value, choice)
+    return plain
+
+
+def _parse(kind: Any, content: bytes) -> Any:
+    try:
+        return kind.FromString(content)
+    except DecodeError as error:
+        raise RequestError(f"the message is no {kind.DESCRIPTOR.name}: {error}") from None
+
+
+def _id_of(content: bytes) -> str:
+    """Return the id of a request that failed, if it can be read at all."""
+    try:
+        return str(messages.ModelInferRequest.FromString(content).id)
+    except DecodeError:
+        return ""
+
+
+def _fail(context: Any, error: Exception) -> None:
+    """Set the status of a call. Serve would log what is raised, with a traceback: too much for a client's fault."""
+    status, sentence, code = _explain(error)
+    context.set_code(status)
+    context.set_details(sentence)
+    given = [(name, value) for name, value in context.invocation_metadata() or () if name == REQUEST_ID]
+    trailing = [("rlservo-code", code), *given]
+    if status is grpc.StatusCode.UNAVAILABLE:
+        trailing.append(("retry-after", str(RETRY_AFTER_S)))
+    context.set_trailing_metadata(trailing)  # in addition to Serve's
+
+
+def _explain(error: Exception) -> tuple[grpc.StatusCode, str, str]:
+    """Return (status, sentence, code) of an error; the inside of the server stays inside."""
+    if not isinstance(error, RlservoError):
+        logger.error("a gRPC call failed", exc_info=error)
+        return grpc.StatusCode.INTERNAL, BUG, "internal"
+    status = CODES.get(status_of(error), grpc.StatusCode.INTERNAL)
+    if status is grpc.StatusCode.INTERNAL:
+        logger.error("%s", error.message)
+        if not isinstance(error, ActionError):
+            return status, BUG, "internal"
+    return status, error.message, error.code
+
+
+def is_local(peer: str) -> bool:
+    """Whether a gRPC peer ('ipv4:127.0.0.1:4711', 'ipv6:%5B::1%5D:4711', 'unix:...') is on this machine."""
+    scheme, _, address = peer.partition(":")
+    if scheme == "unix":
+        return True
+    try:
+        host = ipaddress.ip_address(unquote(address).rsplit(":", 1)[0].strip("[]"))
+    except ValueError:
+        return False
+    mapped = getattr(host, "ipv4_mapped", None)
+    return host.is_loopback if mapped is None else bool(mapped.is_loopback)
+
+
+def _caller(peer: str, metadata: Any) -> str:
+    """Return where a call came from: what HAProxy says, which is on this machine and adds its word last."""
+    forwarded = [value for name, value in metadata if name == "x-forwarded-for" and type(value) is str]
+    return forwarded[-1].rpartition(",")[2].strip() if forwarded and is_local(peer) else peer
+
+
+def _bytes(value: str | bytes) -> bytes:
+    return value if isinstance(value, bytes) else value.encode()

@@ -1,0 +1,696 @@
+"""The Open Inference Protocol v2 over HTTP, with binary tensors: what Triton's and KServe's clients speak.
+
+A policy is a model with the contract's inputs (`obs`, or `obs.<path>` for each leaf of a nested space,
+`state_in.<name>` and `reward`; `last_action` or `last_action.<path>`, where its step is limited) and outputs (`action`
+or `action.<path>`, `state_out.<name>`); every call is for a batch, as the protocol's shapes say. The request parameters
+`explore`, `seed`, `seq`, `deadline_ms` and `timestamp` mean what they mean in the JSON protocol; `sequence_id`,
+`sequence_start` and `sequence_end` are its sessions, and `state_policy`, which the reply gives beside the states, is
+its `@policy`.
+It knows HTTP's headers and the protocol's documents; tensors are `oip_tensors.py`'s, decisions the core's.
+
+Specification: github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import orjson
+from fastapi import Depends, FastAPI, Request
+from fastapi.responses import Response
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.types import Scope
+
+import rlservo
+from rlservo.export.contract.bundle import REWARD, Contract, TensorSpec
+from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError
+from rlservo.export.contract.nested import action_leaves, build_action
+from rlservo.serve_app.episodes.episodes import Episode
+from rlservo.serve_app.episodes.sessions import SessionId
+from rlservo.serve_app.protocols import json_messages
+from rlservo.serve_app.protocols.http_endpoint import (
+    JSON,
+    JSON_HEADERS,
+    BareRoute,
+    Body,
+    Endpoint,
+    Headers,
+    check_media_type,
+    error_models,
+    session_of,
+    too_large,
+)
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor
+from rlservo.serve_app.server.api_keys import Access, grant
+from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.listing import states_of
+from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.state_names import BELONGS_TO
+
+LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
+BINARY = b"application/octet-stream"
+PLATFORM = "onnx_onnxv1"
+STATE_IN, STATE_OUT = "state_in.", "state_out."
+LAST_ACTION = "last_action"  # inputs like the outputs `action` and `action.<path>`
+STATE_POLICY = "state_policy"  # whose the states are
+EXTENSIONS = (
+    "binary_tensor_data",
+    "model_configuration",
+    "model_repository",
+    "parameters",
+    "sequence",
+    "statistics",
+)
+REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
+MODEL_NAME = "model_name"  # KServe's client says again what the path says
+# What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
+PARAMETERS = frozenset(
+    {*json_messages.OPTIONS, "binary_data_output", "sequence_id", "sequence_start", "sequence_end", STATE_POLICY}
+)
+TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
+IGNORED = frozenset({"priority", TIMEOUT, "headers", "content_type"})
+SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits one packet either way
+COMPRESSION_LEVEL = 1  # numbers of a robot hardly compress; a control loop waits for them
+STATES = {"ready": "READY", "loading": "LOADING", "failed": "UNAVAILABLE"}
+SUCH_AS = '{"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [...]}]}'
+
+
+class Tensor(BaseModel):
+    """A tensor, in JSON or (with the parameter `binary_data_size`) as bytes after the JSON."""
+
+    name: str
+    shape: list[int]
+    datatype: str = Field(description="One of " + ", ".join(DTYPES))
+    parameters: dict[str, Any] | None = None
+    data: list[Any] | None = Field(None, description="Nested or flat, in row-major order.")
+
+
+class InferRequest(BaseModel):
+    """Ask for a batch of actions."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    id: str | None = Field(None, description="Echoed.")
+    parameters: dict[str, Any] | None = Field(
+        None,
+        description="`explore`, `seed`, `seq`, `deadline_ms`, `timestamp`, `sequence_id`, `sequence_start`, "
+        "`sequence_end`, `state_policy` (which the reply gave beside the states), `binary_data_output`.",
+    )
+    model_name: str | None = Field(None, description="The path's, if given at all.")
+    inputs: list[Tensor]
+    outputs: list[dict[str, Any]] | None = Field(
+        None, description='`[{"name": "action", "parameters": {"binary_data": true}}]` for bytes after the JSON.'
+    )
+
+
+class InferReply(BaseModel):
+    """A batch of actions, ready for the environment's `step`."""
+
+    model_name: str
+    model_version: str
+    id: str | None = None
+    parameters: dict[str, Any]
+    outputs: list[Tensor]
+
+
+class ServerMetadata(BaseModel):
+    name: str
+    version: str
+    extensions: list[str]
+
+
+class TensorMetadata(BaseModel):
+    name: str
+    datatype: str
+    shape: list[int] = Field(description="-1 is the batch.")
+
+
+class ModelMetadata(BaseModel):
+    name: str
+    versions: list[str]
+    platform: str
+    inputs: list[TensorMetadata]
+    outputs: list[TensorMetadata]
+
+
+class ModelState(BaseModel):
+    """A line of the repository index."""
+
+    name: str
+    version: str
+    state: str
+    reason: str
+
+
+class _Infer:
+    """Answers inference requests: JSON and raw tensors in, JSON and raw tensors out."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+
+    async def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
+        params, encoding, accepted, length = scope["path_params"], b"", b"", None
+        contract = self._core.store().get(params["name"], params.get("version")).contract
+        for name, value in scope["headers"]:
+            if name == LENGTH_HEADER:
+                length = _read_length(value)
+            elif name == b"content-encoding":
+                encoding = value.strip().lower()
+            elif name == b"accept-encoding":
+                accepted = value.lower()
+        if encoding not in (b"", b"identity"):
+            body = _decompress(body, encoding, self._core.settings.max_body_bytes)
+        view = memoryview(body)
+        if length == 0 and len(view):
+            document: dict[str, Any] = {}
+            inputs, non_finite = {contract.inputs[0].name: _raw_input(contract, view)}, False
+        else:
+            document, inputs, non_finite = _read_request(view, length, params["name"])
+        if non_finite and (document.get("parameters") or {}).get("sequence_id"):
+            json_messages.refuse_non_finite()  # before the sequence moves on
+        answer = await decide(
+            self._core,
+            params["name"],
+            params.get("version"),
+            document,
+            inputs,
+            received=received,
+            session=session_of(scope),
+        )
+        if non_finite:
+            json_messages.refuse_non_finite()
+        content, headers = _encode_reply(answer, document.get("id"))
+        if accepted and len(content) >= SMALLEST_COMPRESSED:
+            content, headers = _compress(content, headers, accepted)
+        return content, headers, answer.decision
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a request of either transport comes to."""
+
+    decision: Decision
+    parameters: dict[str, Any]
+    outputs: dict[str, NDArray[Any]]  # in the order they were asked for
+    binary: dict[str, bool]  # the same names: as bytes, or in the JSON
+
+
+async def decide(
+    core: Core,
+    name: str,
+    version: str | None,
+    document: Mapping[str, Any],
+    inputs: dict[str, NDArray[Any]],
+    *,
+    received: float,
+    deadline_ms: float | None = None,
+    session: str | None = None,
+) -> Answer:
+    """Answer a request, whose `parameters` and `outputs` are in `document`; `deadline_ms` is the transport's own."""
+    parameters = document.get("parameters") or {}
+    explore, seed, seq, wanted_ms = _options(parameters) if parameters else (False, None, None, None)
+    if wanted_ms is not None:
+        deadline_ms = wanted_ms if deadline_ms is None else min(wanted_ms, deadline_ms)
+    timestamp = json_messages.read_timestamp(parameters) if parameters else None
+    sequence = parameters.get("sequence_id")
+    identity = parameters.get(STATE_POLICY)
+    if identity is not None and not any(name.startswith(STATE_IN) for name in inputs):
+        identity = None  # there is no state that it could be of
+    contract = core.policy(name, version, _session_id(sequence) if sequence else None, identity).contract
+    binary = _wanted_outputs(contract, document, parameters)
+    obs = _observation(contract, inputs)
+    episode = _episode(contract, inputs, parameters) if parameters or len(inputs) > 1 else None
+    decision = await core.act(
+        name,
+        version,
+        obs,
+        received=received,
+        explore=explore,
+        seed=seed,
+        seq=seq,
+        deadline_ms=deadline_ms,
+        episode=episode,
+        session=session,
+    )
+    said: dict[str, Any] = {"infer_ms": round(decision.infer_ms, 4)}
+    if seq is not None:
+        said["seq"] = seq
+    if decision.notices:
+        said["warnings"] = "; ".join(decision.notices)
+    if decision.episode is not None:
+        told = json_messages.describe_episode(decision.episode)
+        if "session_id" in told:
+            told["sequence_id"] = parameters["sequence_id"]
+            del told["session_id"]
+        said.update(told)
+        if decision.episode.state is not None:
+            said[STATE_POLICY] = decision.episode.state[BELONGS_TO]
+    if timestamp is not None:
+        said.update(json_messages.clock(timestamp, received))
+    outputs = _outputs(contract, decision)
+    if not binary:  # everything there is
+        binary = dict.fromkeys(outputs, bool(flag(parameters, "binary_data_output")))
+    return Answer(decision, said, {name: outputs[name] for name in binary}, binary)
+
+
+def _encode_reply(answer: Answer, request_id: str | None) -> tuple[bytes, Headers]:
+    decision = answer.decision
+    reply: dict[str, Any] = {
+        "model_name": decision.name,
+        "model_version": decision.version,
+        "parameters": answer.parameters,
+    }
+    if request_id is not None:
+        reply["id"] = request_id
+    written = [write_tensor(name, array, binary=answer.binary[name]) for name, array in answer.outputs.items()]
+    reply["outputs"] = [tensor for tensor, _ in written]
+    content = orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
+    if not any(answer.binary.values()):
+        return content, JSON_HEADERS
+    raw = b"".join(part for _, part in written)
+    return content + raw, ((b"content-type", BINARY), (LENGTH_HEADER, b"%d" % len(content)))
+
+
+def _outputs(contract: Contract, decision: Decision) -> dict[str, NDArray[Any]]:
+    """Return everything the model can answer with, by tensor name."""
+    outputs: dict[str, NDArray[Any]] = action_leaves(contract.action_space, decision.action)
+    if decision.episode is not None and decision.episode.state is not None:
+        carried = decision.episode.state
+        outputs.update({STATE_OUT + state.name: carried[state.name] for state in contract.state})
+    return outputs
+
+
+def _read_request(
+    view: memoryview, length: int | None, model: str
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]], bool]:
+    """Return (the JSON document, the inputs by name, whether the JSON held NaN)."""
+    if length is not None and length > len(view):
+        raise RequestError(f"Inference-Header-Content-Length is {length}, and the body has {len(view)} bytes")
+    header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
+    document, non_finite = json_messages.read_json(header, such_as=SUCH_AS)
+    unknown = sorted(document.keys() - REQUEST_FIELDS)
+    if unknown:
+        if document.get(MODEL_NAME) not in (None, model):
+            raise RequestError(f"'{MODEL_NAME}' is not '{model[:64]}', which the path names")
+        unknown = [field for field in unknown if field != MODEL_NAME]
+    if unknown:
+        raise RequestError(f"unknown field '{unknown[0][:64]}': known are {', '.join(sorted(REQUEST_FIELDS))}")
+    if document.get("id") is not None and type(document["id"]) is not str:
+        raise RequestError(f"'id' must be a string, got {json_messages.json_type(document['id'])}")
+    if document.get("parameters") is not None and type(document["parameters"]) is not dict:
+        raise RequestError(f"'parameters' must be an object, got {json_messages.json_type(document['parameters'])}")
+    tensors = document.get("inputs")
+    if type(tensors) is not list or not tensors:
+        raise RequestError(f"'inputs' must be a list of tensors: send {SUCH_AS}")
+    inputs: dict[str, NDArray[Any]] = {}
+    offset = 0
+    for tensor in tensors:
+        name, array, offset = read_tensor(tensor, raw, offset)
+        if name in inputs:
+            raise RequestError(f"input '{name[:64]}' is there twice")
+        inputs[name] = array
+    if offset != len(raw):
+        raise RequestError(f"the body has {len(raw) - offset} bytes after the last tensor's data")
+    return document, inputs, non_finite
+
+
+def _raw_input(contract: Contract, view: memoryview) -> NDArray[Any]:
+    """Read a body without any JSON: the one input's bytes; the batch is whatever they amount to."""
+    if len(contract.inputs) != 1:
+        names = ", ".join(tensor.name for tensor in contract.inputs)
+        raise RequestError(f"a body without JSON is for models of one input; this one has {names}")
+    tensor = contract.inputs[0]
+    dtype = DTYPES[datatype_of(tensor.dtype)]
+    row = dtype.itemsize * int(np.prod(tensor.shape[1:]))
+    if len(view) % row:
+        raise ObservationError(
+            f"input '{tensor.name}' is of {row} bytes per observation, and the body has {len(view)}: not a multiple"
+        )
+    return from_bytes(view, (len(view) // row, *tensor.shape[1:]), dtype)
+
+
+def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
+    """Return the policy's observation batch out of the named inputs, whose names and shapes are checked."""
+    listed: Sequence[TensorSpec] = contract.inputs
+    known = [tensor.name for tensor in listed]
+    unknown = next((name for name in inputs if name not in known), None)
+    if unknown is not None:  # a last action, which is an input without standing in the contract, or a mistake
+        listed = [*listed, *last_action_inputs(contract)]
+        unknown = next((name for name in inputs if all(name != tensor.name for tensor in listed)), None)
+    if unknown is not None:
+        raise ObservationError(
+            f"policy '{contract.name}' has the input {quoted(known)} and has no input '{unknown[:64]}'"
+        )
+    rows: dict[str, int] = {}
+    for expected in listed:
+        array = inputs.get(expected.name)
+        if array is None:
+            if expected.name == REWARD or expected.name.startswith((STATE_IN, LAST_ACTION)):
+                continue
+            raise ObservationError(f"policy '{contract.name}' has the input '{expected.name}' and did not get it")
+        if array.shape[1:] != expected.shape[1:] or array.ndim != len(expected.shape):
+            raise ObservationError(
+                f"policy '{contract.name}' expects input '{expected.name}' of shape {list(expected.shape)} "
+                f"(-1 is the batch), got {list(array.shape)}",
+                {"policy": contract.name, "expected_shape": list(expected.shape), "shape": list(array.shape)},
+            )
+        rows[expected.name] = len(array)
+    if len(set(rows.values())) > 1:
+        told = ", ".join(f"{name} {count}" for name, count in rows.items())
+        raise ObservationError(f"the inputs of policy '{contract.name}' are not of one batch: {told}")
+    return build_action(contract.observation_space, inputs, "obs")
+
+
+def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Episode | None:
+    """Return what the inputs and parameters say of the episode. Raises RequestError."""
+    states: dict[str, Any] = {
+        name.removeprefix(STATE_IN): array for name, array in inputs.items() if name.startswith(STATE_IN)
+    }
+    belongs_to = parameters.get(STATE_POLICY)
+    if states and belongs_to is not None:
+        if type(belongs_to) is not str:
+            raise RequestError(f"'{STATE_POLICY}' must be the string that the last reply gave")
+        states[BELONGS_TO] = belongs_to
+    reward = inputs.get(REWARD)
+    last = _last_action(contract, inputs)
+    start, end = bool(flag(parameters, "sequence_start")), bool(flag(parameters, "sequence_end"))
+    sequence_id = parameters.get("sequence_id")
+    if sequence_id in (None, 0, ""):
+        if start and not states:  # a single step, for whoever carries from there what there is to carry
+            return Episode(state={}, reward=reward, last_action=last)
+        if not states and reward is None and last is None:
+            return None
+        return Episode(state=states or None, reward=reward, last_action=last)
+    return Episode(
+        state=states or None,
+        session_id=_session_id(sequence_id),
+        reset=start,
+        end=end,
+        reward=reward,
+        last_action=last,
+    )
+
+
+def _session_id(sequence_id: Any) -> SessionId:
+    """Return a sequence's id as a session's; an integer and a string of its digits are two. Raises RequestError."""
+    if type(sequence_id) in (int, str) and len(str(sequence_id)) < json_messages.LONGEST_SESSION_ID:
+        return sequence_id  # type: ignore[no-any-return]  # mypy does not narrow by the type's own identity
+    raise RequestError("'sequence_id' must be an integer, or a string of fewer than 128 characters")
+
+
+def _last_action(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
+    """Return the last action that the inputs hold, in the action space's form, or None. Raises ObservationError."""
+    given = {name: array for name, array in inputs.items() if name.startswith(LAST_ACTION)}
+    if not given:
+        return None
+    missing = next((tensor.name for tensor in last_action_inputs(contract) if tensor.name not in given), None)
+    if missing is not None:
+        raise ObservationError(f"policy '{contract.name}' did not get the input '{missing}', but others of last_action")
+    return build_action(contract.action_space, given, LAST_ACTION)
+
+
+def last_action_inputs(contract: Contract) -> list[TensorSpec]:
+    """Return what the inputs of a last action look like: as the outputs that gave it."""
+    return [
+        tensor.model_copy(update={"name": LAST_ACTION + tensor.name.removeprefix("action")})
+        for tensor in contract.outputs
+        if tensor.name == "action" or tensor.name.startswith("action.")
+    ]
+
+
+def _options(parameters: Mapping[str, Any]) -> tuple[bool, int | None, int | None, float | None]:
+    """Return (explore, seed, seq, deadline_ms); refuse what would otherwise be ignored in silence."""
+    for name in parameters:
+        if name not in PARAMETERS and name not in IGNORED:
+            raise RequestError(
+                f"unknown parameter '{name[:64]}': known are {', '.join(sorted(PARAMETERS | IGNORED))}",
+                {"known": sorted(PARAMETERS | IGNORED)},
+            )
+    explore, seed, seq, deadline_ms = json_messages.read_options(parameters)
+    timeout_us = json_messages.read_finite(parameters, TIMEOUT, "an integer of microseconds", kinds=(int,))
+    if deadline_ms is None and timeout_us:
+        deadline_ms = timeout_us / 1e3
+    return explore, seed, seq, deadline_ms
+
+
+def _wanted_outputs(contract: Contract, document: Mapping[str, Any], parameters: Mapping[str, Any]) -> dict[str, bool]:
+    """Return the outputs that were asked for, and whether as bytes; none asked for means all.
+
+    Raises RequestError for outputs that do not exist.
+    """
+    binary = bool(flag(parameters, "binary_data_output")) if parameters else False
+    outputs = document.get("outputs")
+    if not outputs:
+        return {}
+    if type(outputs) is not list:
+        raise RequestError(f"'outputs' must be a list of {{\"name\": ...}}, got {json_messages.json_type(outputs)}")
+    known = output_names(contract)
+    wanted: dict[str, bool] = {}
+    for output in outputs:
+        name = output.get("name") if type(output) is dict else None
+        if type(name) is not str or name not in known:
+            given = json_messages.json_type(output.get("name") if type(output) is dict else output)
+            shown = f" '{name[:64]}'" if type(name) is str else f" {given}"
+            raise RequestError(f"an output{shown} does not exist: the model's output is {quoted(known)}")
+        if name.startswith(STATE_OUT) and parameters.get("sequence_id"):
+            raise RequestError(f"the output '{name}' stays with the sequence: ask for the action, or carry the state")
+        own = output.get("parameters") or {}
+        if type(own) is not dict:
+            raise RequestError(f"an output's 'parameters' must be an object, got {json_messages.json_type(own)}")
+        refused = next((name for name in ("classification", "shared_memory_region") if name in own), None)
+        if refused is not None:
+            raise RequestError(f"the output parameter '{refused}' is not offered: leave it out")
+        chosen = flag(own, "binary_data")
+        wanted[name] = binary if chosen is None else chosen
+    return wanted
+
+
+def quoted(names: list[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)
+
+
+def output_names(contract: Contract) -> list[str]:
+    """Return the outputs this protocol offers: actions and states, not the network's inner values."""
+    return [
+        tensor.name
+        for tensor in contract.outputs
+        if tensor.name == "action" or tensor.name.startswith(("action.", STATE_OUT))
+    ]
+
+
+# Bytes: lengths and compression.
+
+
+def _check_headers(headers: list[tuple[bytes, bytes]]) -> None:
+    """Triton's client names no content type, others name JSON or octets: the length header is what tells them apart."""
+    check_media_type(headers, JSON, BINARY, optional=True)
+    for name, value in headers:
+        if name == b"content-encoding" and value.strip().lower() not in (b"identity", b"gzip", b"deflate", b""):
+            raise MediaTypeError(
+                f"the content encoding '{value[:32].decode('latin-1')}' is not read: send gzip, deflate or none"
+            )
+
+
+def _read_length(value: bytes) -> int:
+    if not value.isdigit() or len(value) > 15:
+        raise RequestError(
+            f"Inference-Header-Content-Length must be the JSON's length, got '{value[:32].decode('latin-1')}'"
+        )
+    return int(value)
+
+
+def _decompress(body: Body, encoding: bytes, limit: int) -> bytes:
+    """Undo gzip or deflate, to `limit` bytes at most: a few kilobytes can unpack to gigabytes."""
+    try:
+        stream = zlib.decompressobj(zlib.MAX_WBITS | (16 if encoding == b"gzip" else 0))
+        plain = stream.decompress(body, limit + 1)
+    except zlib.error as error:
+        raise RequestError(f"the body is not {encoding.decode()}: {error}") from None
+    if len(plain) > limit:
+        raise too_large(limit)
+    if not stream.eof or stream.unused_data:
+        state = "incomplete" if not stream.eof else "followed by other bytes"
+        raise RequestError(f"the {encoding.decode()} body is {state}")
+    return plain
+
+
+def _compress(content: bytes, headers: Headers, accepted: bytes) -> tuple[bytes, Headers]:
+    """Compress for a client that asked for it with accept-encoding."""
+    offered = {part.split(b";")[0].strip() for part in accepted.split(b",") if b"q=0" not in part.replace(b"q=0.", b"")}
+    for encoding, bits in ((b"gzip", zlib.MAX_WBITS | 16), (b"deflate", zlib.MAX_WBITS)):
+        if encoding in offered:
+            stream = zlib.compressobj(COMPRESSION_LEVEL, wbits=bits)
+            headers += ((b"content-encoding", encoding), (b"vary", b"accept-encoding"))
+            return stream.compress(content) + stream.flush(), headers
+    return content, headers
+
+
+async def media_type(request: Request) -> None:
+    """Raise MediaTypeError for what none of the protocol's clients sends: a dependency of routes that FastAPI runs."""
+    check_media_type(request.scope["headers"], JSON, BINARY, optional=True)
+
+
+# What can be asked about the server and its models. FastAPI runs these: nobody asks a thousand times a second.
+
+
+def add_routes(app: FastAPI, core: Core, add_direct: Callable[[BareRoute], None]) -> None:
+    """Add /v2 to the application; `add_direct` adds what FastAPI only documents."""
+    infer = Endpoint("oip", _Infer(core), _check_headers, core)
+    _add_health(app, core)
+    _add_models(app, core)
+    for path, operation, summary in (
+        ("/v2/models/{name}/infer", "infer", "Infer with the default version"),
+        (
+            "/v2/models/{name}/versions/{version}/infer",
+            "infer_version",
+            "Infer with one version, or with what an alias leads to",
+        ),
+    ):
+        add_direct(
+            BareRoute(
+                path,
+                infer,
+                operation=operation,
+                tag="open inference protocol",
+                summary=summary,
+                reply=InferReply,
+                body={
+                    "application/json": {"schema": _request_schema()},
+                    "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+                },
+                responses=error_models(400, 404, 408, 409, 410, 413, 415, 422, 500, 503),
+            )
+        )
+
+
+def _request_schema() -> dict[str, Any]:
+    """The request's schema; the tensor's is already among the document's, through the reply."""
+    schema = InferRequest.model_json_schema(ref_template="#/components/schemas/{model}")
+    schema.pop("$defs")
+    return schema
+
+
+def _add_health(app: FastAPI, core: Core) -> None:
+    @app.get(
+        "/v2/health/live",
+        tags=["health"],
+        summary="The process answers (Open Inference Protocol)",
+        responses=error_models(),
+    )
+    @grant(Access.open)
+    async def live() -> Response:
+        return _json({"live": True})
+
+    @app.get(
+        "/v2/health/ready", tags=["health"], summary="The policies are loaded and proven", responses=error_models(503)
+    )
+    @grant(Access.open)
+    async def ready() -> Response:
+        core.store()
+        return _json({"ready": True})
+
+
+def _add_models(app: FastAPI, core: Core) -> None:
+    tags: list[Any] = ["open inference protocol"]
+    errors = error_models(404, 503)
+
+    @app.get(
+        "/v2",
+        tags=tags,
+        summary="The server and the extensions it speaks",
+        response_model=ServerMetadata,
+        responses=error_models(),
+    )
+    @grant(Access.act)
+    async def server() -> Response:
+        return _json(server_metadata())
+
+    @app.get("/v2/models/{name}", tags=tags, summary="A model", response_model=ModelMetadata, responses=errors)
+    @grant(Access.act)
+    async def model(name: str) -> Response:
+        return _json(model_metadata(core, name, None))
+
+    @app.get(
+        "/v2/models/{name}/versions/{version}",
+        tags=tags,
+        summary="One version of a model",
+        response_model=ModelMetadata,
+        responses=errors,
+    )
+    @grant(Access.act)
+    async def model_version(name: str, version: str) -> Response:
+        return _json(model_metadata(core, name, version))
+
+    @app.get("/v2/models/{name}/ready", tags=tags, summary="The model is loaded and proven", responses=errors)
+    @grant(Access.act)
+    async def model_ready(name: str) -> Response:
+        return _json({"name": core.store().get(name).contract.name, "ready": True})
+
+    @app.get("/v2/models/{name}/versions/{version}/ready", tags=tags, summary="The version is loaded", responses=errors)
+    @grant(Access.act)
+    async def model_version_ready(name: str, version: str) -> Response:
+        return _json({"name": core.store().get(name, version).contract.name, "ready": True})
+
+    @app.post(
+        "/v2/repository/index",
+        tags=tags,
+        summary="Every version of every model",
+        dependencies=[Depends(media_type)],
+        response_model=list[ModelState],
+        responses=error_models(415, 503),
+    )
+    @grant(Access.act)
+    async def index(request: Request) -> Response:
+        body = await request.body()
+        ready = False
+        if body:
+            document, _ = json_messages.read_json(body, such_as='{"ready": true}')
+            ready = bool(flag(document, "ready"))
+        return _json(repository_index(core, ready=ready))
+
+
+# What can be asked, as the protocol's documents; gRPC's messages have the same fields.
+
+
+def server_metadata() -> dict[str, Any]:
+    """Return who this is, and the extensions it speaks."""
+    return {"name": "rlservo", "version": rlservo.__version__, "extensions": EXTENSIONS}
+
+
+def repository_index(core: Core, *, ready: bool = False) -> list[dict[str, str]]:
+    """Return every version of every model and how it stands; `ready` leaves the others out."""
+    core.store()
+    return [
+        {"name": name, "version": version, "state": STATES[state.state], "reason": state.reason}
+        for name, versions in states_of(core).items()
+        for version, state in versions.items()
+        if state.state == "ready" or not ready
+    ]
+
+
+def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]:
+    """Return a model's inputs and outputs; `version` None is the default."""
+    policy = core.store().get(name, version)
+    contract = policy.contract
+    versions = core.store().versions(name) if version is None else (contract.version,)
+    inputs = [*contract.inputs, *(last_action_inputs(contract) if policy.limited else ())]
+
+    def described(tensor: TensorSpec) -> dict[str, Any]:
+        return {"name": tensor.name, "datatype": datatype_of(tensor.dtype), "shape": tensor.shape}
+
+    return {
+        "name": name,
+        "versions": versions,
+        "platform": PLATFORM,
+        "inputs": [described(tensor) for tensor in inputs],
+        "outputs": [described(tensor) for tensor in contract.outputs if tensor.name in output_names(contract)],
+    }
+
+
+def _json(document: Any) -> Response:
+    return Response(orjson.dumps(document), media_type="application/json")

@@ -1,0 +1,161 @@
+"""Tensors as the Open Inference Protocol writes them: as JSON numbers, or as raw little-endian bytes after the JSON.
+
+The binary form is the protocol's "binary tensor data" extension. It knows numpy and the format; nothing of HTTP or of
+policies. Specification: github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.errors import ObservationError, RequestError
+from rlservo.serve_app.protocols.json_messages import json_type
+
+DTYPES: dict[str, np.dtype[Any]] = {
+    "BOOL": np.dtype("?"),
+    "UINT8": np.dtype("u1"),
+    "UINT16": np.dtype("<u2"),
+    "UINT32": np.dtype("<u4"),
+    "UINT64": np.dtype("<u8"),
+    "INT8": np.dtype("i1"),
+    "INT16": np.dtype("<i2"),
+    "INT32": np.dtype("<i4"),
+    "INT64": np.dtype("<i8"),
+    "FP16": np.dtype("<f2"),
+    "FP32": np.dtype("<f4"),
+    "FP64": np.dtype("<f8"),
+}
+NAMES = {dtype.newbyteorder("="): name for name, dtype in DTYPES.items()}
+MAX_AXES = 32  # numpy itself stops at 64
+TENSOR_FIELDS = frozenset({"name", "shape", "datatype", "parameters", "data"})
+
+
+def datatype_of(dtype: str) -> str:
+    """Return the protocol's name of a contract's dtype ('float32' is 'FP32')."""
+    return NAMES[np.dtype(dtype)]
+
+
+def read_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDArray[Any], int]:
+    """Return (name, array, offset after it); `offset` is where the tensor would begin in `raw`, were it binary.
+
+    Raises RequestError where the form is wrong, ObservationError where a number does not fit its datatype.
+    """
+    if type(document) is not dict:
+        raise RequestError(f"every entry of 'inputs' must be an object, got {json_type(document)}")
+    name, shape, datatype = document.get("name"), document.get("shape"), document.get("datatype")
+    if type(name) is not str:
+        raise RequestError(f"an input's 'name' must be a string, got {json_type(name)}")
+    label = name[:64]
+    unknown = sorted(document.keys() - TENSOR_FIELDS)
+    if unknown:
+        raise RequestError(f"input '{label}' has the unknown field '{unknown[0][:64]}': known are name, shape, ...")
+    if type(shape) is not list or len(shape) > MAX_AXES or not all(type(n) is int and 0 <= n < 2**31 for n in shape):
+        raise RequestError(f"input '{label}': 'shape' must be a list of sizes such as [1, 27]")
+    if datatype == "BYTES":
+        raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")
+    dtype = DTYPES.get(datatype) if type(datatype) is str else None
+    if dtype is None:
+        raise RequestError(f"input '{label}': datatype must be one of {', '.join(DTYPES)}, got {json_type(datatype)}")
+    parameters = document.get("parameters") or {}
+    if type(parameters) is not dict:
+        raise RequestError(f"input '{label}': 'parameters' must be an object, got {json_type(parameters)}")
+    if "shared_memory_region" in parameters:
+        raise RequestError(f"input '{label}' is in shared memory, which this server does not read: send the data")
+    size = parameters.get("binary_data_size")
+    if size is None:
+        return name, _from_json(label, document.get("data"), tuple(shape), dtype), offset
+    if "data" in document:
+        raise RequestError(f"input '{label}' has both 'data' and 'binary_data_size': send one of them")
+    if type(size) is not int or size < 0:
+        raise RequestError(f"input '{label}': 'binary_data_size' must be a number of bytes, got {json_type(size)}")
+    expected = math.prod(shape) * dtype.itemsize
+    if size != expected:
+        raise RequestError(
+            f"input '{label}' of shape {shape} and datatype {datatype} is {expected} bytes, "
+            f"but its 'binary_data_size' is {size}"
+        )
+    if offset + size > len(raw):
+        raise RequestError(
+            f"input '{label}' needs {size} bytes after the JSON and {max(0, len(raw) - offset)} are left of the body"
+        )
+    return name, from_bytes(raw[offset : offset + size], tuple(shape), dtype), offset + size
+
+
+def from_bytes(raw: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return the array that `raw` holds; its length has been checked. Not writable: it is the request's own memory."""
+    if dtype.kind == "b":  # any non-zero byte is true; numpy's own view of such a byte is undefined
+        flags: NDArray[Any] = np.frombuffer(raw, np.uint8) != 0
+        return flags.reshape(shape)
+    array: NDArray[Any] = np.frombuffer(raw, dtype)
+    if not array.flags.aligned:  # it begins wherever the JSON ended
+        array = array.copy()
+    return array.reshape(shape)
+
+
+def _from_json(label: str, data: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Read `data`, nested or flat in row-major order."""
+    if type(data) is not list:
+        raise RequestError(f"input '{label}': 'data' must be a list of numbers, got {json_type(data)}")
+    try:
+        array: NDArray[Any] = np.asarray(data)
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise ObservationError(f"input '{label}': its lists are not of equal length: {error}") from None
+    if array.size == 0:
+        array = array.astype(dtype)
+    if array.dtype.kind not in "fiub":
+        raise ObservationError(f"input '{label}': 'data' holds {_first_other(data)}, not only numbers")
+    if array.shape != shape and not (array.ndim == 1 and array.size == math.prod(shape)):
+        raise ObservationError(
+            f"input '{label}': 'data' has the shape {list(array.shape)}, and 'shape' says {list(shape)}",
+            {"expected_shape": list(shape), "shape": list(array.shape)},
+        )
+    if dtype.kind in "iu":
+        info = np.iinfo(dtype)
+        bad = ~((array == np.floor(array)) & (array >= info.min) & (array <= info.max))
+        if array.dtype.kind == "b" or bad.any():
+            value = array[bad][0] if bad.any() else array.flat[0]
+            raise ObservationError(f"input '{label}': {value} is not an integer in {info.min}..{info.max}")
+    elif dtype.kind == "b" and not ((array == 0) | (array == 1)).all():
+        raise ObservationError(f"input '{label}': BOOL data must be true or false")
+    with np.errstate(over="ignore"):  # what becomes an infinity is refused with the observation, element and all
+        return array.astype(dtype).reshape(shape)
+
+
+def _first_other(data: Any) -> str:
+    """Describe the first leaf that is no number."""
+    for item in data:
+        if type(item) is list:
+            found = _first_other(item)
+            if found:
+                return found
+        elif type(item) not in (int, float, bool) or (type(item) is int and not -(2**63) <= item < 2**64):
+            return "an integer of more than 64 bits" if type(item) is int else json_type(item)
+    return ""
+
+
+def write_tensor(name: str, array: NDArray[Any], *, binary: bool) -> tuple[dict[str, Any], bytes]:
+    """Return the tensor's JSON and, in binary form, its bytes; `data` is the flat array, for orjson to write."""
+    document: dict[str, Any] = {
+        "name": name,
+        "datatype": NAMES[array.dtype.newbyteorder("=")],
+        "shape": array.shape,
+    }
+    if not binary:
+        document["data"] = np.ascontiguousarray(array).ravel()
+        return document, b""
+    raw = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
+    document["parameters"] = {"binary_data_size": len(raw)}
+    return document, raw
+
+
+def flag(parameters: Mapping[str, Any], name: str) -> bool | None:
+    """Return an optional boolean parameter. Raises RequestError when it is something else."""
+    value = parameters.get(name)
+    if value is None or type(value) is bool:
+        return value
+    raise RequestError(f"the parameter '{name}' must be true or false, got {json_type(value)}")

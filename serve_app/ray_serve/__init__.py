@@ -1,0 +1,1 @@
+"""Ray Serve integration: deployment, ingress, HAProxy, cluster processes, autoscaling."""

@@ -1,0 +1,304 @@
+"""The policy server as a Ray Serve application. The one file that imports ray.serve.
+
+One deployment holds every policy: a policy is kilobytes and microseconds, a hop to another actor is milliseconds. From
+a checkout: `serve run deploy/serve.yaml`, or `serve run rlservo.serve_app.ray_serve.app:build policies=DIR`. `rlservo
+serve` comes here through `cluster_process.py`. A replica imports neither torch nor ray.rllib.
+"""
+
+# No `from __future__ import annotations` here: Serve reads the type of build's argument to know what to make of `args`.
+
+import asyncio
+import inspect
+import logging
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import ray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from ray import serve
+from ray.exceptions import ActorDiedError, RayError
+from ray.serve import Application, Deployment
+from ray.serve.config import HTTPOptions, gRPCOptions
+from ray.serve.context import _get_global_client
+
+from rlservo.export.contract.errors import PartlyAppliedError, RlservoError
+from rlservo.serve_app.protocols.json_act import PolicyApp, create_app
+from rlservo.serve_app.protocols.oip_grpc import InferenceService
+from rlservo.serve_app.ray_serve import ingress
+from rlservo.serve_app.ray_serve.autoscaling import BUSY, Load
+from rlservo.serve_app.ray_serve.gcs_ledger import GcsLedger
+from rlservo.serve_app.server import listing
+from rlservo.serve_app.server.api_keys import check_exposure, is_loopback
+from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.request_log import configure
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.plan import ServedConfig
+from rlservo.serve_app.versions.policy_store import load_policy
+from rlservo.serve_app.versions.replica_versions import Control, Following
+from rlservo.serve_app.versions.repository import Library, Repository
+
+logger = logging.getLogger(__name__)
+
+APPLICATION = "rlservo"
+DEPLOYMENT = "PolicyServer"
+SPARE = 64  # health, metrics, documentation
+GRPC_SERVICE = "rlservo.serve_app.ray_serve.grpc_ingress:add_service"
+FOLLOW_TIMEOUT_S = 45.0  # [s] for every replica to load and prove what a change brought
+# A rolling update starts the new replica before the old one stops; older Rays stop first.
+SURGE: dict[str, Any] = (
+    {"max_surge_percent": 100} if "max_surge_percent" in inspect.signature(serve.deployment).parameters else {}
+)
+
+
+class BuildArguments(BaseModel):
+    """The `args` of an application in serve.yaml, or `key=value` after `serve run`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    policies: list[str] = Field(min_length=1)
+    """Bundle folders, policy folders or repositories; on the command line separated by commas."""
+
+    replicas: int = Field(1, ge=1)
+    """Processes that serve the same policies; each loads all of them."""
+
+    served: dict[str, Any] = {}
+    """Versions, aliases, canary and shadow (ServedConfig), for where `user_config` cannot be given; that wins."""
+
+    settings: dict[str, Any] = {}
+    """Fields of ServerSettings; what is not given comes from RLSERVO_* variables, then from the defaults."""
+
+    @field_validator("policies", mode="before")
+    @classmethod
+    def _split(cls, value: Any) -> Any:
+        return value.split(",") if isinstance(value, str) else value
+
+
+def build(args: BuildArguments) -> Application:
+    """Return the application for `serve run`, `serve deploy` and `rlservo serve`.
+
+    Relative folders are taken from the directory this runs in, since a replica's own is another. Raises UsageError.
+    """
+    settings = ServerSettings.from_environment(args.settings)
+    ServedConfig.read(args.served)
+    # A folder may exist only on the nodes that run replicas, so it is the replica that looks.
+    folders = [str(Path(folder).expanduser().absolute()) for folder in args.policies]
+    server: Deployment = cast("Deployment", PolicyServer)  # the decorator's type says it is still the class
+    options = server.options(
+        num_replicas=args.replicas, max_ongoing_requests=_serve_limit(settings), user_config=args.served
+    )
+    return options.bind(folders, settings.model_dump())
+
+
+def _serve_limit(settings: ServerSettings) -> int:
+    """Return more than a replica takes on: who waits at Serve's limit waits for whoever is slow to send a body."""
+    return settings.max_ongoing_requests + settings.max_incoming + settings.max_streams + SPARE
+
+
+@serve.deployment(
+    name=DEPLOYMENT,
+    # A policy server spends its time waiting; a whole logical CPU would only keep replicas off small machines.
+    ray_actor_options={"num_cpus": 0.1},
+    # A line per request costs more than the policy; below this level Serve makes one all the same and drops it (5%).
+    logging_config={"enable_access_log": False, "log_level": "WARNING"},
+    # A replica that hangs is gone after three checks in vain, 8 s at most; Serve's own 30 s a check would be minutes.
+    # HAProxy leaves it alone before that, after two of its own (`haproxy_wrapper.py`). It has no end in order:
+    # RAY_SERVE_FORCE_STOP_UNHEALTHY_REPLICAS.
+    health_check_period_s=1,
+    health_check_timeout_s=2,
+    graceful_shutdown_timeout_s=15,  # streams are closed with a code at its beginning, and cut at its end
+    user_config={},
+    **SURGE,
+)
+@serve.ingress()
+class PolicyServer(InferenceService):
+    """A replica: the policies, the HTTP application and the gRPC methods over them."""
+
+    def __init__(self, folders: list[str], settings: dict[str, Any]) -> None:
+        """Check the settings. Serve calls `reconfigure` next, and sends requests only after that."""
+        self._settings = ServerSettings(**settings)
+        context = serve.get_replica_context()
+        self._replica = context.replica_tag
+        self._id = context.replica_id.deployment_id
+        self._core: Core | None = None
+        self._watch: asyncio.Task[None] | None = None
+        self._load = Load()
+        try:
+            configure(self._settings, replica=self._replica)
+            self._host = _listening_host()
+            check_exposure(self._host, self._settings)
+            limits = self._settings.bundle_limits
+            load = partial(
+                load_policy,
+                threads=self._settings.threads,
+                options=self._settings.policy_options,
+                limits=limits,
+            )
+            library = Library(Repository(folders, limits), load)
+        except RlservoError as error:
+            raise _plain(error) from None
+        self._control = Control(
+            library,
+            GcsLedger(_controller()._actor_id.hex(), context.app_name, context.deployment),
+            replica=self._replica,
+            broadcast=self._tell_all,
+            gather=self._ask_all,
+            is_current=self._is_current,
+            scan_timeout_s=self._settings.scan_timeout_s,
+            load_timeout_s=self._settings.load_timeout_s,
+        )
+
+    def __serve_build_asgi_app__(self) -> PolicyApp:  # Serve's hook: the app is built in the replica
+        app = create_app(
+            lambda: self._control.store,
+            self._settings,
+            replica=self._replica,
+            control=self._control,
+            alone=_alone,
+            host=self._host,
+        )
+        core: Core = app.state.core
+        self._core = core
+        core.admission.age.watch()
+        # By way of the module: Serve pickles this class with copies of the objects that it names.
+        ahead = self._settings.ahead_of_serve and _can_be_left_out()
+        ingress.door.open(app, core.admission.is_open, ahead=ahead)
+        self.serve_grpc(core, local_only=is_loopback(self._host))
+        return app
+
+    async def reconfigure(self, user_config: Any) -> None:
+        """Serve what the configuration says: Serve calls this at the start, and on `serve deploy` with another one.
+
+        Serve sends a replica nothing while this runs, so only the first call waits until all is loaded.
+        """
+        if self._control.store is None:
+            try:
+                await self._control.configure(user_config)
+            except RlservoError as error:
+                raise _plain(error) from None
+            self._watch = asyncio.create_task(self._control.watch())
+        else:
+            self._reconfiguring = asyncio.create_task(self._configure(user_config))
+
+    def record_autoscaling_stats(self) -> dict[str, float]:
+        """Tell Serve's autoscaler how busy this replica is, for `autoscaling.by_load`."""
+        return {BUSY: self._load.busy()}
+
+    async def check_health(self) -> None:
+        """Tell Serve's controller that the event loop turns and the policies are there; if not, it replaces us."""
+        await asyncio.sleep(0)
+        if self._control.store is None:
+            raise RuntimeError("no policies are loaded: the deployment's user_config must be a map, and not null")
+
+    async def follow_plan(self, generation: int) -> Following:
+        """Serve a plan that another replica wrote; replicas call this of each other."""
+        return await self._control.follow(generation)
+
+    async def describe(self) -> dict[str, Any]:
+        """Return this replica's listing; replicas call this of each other."""
+        return {} if self._core is None else listing.describe(self._core)
+
+    async def _configure(self, user_config: Any) -> None:
+        try:
+            await self._control.configure(user_config)
+        except Exception:
+            logger.exception("the configuration could not be looked at; what ran before goes on")
+
+    async def _is_current(self, user_config: Any) -> bool:
+        """Whether the controller means this configuration, or already another one.
+
+        Serve starts a replica with what held when it was scheduled, and reconfigures it later (ray 2.60).
+        """
+        try:
+            current = await _controller().get_deployment_config.remote(self._id)
+        except RayError:  # the controller is coming back: nobody says otherwise
+            return True
+        return current is None or current.user_config == user_config
+
+    async def _tell_all(self, generation: int) -> list[Following]:
+        replies = await self._call_all("follow_plan", generation)
+        return [reply for reply in replies if isinstance(reply, Following)]
+
+    async def _ask_all(self) -> list[Any]:
+        return sorted(await self._call_all("describe"), key=lambda reply: str(reply.get("replica")))
+
+    async def _call_all(self, method: str, *arguments: Any) -> list[Any]:
+        """Call a method of every running replica. Raises PartlyAppliedError when one of them does not answer."""
+        handle: Any = serve.get_deployment_handle(self._id.name, self._id.app_name)
+        if not hasattr(type(handle), "broadcast"):  # Ray before 2.60; the handle itself has every attribute
+            raise PartlyAppliedError(
+                f"Ray {ray.__version__} cannot ask every replica at once: the others follow within a few seconds"
+            )
+        try:
+            replies = await handle.broadcast(method, *arguments).results_async(
+                timeout_s=FOLLOW_TIMEOUT_S, return_exceptions=True
+            )
+        except TimeoutError:
+            raise PartlyAppliedError(f"not every replica answered within {FOLLOW_TIMEOUT_S:g} s") from None
+        failures = [
+            reply for reply in replies if isinstance(reply, BaseException) and not isinstance(reply, ActorDiedError)
+        ]
+        if failures:
+            raise PartlyAppliedError(
+                f"{len(failures)} of {len(replies)} replicas failed to answer: {failures[0]!s:.200}"
+            )
+        return [reply for reply in replies if not isinstance(reply, BaseException)]
+
+
+def _plain(error: RlservoError) -> RuntimeError:
+    """Ray pickles what a constructor raises and prints its text: one sentence instead of our class and details."""
+    return RuntimeError(error.message)
+
+
+def _controller() -> Any:
+    """Return Serve's controller, which knows more than Serve's interface tells (ray 2.60): hence the private client."""
+    client: Any = _get_global_client()
+    return client._controller
+
+
+def _can_be_left_out() -> bool:
+    """Whether Serve's handling of a request can be: a replica that stops then waits for its HTTP server (ray 2.60).
+
+    Older ones wait only for the requests that Serve has counted. Where Serve traces, it is to see every request.
+    """
+    try:
+        from ray.serve._private.replica import Replica
+        from ray.serve._private.tracing_utils import is_tracing_enabled
+    except ImportError:  # another Ray, which has moved its private names
+        return False
+    return hasattr(Replica, "_stop_accepting_direct_ingress") and not is_tracing_enabled()
+
+
+def _alone() -> bool:
+    """Whether this is the deployment's only replica, as Serve's controller last told it."""
+    return int(serve.get_replica_context().world_size) <= 1
+
+
+def _listening_host() -> str:
+    """Return the address that Serve's HTTP options name; it is where this replica's own port listens, too."""
+    options: Any = ray.get(_controller().get_http_config.remote())
+    return str(options.host)
+
+
+def start(
+    policies: list[str],
+    *,
+    host: str,
+    port: int,
+    grpc_port: int | None,
+    replicas: int,
+    served: dict[str, Any],
+    settings: dict[str, Any],
+) -> None:
+    """Start Serve in the connected Ray cluster and return when requests are answered."""
+    # Without a port Serve's fallback proxy would listen all the same, where there is a service.
+    services = [] if grpc_port is None else [GRPC_SERVICE]
+    grpc_options = gRPCOptions(port=grpc_port or 0, grpc_servicer_functions=services, enable_reflection=False)
+    serve.start(http_options=HTTPOptions(host=host, port=port), grpc_options=grpc_options)
+    app = build(BuildArguments(policies=policies, replicas=replicas, served=served, settings=settings))
+    serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)
+
+
+def stop() -> None:
+    """Shut Serve down: proxies first, then replicas, then the controller."""
+    serve.shutdown()

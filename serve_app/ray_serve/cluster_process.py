@@ -1,0 +1,187 @@
+"""The launcher's child: a private Ray cluster with the policy server in it, for as long as its standard input is open.
+
+`launcher.py` starts it as `python -m rlservo.serve_app.ray_serve.cluster_process PLAN`, with the environment Ray's
+processes are to inherit. It reports on the file descriptor the plan names, one JSON object per line, and shuts
+everything down when its standard input ends: because the launcher closed it, or because the launcher is no more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import os
+import shlex
+import shutil
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from rlservo.serve_app.ray_serve.processes import SERVER_LOG, cut_log, describe_end, end_marked, remove_folder
+from rlservo.serve_app.server.admin_key import remove_key
+
+LOOK_S = 0.5  # between looks at whether Ray's own processes live
+ORDERLY_END_S = 25.0  # [s] less than the launcher waits
+LOG_LOOK_S = 60.0
+OBJECT_STORE_BYTES = 80 << 20  # Ray's least is 75 MiB; requests do not go through it
+
+
+def main() -> int:
+    plan: dict[str, Any] = json.loads(sys.argv[1])
+    # A terminal's Ctrl-C reaches the whole process group. What to do about it is the launcher's decision.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    stop = threading.Event()
+    started = threading.Event()
+    threading.Thread(target=_watch_input, args=(stop, started, plan), daemon=True).start()
+    import ray
+
+    from rlservo.serve_app.ray_serve import app
+
+    _leave_out_extras()
+    try:
+        ray.init(
+            address="local",  # whatever RAY_ADDRESS or a running cluster says
+            num_cpus=max(1, plan["replicas"]),
+            num_gpus=0,
+            object_store_memory=OBJECT_STORE_BYTES,
+            include_dashboard=False,
+            log_to_driver=False,
+            configure_logging=False,
+            _temp_dir=plan["ray_folder"],
+            _node_ip_address="127.0.0.1",  # where Ray's ports listen, with the variable that `launcher.py` sets
+            _system_config={"enable_worker_prestart": False},
+        )
+        app.start(
+            plan["policies"],
+            host=plan["host"],
+            port=plan["port"],
+            grpc_port=plan["grpc_port"],
+            replicas=plan["replicas"],
+            served=plan["served"],
+            settings=plan["settings"],
+        )
+    except Exception as error:
+        _report(plan, {"error": _sentence(error)})
+        raise
+    started.set()
+    _report(plan, {"ready": True})
+    looked = time.monotonic()
+    while not stop.wait(LOOK_S):
+        if (cause := _ray_ended()) is not None:
+            _report(plan, {"died": cause})
+            _leave_nothing(plan)
+            return 1
+        if time.monotonic() - looked > LOG_LOOK_S:
+            looked = time.monotonic()
+            cut_log(Path(plan["folder"]) / SERVER_LOG)
+    app.stop()
+    ray.shutdown()
+    _leave_nothing(plan)
+    return 0
+
+
+def _leave_out_extras() -> None:
+    """Keep Ray (2.60) from starting what nothing here uses and an answer waits for, where its own switches do not.
+
+    The autoscaler's monitor and the log forwarder are 165 MB and a second; `ray start` has flags for both, `ray.init`
+    none. Without a dashboard its process starts all the same, to send usage statistics that are off, and `ray.init`
+    waits until it is up. Where these private names have moved, everything starts.
+
+    The dashboard's agent is 80 MB, opens a port to every interface, which three half-open connections block, and logs
+    a traceback a second about the dashboard that is not there. The raylet insists on a process, so it gets one that
+    does nothing. Raises RuntimeError where Ray starts it in another way.
+    """
+    import ray
+    from ray._private import parameter, services
+
+    with contextlib.suppress(AttributeError):
+        parameter.RayParams = functools.partial(  # type: ignore[misc, assignment]
+            parameter.RayParams,
+            no_monitor=True,
+            include_log_monitor=False,  # type: ignore[arg-type]
+        )
+    if hasattr(services, "start_api_server"):
+        services.start_api_server = _no_api_server
+    start: Any = getattr(services, "start_ray_process", None)
+    if start is None:
+        raise RuntimeError(f"Ray {ray.__version__} starts its processes in another way than 2.60 does")
+
+    def start_ray_process(command: list[str], process_type: str, *arguments: Any, **more: Any) -> Any:
+        if process_type == "raylet":
+            command = without_agent(command)
+        return start(command, process_type, *arguments, **more)
+
+    services.start_ray_process = start_ray_process
+
+
+def without_agent(raylet: list[str]) -> list[str]:
+    """Return the raylet's command with an idle process as the dashboard's agent, and no wait for the agent's ports.
+
+    Raises RuntimeError where the command is another than that of Ray 2.60.
+    """
+    import ray
+
+    changed = {
+        "--dashboard_agent_command": shlex.join([shutil.which("sleep") or "sleep", "infinity"]),
+        "--metrics-agent-port": "-1",
+        "--metrics_export_port": "-1",
+    }
+    for option in changed:
+        if (count := sum(word.startswith(f"{option}=") for word in raylet)) != 1:
+            raise RuntimeError(f"Ray {ray.__version__} starts its raylet with {count} of {option}: 2.60 has one")
+    kept = [word for word in raylet if word.partition("=")[0] not in changed]
+    return [*kept, *(f"{option}={value}" for option, value in changed.items()), "--dashboard_agent_listen_port=-1"]
+
+
+def _ray_ended() -> str | None:
+    """Return which process without which nothing is served has ended, and how; None while all of them live.
+
+    Ray (2.60) leaves the driver of a cluster whose raylet is gone waiting for ever.
+    """
+    from ray._private import worker
+
+    node: Any = worker._global_node
+    for name, process in [] if node is None else node.dead_processes():
+        return f"its process '{name}' {describe_end(process.poll())}"
+    return None
+
+
+def _no_api_server(*_: Any, **__: Any) -> tuple[str, None]:
+    """Return the address and the process of a dashboard that is not there."""
+    return "", None
+
+
+def _watch_input(stop: threading.Event, started: threading.Event, plan: dict[str, Any]) -> None:
+    while os.read(0, 4096):
+        pass
+    stop.set()
+    if started.is_set():
+        time.sleep(ORDERLY_END_S)  # a daemon thread: an end in time ends this sleep, too
+    # Otherwise nothing has been served yet, so there is nothing to drain; a half-started cluster has no orderly end.
+    _leave_nothing(plan)
+    os._exit(0)
+
+
+def _leave_nothing(plan: dict[str, Any]) -> None:
+    """End what is left, remove the folder and the key's file. The launcher does the same, unless it was killed."""
+    if plan["key_file"] is not None:
+        remove_key(Path(plan["key_file"]), plan["settings"]["operator_key"])
+    end_marked(plan["mark"], os.getsid(0))
+    remove_folder(Path(plan["folder"]))
+
+
+def _report(plan: dict[str, Any], message: dict[str, Any]) -> None:
+    os.write(plan["report_fd"], json.dumps(message).encode() + b"\n")
+
+
+def _sentence(error: Exception) -> str:
+    """Return the line that says what went wrong: the last one, since Ray puts the remote traceback before it."""
+    text = str(error).strip() or type(error).__name__
+    return text.splitlines()[-1].strip()[:500]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

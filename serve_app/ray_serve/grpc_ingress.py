@@ -1,0 +1,57 @@
+"""What Ray Serve's gRPC servers are told about the Open Inference Protocol: method names, and how bytes get through.
+
+`grpc_options.grpc_servicer_functions: [rlservo.serve_app.ray_serve.grpc_ingress:add_service]` names it to Serve, whose
+proxies and replicas import it: it needs nothing but grpcio. `oip_grpc.py` has the methods.
+
+Serve passes a request on to the replica's method of the same name. Messages stay bytes until they are there: garbage
+is then answered like every other error, and Ray's own proxy (which pickles what it passes on) needs no message classes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import grpc
+
+SERVICE = "inference.GRPCInferenceService"
+UNARY = (
+    "ServerLive",
+    "ServerReady",
+    "ServerMetadata",
+    "ModelReady",
+    "ModelMetadata",
+    "ModelConfig",
+    "ModelStatistics",
+    "ModelInfer",
+    "RepositoryIndex",
+)
+STREAMS = ("ModelStreamInfer",)
+LONGEST_S = 86400.0  # [s] gRPC says "no deadline" as one far away
+
+Incoming = tuple[bytes, float | None]
+"""A request's bytes, and how many seconds its caller still waits for the answer (None: for ever)."""
+
+
+def add_service(_servicer: Any, server: Any) -> None:
+    """Register the service's methods at one of Serve's gRPC servers."""
+    handlers = {name: grpc.unary_unary_rpc_method_handler(_nothing) for name in UNARY}
+    handlers |= {name: grpc.stream_stream_rpc_method_handler(_nothing) for name in STREAMS}
+    service: Any = grpc.method_handlers_generic_handler(SERVICE, handlers)
+    server.add_generic_rpc_handlers((service,))
+    # Serve has put its own functions in by now, and does not tell them the caller's deadline (ray 2.60).
+    for path, handler in service._method_handlers.items():
+        if not handler.request_streaming:
+            service._method_handlers[path] = handler._replace(unary_unary=_with_deadline(handler.unary_unary))
+
+
+def _with_deadline(answer: Callable[[Any, Any], Awaitable[bytes]]) -> Callable[[bytes, Any], Awaitable[bytes]]:
+    async def call(content: bytes, context: Any) -> bytes:
+        remaining = context.time_remaining()
+        return await answer((content, None if remaining is None or remaining > LONGEST_S else remaining), context)
+
+    return call
+
+
+def _nothing(_request: Any, _context: Any) -> None:
+    """Serve puts its own function in this one's place."""

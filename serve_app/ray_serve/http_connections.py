@@ -1,0 +1,164 @@
+"""uvicorn's HTTP connections with a time-out for every phase.
+
+uvicorn (0.54) bounds one phase of a connection, the idle time after a reply. For the others it waits for ever:
+
+- for a request's head, the first one and each further one;
+- for the rest of a body whose reply has been sent, and for the body of a route that sets no time of its own;
+- for a client that does not read its reply, also after the connection has been closed;
+- for nothing: `Upgrade: websocket` with a body is handed to the WebSocket protocol without that body.
+
+`install` puts a subclass in place of the class that uvicorn chooses, in each of Serve's processes that serves HTTP
+(`ingress.py`). One timer a connection looks at its phases; a request costs two assignments. In front of the replicas
+HAProxy has time-outs of its own (`haproxy_wrapper.py`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import TYPE_CHECKING, Any
+
+import uvicorn
+from uvicorn.protocols.http import auto
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+if TYPE_CHECKING:
+    from starlette.types import Receive, Scope, Send
+
+HEAD_S = 5.0
+"""[s] for a request's head, from the connection's begin or the head's first byte on."""
+BODY_S = 30.0
+"""[s] for a body, where a route has no shorter time of its own (`body_timeout_s`)."""
+LINGER_S = 1.0
+"""[s] in which a client that still sends may take the reply: closed at once, what it sends would destroy the reply."""
+UNREAD_S = 10.0
+"""[s] that sent bytes may wait for a client that does not read."""
+LOOK_S = 1.0
+"""[s] between two looks at a connection."""
+
+LATE = b'{"error":"the request did not arrive in time","code":"deadline-passed"}'
+LATE_REPLY = (
+    b"HTTP/1.1 408 Request Timeout\r\ncontent-type: application/json\r\nconnection: close\r\n"
+    b"content-length: %d\r\n\r\n%s" % (len(LATE), LATE)
+)
+NO_UPGRADE = (
+    b'{"error":"the header Upgrade is understood for a WebSocket alone, which begins with a GET without a body: '
+    b'leave it out","code":"bad-request"}'
+)
+# What the subclass overrides or reads of uvicorn's private parts.
+PRIVATE = ("_should_upgrade", "_start_asgi_task", "_unset_keepalive_if_required", "handle_websocket_upgrade")
+
+
+class TimedProtocol(HttpToolsProtocol):
+    """A connection that ends when one of its phases takes too long."""
+
+    _head_since: float | None = None  # since when a head is awaited; None while something else is
+    _body_since = 0.0  # since when the request's body is awaited
+    _timer: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for the first head."""
+        super().connection_made(transport)
+        self._head_since = self.loop.time()
+        self._timer = self.loop.call_later(LOOK_S, self._look)
+        # The kernel ends the connection, whoever else still holds it: uvicorn's WebSockets, too.
+        connection = transport.get_extra_info("socket")
+        if connection is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1000))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop looking."""
+        self._stop()
+        super().connection_lost(exc)
+
+    def handle_websocket_upgrade(self) -> None:
+        """Leave the connection to the WebSocket protocol, which sends pings."""
+        self._stop()
+        super().handle_websocket_upgrade()
+
+    def on_message_begin(self) -> None:
+        """Begin to wait for this head."""
+        self._head_since = self.loop.time()
+        super().on_message_begin()
+
+    def on_headers_complete(self) -> None:
+        """Begin to wait for the body."""
+        self._body_since, self._head_since = self._head_since or 0.0, None
+        super().on_headers_complete()
+
+    def on_response_complete(self) -> None:
+        """Give a client that is still sending a moment to take its reply, and close."""
+        super().on_response_complete()
+        cycle = self.cycle
+        if cycle.response_complete and cycle.more_body and not self.transport.is_closing():
+            self._unset_keepalive_if_required()
+            self._stop()
+            self.loop.call_soon(self._linger)  # the reply may be held until the end of this turn (`joined_writes.py`)
+
+    def _linger(self) -> None:
+        if not self.transport.is_closing():
+            self.transport.write_eof()
+            self.loop.call_later(LINGER_S, self.transport.close)
+
+    def _should_upgrade(self) -> bool:
+        return super()._should_upgrade() and not _has_body(self.scope)
+
+    def _start_asgi_task(self, cycle: Any, app: Any) -> None:
+        # The parser has stopped at this head: a body is lost, and so is the next request.
+        parser: Any = self.parser
+        if parser.should_upgrade() and any(name == b"upgrade" for name, _ in cycle.scope["headers"]):
+            cycle.keep_alive = False
+            if _has_body(cycle.scope):
+                app = _refuse_upgrade
+        super()._start_asgi_task(cycle, app)
+
+    def _look(self) -> None:
+        if self.transport.is_closing():
+            return
+        now, cycle = self.loop.time(), self.cycle
+        if self._head_since is not None:
+            late = now - self._head_since > HEAD_S
+        elif cycle.response_complete:
+            late = False
+            if self.timeout_keep_alive_task is None:  # something came, but no head began: blank lines
+                self._head_since = now
+        else:
+            late = cycle.more_body and now - self._body_since > BODY_S
+        if not late:
+            self._timer = self.loop.call_later(LOOK_S, self._look)
+            return
+        if cycle is None or cycle.response_complete or not cycle.response_started:
+            self.transport.write(LATE_REPLY)
+        self.transport.close()
+
+    def _stop(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+
+def _has_body(scope: Any) -> bool:
+    """Whether a request that asks for an upgrade is anything else than a handshake."""
+    if scope["method"] != "GET":
+        return True
+    return any(
+        name == b"transfer-encoding" or (name == b"content-length" and value.strip() != b"0")
+        for name, value in scope["headers"]
+    )
+
+
+async def _refuse_upgrade(_scope: Scope, _receive: Receive, send: Send) -> None:
+    headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(NO_UPGRADE))]
+    await send({"type": "http.response.start", "status": 400, "headers": headers})
+    await send({"type": "http.response.body", "body": NO_UPGRADE})
+
+
+def install() -> None:
+    """Let uvicorn's servers of this process use it. Raises RuntimeError where uvicorn has become another."""
+    if auto.AutoHTTPProtocol is TimedProtocol:
+        return
+    missing = [name for name in PRIVATE if not hasattr(HttpToolsProtocol, name)]
+    if auto.AutoHTTPProtocol is not HttpToolsProtocol or missing:
+        what = f"its HttpToolsProtocol has no {missing[0]}" if missing else "httptools is missing"
+        raise RuntimeError(f"uvicorn {uvicorn.__version__} cannot be given time-outs for its connections: {what}")
+    auto.AutoHTTPProtocol = TimedProtocol

@@ -1,0 +1,155 @@
+"""Makes the environment of a rollout and checks that the policy fits it. gymnasium is imported in the functions."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlservo.export.contract.bundle import (
+    BoxSpec,
+    Contract,
+    DictSpec,
+    MultiBinarySpec,
+    MultiDiscreteSpec,
+    SpaceSpec,
+    TupleSpec,
+)
+from rlservo.export.contract.errors import UsageError
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+
+def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.Env[Any, Any]:
+    """Return the environment, or raise UsageError: no such id (with close matches), a missing extra, bad arguments."""
+    try:
+        import gymnasium as gym
+    except ModuleNotFoundError as missing:
+        raise UsageError(f"a rollout needs {missing.name}: pip install 'rlservo[sim]'") from missing
+    mode = {"render_mode": "rgb_array"} if render else {}
+    try:
+        # Gymnasium's checker looks at every step and warns on the terminal: that is for who writes an environment.
+        return gym.make(env_id, disable_env_checker=True, **{**arguments, **mode})
+    except gym.error.UnregisteredEnv as error:
+        close = difflib.get_close_matches(env_id, list(gym.registry), n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(close)}?" if close else "write 'module:Id' to import the module that has it"
+        raise UsageError(f"environment {env_id!r} is not registered: {hint}", {"close_matches": close}) from error
+    except (ModuleNotFoundError, gym.error.DependencyNotInstalled) as error:
+        hint = "pip install 'rlservo[sim]'" if env_id.startswith("rlservo/") else "install what it needs"
+        raise UsageError(f"environment {env_id!r} cannot be made: {error}: {hint}") from error
+    except Exception as error:  # a constructor is anyone's code
+        raise UsageError(f"environment {env_id!r} cannot be made with {arguments}: {error}") from error
+
+
+def control_rate_of(env: gym.Env[Any, Any], arguments: Mapping[str, Any], contract: Contract) -> float | None:
+    """Return the rate at which actions are due [Hz]: the environment's own word, else the contract's, else render_fps.
+
+    `render_fps` comes last because in Gymnasium's own environments it is a wish about videos (Pendulum: 30 at 20 Hz).
+    """
+    stated = _described(env, arguments).get("control_rate_hz")
+    for candidate in (stated, contract.control_rate_hz, env.unwrapped.metadata.get("render_fps")):
+        if candidate:
+            return float(candidate)
+    return None
+
+
+def check_fit(contract: Contract, env: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> None:
+    """Raise UsageError, naming the first difference, unless the policy's spaces are the environment's.
+
+    The observation must have the same shape, kind of number and, where both name them, elements; the action the same
+    bounds as well, since the policy scales to them.
+    """
+    described = _described(env, arguments)
+    sides = (
+        ("observation", contract.observation_space, env.observation_space),
+        ("action", contract.action_space, env.action_space),
+    )
+    for side, expected, actual in sides:
+        difference = _difference(expected, actual, bounds=side == "action") or _misnamed(expected, described.get(side))
+        if difference:
+            name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+            raise UsageError(f"policy {contract.name!r} does not fit {name}: the {side} {difference}")
+
+
+def _difference(expected: SpaceSpec, actual: gym.Space[Any], *, bounds: bool) -> str | None:
+    from gymnasium import spaces
+
+    if isinstance(expected, DictSpec | TupleSpec):
+        return _nested_difference(expected, actual, bounds=bounds)
+    if isinstance(expected, MultiDiscreteSpec):
+        if not isinstance(actual, spaces.MultiDiscrete):
+            return f"is a {type(actual).__name__} there, the policy has MultiDiscrete({list(expected.nvec)})"
+        if (actual.shape, tuple(actual.nvec.ravel().tolist())) != (expected.shape, expected.nvec):
+            return f"has {actual.nvec.tolist()} choices there, the policy has {list(expected.nvec)}"
+        return None
+    if isinstance(expected, MultiBinarySpec):
+        if not isinstance(actual, spaces.MultiBinary) or actual.shape != expected.shape:
+            return f"is {actual} there, the policy has MultiBinary of shape {expected.shape}"
+        return None
+    if not isinstance(expected, BoxSpec):
+        if not isinstance(actual, spaces.Discrete):
+            return f"is a {type(actual).__name__} there, the policy has Discrete({expected.n})"
+        if (int(actual.n), int(actual.start)) != (expected.n, expected.start):
+            return (
+                f"is {int(actual.n)} choices from {int(actual.start)} there, "
+                f"the policy has {expected.n} from {expected.start}"
+            )
+        return None
+    if not isinstance(actual, spaces.Box):
+        return f"is a {type(actual).__name__} there, the policy has a Box of shape {expected.shape}"
+    if actual.shape != expected.shape:
+        return f"has shape {actual.shape} there, the policy has {expected.shape}"
+    if np.dtype(actual.dtype).kind != np.dtype(expected.dtype).kind:  # float32 and float64 convert without harm
+        return f"has dtype {actual.dtype} there, the policy has {expected.dtype}"
+    if not bounds:
+        return None
+    for word, ours, theirs in zip(("low", "high"), expected.bounds(), (actual.low, actual.high), strict=True):
+        differs = ~np.isclose(ours, theirs.astype(np.float64), rtol=1e-6, atol=1e-9)
+        if differs.any():
+            first = tuple(int(i) for i in np.argwhere(differs)[0])
+            index = int(np.ravel_multi_index(first, ours.shape)) if first else 0
+            element = f" ({expected.elements[index].name})" if index < len(expected.elements) else ""
+            return f"element {index}{element} has {word} {theirs[first]:g} there, the policy has {ours[first]:g}"
+    return None
+
+
+def _nested_difference(expected: DictSpec | TupleSpec, actual: gym.Space[Any], *, bounds: bool) -> str | None:
+    from gymnasium import spaces
+
+    kind = spaces.Dict if isinstance(expected, DictSpec) else spaces.Tuple
+    if not isinstance(actual, kind):
+        return f"is a {type(actual).__name__} there, the policy has a {kind.__name__}"
+    ours: dict[Any, SpaceSpec] = (
+        dict(expected.spaces) if isinstance(expected, DictSpec) else dict(enumerate(expected.spaces))
+    )
+    theirs: dict[Any, Any] = dict(actual.spaces) if isinstance(actual, spaces.Dict) else dict(enumerate(actual.spaces))
+    if set(ours) != set(theirs):
+        return f"has the parts {sorted(map(str, theirs))} there, the policy has {sorted(map(str, ours))}"
+    for key, child in ours.items():
+        if difference := _difference(child, theirs[key], bounds=bounds):
+            return f"part {key} {difference}"
+    return None
+
+
+def _misnamed(expected: SpaceSpec, described: Any) -> str | None:
+    if not isinstance(described, list | tuple) or len(described) != len(expected.elements):
+        return None
+    for index, (ours, theirs) in enumerate(zip(expected.elements, described, strict=True)):
+        if ours.name != theirs["name"]:
+            return f"element {index} is {theirs['name']!r} there, the policy has {ours.name!r}"
+    return None
+
+
+def _described(env: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what the environment class says of itself, if it does: element names and the control rate."""
+    describe = getattr(type(env.unwrapped), "describe", None)
+    if describe is None:
+        return {}
+    try:
+        description = describe(**arguments)
+    except TypeError:  # someone else's method of that name
+        return {}
+    return description if isinstance(description, Mapping) else {}

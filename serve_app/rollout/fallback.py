@@ -1,0 +1,218 @@
+"""What a robot does while its policy does not answer: `WithFallback` turns silence into a chosen action, and says so.
+
+It wraps anything that acts. A control loop that raised because a packet got lost would leave the robot with its last
+command and nobody at the wheel. Which command is the safe one depends on the robot: holding a position setpoint stops
+an arm, holding a velocity runs a vehicle into a wall. So there is no default.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+from typing_extensions import Self
+
+from rlservo.export.contract.bundle import Contract, SpaceSpec, leaf_specs
+from rlservo.export.contract.errors import (
+    DeadlineError,
+    RequestError,
+    RlservoError,
+    SessionLostError,
+    UnavailableError,
+    UsageError,
+)
+from rlservo.export.contract.nested import action_leaves, build_action
+from rlservo.serve_app.interface import ActingPolicy, Observation
+
+logger = logging.getLogger(__name__)
+
+LOG_EVERY_S = 10.0
+FIRST_TRIES = 10  # to get an episode's first action, where there is none to hold yet
+
+
+class StoppedError(RlservoError):
+    """The policy did not answer, and the loop was told to stop then."""
+
+    code = "stopped"
+
+
+@dataclass
+class LinkCounts:
+    """What became of the requests for actions."""
+
+    late: int = 0  # no answer within the deadline
+    unavailable: int = 0  # the server could not be reached, or refused for now
+    lost: int = 0  # the server has no memory of the episode any more
+    fallback: int = 0  # steps that got the fallback's action
+
+
+class WithFallback:
+    """A policy that always has an action in time, for as long as what it wraps keeps its deadline.
+
+    ```python
+    policy = WithFallback(StreamClient(url, "ur5", deadline_ms=50), "hold")
+    ```
+    """
+
+    def __init__(
+        self,
+        policy: ActingPolicy,
+        fallback: Literal["hold", "zero", "stop"] | ArrayLike | dict[str, Any],
+        *,
+        on_fallback: Callable[[RlservoError], None] | None = None,
+    ) -> None:
+        """`fallback`: 'hold' repeats the last action, 'zero' sends zeros, 'stop' raises StoppedError, or an action.
+
+        `on_fallback` is told why, each time. Raises UsageError where the action does not fit the policy's space.
+        """
+        self._policy = policy
+        self._fallback = fallback
+        self._given: Any = None
+        if not isinstance(fallback, str):
+            self._given = _checked(policy.contract, fallback)
+        elif fallback == "zero":
+            self._given = _zero(policy.contract)
+        elif fallback not in ("hold", "stop"):
+            raise UsageError(f"fallback {fallback!r} does not exist: expected hold, zero, stop or an action")
+        self._on_fallback = on_fallback
+        self._last: Any = None
+        self._said_at = -LOG_EVERY_S
+        self.counts = LinkCounts()
+
+    @property
+    def name(self) -> str:
+        """What the fallback is, in a word."""
+        return self._fallback if isinstance(self._fallback, str) else "given action"
+
+    @property
+    def policy(self) -> ActingPolicy:
+        """What is wrapped."""
+        return self._policy
+
+    @property
+    def contract(self) -> Contract:
+        return self._policy.contract
+
+    def act(
+        self, obs: Observation, *, explore: bool = False, seed: int | None = None, reward: ArrayLike | None = None
+    ) -> Any:
+        """Return the policy's action, or the fallback's when it did not answer in time or at all.
+
+        Where there is nothing to hold yet, an episode's first action is asked for several times.
+
+        Raises StoppedError where the fallback is to stop, or to hold before there was an action, and all that is not a
+        matter of waiting: a wrong observation, an unsafe action.
+        """
+        more: dict[str, Any] = {} if reward is None else {"reward": reward}
+        for tries_left in reversed(range(FIRST_TRIES)):
+            try:
+                action = self._policy.act(obs, explore=explore, seed=seed, **more)
+            except (DeadlineError, UnavailableError, SessionLostError) as error:
+                if (
+                    tries_left
+                    and self._fallback_is("hold")
+                    and self._last is None
+                    and not isinstance(error, SessionLostError)
+                ):
+                    self._count(error)
+                    continue  # the robot has not been commanded yet, and what it sees has not changed
+                return self._fall_back(error)
+            self._last = _copy(action)  # a loop may write into what it got
+            return action
+        raise AssertionError("the last try returns or raises")
+
+    def reset(self) -> None:
+        """Start an episode. There is nothing to hold until the policy has acted in it."""
+        self._last = None
+        self._policy.reset()
+
+    def close(self) -> None:
+        """Close the wrapped policy."""
+        self._policy.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _fall_back(self, error: DeadlineError | UnavailableError | SessionLostError) -> Any:
+        self._count(error)
+        if self._fallback_is("stop"):
+            raise StoppedError(f"stopped: {error.message}", error.details) from error
+        action = self._given if self._given is not None else self._last
+        if action is None:
+            raise StoppedError(f"there is no action to hold yet: {error.message}", error.details) from error
+        self.counts.fallback += 1
+        now = time.monotonic()
+        if now - self._said_at >= LOG_EVERY_S:
+            self._said_at = now
+            logger.warning("fallback (%s), %d times so far: %s", self.name, self.counts.fallback, error.message)
+        if isinstance(self._policy, _Told):  # a limit on the step counts from what the robot really does
+            self._policy.commanded(_copy(action))
+        return _copy(action)
+
+    def _fallback_is(self, word: str) -> bool:
+        return isinstance(self._fallback, str) and self._fallback == word
+
+    def _count(self, error: DeadlineError | UnavailableError | SessionLostError) -> None:
+        if isinstance(error, DeadlineError):
+            self.counts.late += 1
+        elif isinstance(error, SessionLostError):
+            self.counts.lost += 1
+        else:
+            self.counts.unavailable += 1
+        if self._on_fallback is not None:
+            self._on_fallback(error)
+
+
+@runtime_checkable
+class _Told(Protocol):
+    """A client whose server may remember the last action."""
+
+    def commanded(self, action: Any) -> None: ...
+
+
+def _zero(contract: Contract) -> Any:
+    leaves = leaf_specs(contract.action_space, "action")
+    choice = next((name for name, leaf in leaves.items() if np.dtype(leaf.dtype).kind != "f"), None)
+    if choice is not None:
+        raise UsageError(f"{choice} of policy '{contract.name}' is a choice, of which zero is one: give an action")
+    zeros = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
+    return _checked(contract, build_action(contract.action_space, zeros))
+
+
+def _checked(contract: Contract, action: Any) -> Any:
+    """Return a given action as the space has it; raise UsageError where it is none."""
+    space: SpaceSpec = contract.action_space
+    typed: dict[str, Any] = {}
+    try:
+        for name, given in action_leaves(space, action).items():
+            leaf = leaf_specs(space, "action")[name]
+            array = np.asarray(given)
+            low, high = leaf.bounds()
+            cast = array.astype(leaf.dtype)
+            inside = array.shape == leaf.shape and bool(((cast >= low) & (cast <= high)).all())
+            if not inside or not np.isfinite(array).all() or not np.allclose(cast, array, rtol=1e-6):
+                raise UsageError(
+                    f"the fallback's {name} is {str(given)[:80]}: policy '{contract.name}' expects shape {leaf.shape} "
+                    f"within {leaf.bounds()[0].min():g} to {leaf.bounds()[1].max():g}"
+                )
+            typed[name] = cast
+    except (RequestError, ValueError, TypeError) as error:
+        raise UsageError(f"the fallback is no action of policy '{contract.name}': {error}") from error
+    return build_action(space, typed)
+
+
+def _copy(action: Any) -> Any:
+    if isinstance(action, dict):
+        return {key: _copy(part) for key, part in action.items()}
+    return tuple(_copy(part) for part in action) if isinstance(action, tuple) else action.copy()

@@ -1,0 +1,80 @@
+"""Writes an environment's `rgb_array` frames to an mp4 file.
+
+It knows nothing of policies or loops. imageio and its ffmpeg are imported when the first frame is written.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from rlservo.export.contract.errors import UsageError
+
+
+class VideoFile:
+    """An mp4 file that grows frame by frame; nothing is created before the first one. A context manager."""
+
+    def __init__(self, path: str | Path, *, fps: float) -> None:
+        """Check the name and that the encoder is installed, so that a long run does not fail at its first frame."""
+        self.path = Path(path)
+        if self.path.suffix.lower() != ".mp4":
+            raise UsageError(f"the video file is {str(path)!r}: expected a name that ends in .mp4")
+        if not self.path.parent.is_dir():
+            raise UsageError(f"the video file's folder {str(self.path.parent)!r} does not exist: make it first")
+        try:
+            for module in ("imageio.v2", "imageio_ffmpeg"):
+                import_module(module)
+        except ModuleNotFoundError as missing:
+            raise UsageError(f"a video needs {missing.name}: pip install 'rlservo[sim]'") from missing
+        self._fps = fps
+        self._writer: Any = None
+        self.frames = 0
+
+    def add(self, frame: NDArray[np.uint8]) -> None:
+        """Append one (height, width, 3) uint8 picture."""
+        if self._writer is None:
+            import imageio.v2 as imageio
+
+            # macro_block_size 2: what yuv420p needs; the default of 16 would rescale most pictures with a warning.
+            self._writer = imageio.get_writer(self.path, fps=self._fps, codec="libx264", macro_block_size=2)
+        self._writer.append_data(frame)
+        self.frames += 1
+
+    def close(self) -> None:
+        """Finish the file; harmless when repeated."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def rgb_frame(env: Any) -> NDArray[np.uint8]:
+    """Return `env.render()` as (height, width, 3) uint8.
+
+    Raises UsageError when the environment cannot draw: no GL library, no display, or no `rgb_array` mode.
+    """
+    try:
+        frame = env.render()
+    except Exception as error:  # GL libraries raise ImportError, AttributeError, RuntimeError and mujoco.FatalError
+        raise UsageError(
+            f"the environment cannot draw a picture ({type(error).__name__}: {str(error)[:200]}). For MuJoCo without a "
+            "display install the Debian package libegl1 and set MUJOCO_GL=egl, or libosmesa6 and MUJOCO_GL=osmesa"
+        ) from error
+    array = np.asarray(frame)
+    if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
+        got = type(frame).__name__ if array.ndim == 0 else f"{array.dtype} {array.shape}"
+        raise UsageError(f"the environment's rgb_array picture is {got}, expected uint8 (height, width, 3)")
+    return array

@@ -1,0 +1,1 @@
+"""In-process runtime: load a policy bundle, check it, act. Needs numpy and onnxruntime only."""

@@ -1,0 +1,66 @@
+"""Let only finite actions of the action space pass: the last look before an action leaves for a robot.
+
+It knows numpy and one leaf of the contract's action space; nothing of graphs.
+"""
+
+from __future__ import annotations
+
+from operator import ge, le
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.bundle import LeafSpec, iter_elements
+from rlservo.export.contract.errors import ActionError
+
+OVERSHOOT = 1e-5  # relative to the bound: what float32 rounding in unsquash may leave outside the space; clipped
+SMALL_ACTION = 32  # elements up to which a Python loop checks bounds faster than numpy does
+
+
+class ActionGuard:
+    """Checks the actions of one leaf, `action` or `action.<path>`."""
+
+    def __init__(self, policy: str, name: str, space: LeafSpec) -> None:
+        self._policy = policy
+        self._name = name
+        self._space = space
+        self._shape = space.shape
+        self._dtype = np.dtype(space.dtype)
+        low, high = space.bounds()
+        if self._dtype.kind == "f":  # the largest finite number stands for unbounded: infinity is then outside as well
+            largest = float(np.finfo(self._dtype).max)
+            low, high = np.maximum(low, -largest), np.minimum(high, largest)
+        self._low, self._high = low, high
+        self._small_bounds: tuple[list[float], list[float]] | None = None
+        if space.size <= SMALL_ACTION:
+            self._small_bounds = (low.ravel().tolist(), high.ravel().tolist())
+
+    def check(self, action: NDArray[Any]) -> None:
+        """Raise ActionError unless `action` `[batch, *shape]` is of the space; rounding is clipped in place."""
+        if self._small_bounds is not None and len(action) == 1:
+            values = action.ravel().tolist()
+            low, high = self._small_bounds
+            if all(map(le, low, values)) and all(map(ge, high, values)):  # so written, it holds for not-a-number too
+                return
+        elif ((action >= self._low) & (action <= self._high)).all():
+            return
+        self._clip_or_refuse(action)
+
+    def _clip_or_refuse(self, action: NDArray[Any]) -> None:
+        slack = OVERSHOOT * np.maximum(1.0, np.minimum(np.abs(self._low), np.abs(self._high)))
+        bad = ~((action >= self._low - slack) & (action <= self._high + slack))
+        if bad.any():
+            index = tuple(int(i) for i in np.argwhere(bad)[0])
+            flat = int(np.ravel_multi_index(index[1:], self._shape)) if self._shape else 0
+            label = dict(iter_elements(self._space))[flat] if self._shape else "0"
+            low, high = self._low[index[1:]], self._high[index[1:]]
+            value = action[index]
+            why = f"not in [{low:g}, {high:g}]" if np.isfinite(value) else "not a finite number"
+            of = "" if self._name == "action" else f" of {self._name}"
+            raise ActionError(
+                f"policy '{self._policy}' computed an action that must not reach a robot: "
+                f"element {label}{of} is {value}, {why}",
+                {"policy": self._policy, "index": list(index), "value": str(value)},
+            )
+        np.clip(action, self._low.astype(self._dtype), self._high.astype(self._dtype), out=action)

@@ -1,0 +1,94 @@
+"""Exploring actions: a sample of the policy's action distribution, drawn in numpy, as RLlib would draw it in torch.
+
+The graph gives the distribution's parameters (`action_dist_inputs`); this file knows the distributions RLlib's own
+algorithms use and what RLlib does to a sample before `env.step`. It knows nothing of graphs or files.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.bundle import (
+    BoxSpec,
+    DictSpec,
+    DiscreteSpec,
+    Distribution,
+    LeafSpec,
+    MultiDiscreteSpec,
+    SpaceSpec,
+    TupleSpec,
+    leaf_specs,
+)
+from rlservo.export.contract.scores import parameter_count, split_parameters
+
+# RLlib clamps the log of a squashed Gaussian's scale to this range: ray/rllib/utils/numpy.py, ray 2.60.
+MIN_LOG_STD = -5.0
+MAX_LOG_STD = 2.0
+
+
+def distribution_size(distribution: Distribution, space: SpaceSpec) -> int:
+    """Return how many numbers per action `action_dist_inputs` must hold; 0 where the two do not belong together."""
+    leaves = leaf_specs(space, "action").values()
+    kinds = {_leaf_kind(leaf, distribution) for leaf in leaves}
+    nested = isinstance(space, DictSpec | TupleSpec)
+    if nested != (distribution.kind == "multi") or (not nested and kinds != {distribution.kind}):
+        return 0
+    return sum(parameter_count(leaf) for leaf in leaves)
+
+
+def sample_action(
+    inputs: NDArray[np.floating], distribution: Distribution, space: LeafSpec, rng: np.random.Generator
+) -> NDArray[np.float64] | NDArray[np.int64]:
+    """Draw one action per row of `inputs` `[batch, distribution_size]`, in environment units: `[batch, *space.shape]`.
+
+    'diag_gaussian' rows are [mean, log_std]; 'squashed_gaussian' rows are too, with the sample through tanh;
+    'categorical' rows are logits, sampled by the Gumbel-max trick (Gumbel 1954; Maddison et al. 2014,
+    arXiv:1411.0030); 'multi_categorical' rows are several such rows side by side.
+    """
+    rows = inputs.astype(np.float64)
+    if isinstance(space, DiscreteSpec):
+        return np.asarray(_choose(rows, rng) + space.start, np.int64)
+    if isinstance(space, MultiDiscreteSpec):
+        parts = np.split(rows, np.cumsum(space.nvec)[:-1], axis=-1)
+        chosen = np.stack([_choose(part, rng) for part in parts], axis=-1) + np.array(space.start)
+        return np.asarray(chosen.reshape((-1, *space.shape)), np.int64)
+    assert isinstance(space, BoxSpec), "RLlib has no distribution for other spaces"
+    mean, log_std = np.split(rows, 2, axis=-1)
+    if distribution.kind == "squashed_gaussian":
+        log_std = np.clip(log_std, MIN_LOG_STD, MAX_LOG_STD)
+    sample = mean + np.exp(log_std) * rng.standard_normal(mean.shape)
+    if distribution.kind == "squashed_gaussian":
+        sample = np.tanh(sample)
+    sample = sample.reshape((-1, *space.shape))
+    low, high = space.bounds()
+    bounded = bool(np.isfinite(low).all() and np.isfinite(high).all())
+    if distribution.transform == "none" or (distribution.transform == "unsquash" and not bounded):
+        return sample
+    if distribution.transform == "unsquash":
+        sample = low + (sample + 1.0) * (high - low) / 2.0
+    return np.clip(sample, low, high)
+
+
+def sample_leaves(
+    inputs: NDArray[np.floating], distribution: Distribution, space: SpaceSpec, rng: np.random.Generator
+) -> dict[str, NDArray[Any]]:
+    """Draw every leaf of the action by tensor name, in the leaf's own dtype."""
+    return {
+        name: sample_action(part, distribution, leaf, rng).astype(leaf.dtype)
+        for name, leaf, part in split_parameters(inputs, space)
+    }
+
+
+def _choose(logits: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.int64]:
+    return np.asarray(np.argmax(logits + rng.gumbel(size=logits.shape), axis=-1), np.int64)
+
+
+def _leaf_kind(leaf: LeafSpec, distribution: Distribution) -> str:
+    if isinstance(leaf, DiscreteSpec):
+        return "categorical"
+    if isinstance(leaf, MultiDiscreteSpec):
+        return "multi_categorical"
+    return "squashed_gaussian" if distribution.kind == "squashed_gaussian" else "diag_gaussian"

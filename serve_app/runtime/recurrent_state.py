@@ -1,0 +1,102 @@
+"""What a policy carries from step to step, as the graph's tensors: recurrent state, frames, previous actions, reward.
+
+Where it is kept is the caller's affair: `Policy` keeps one, a server's clients may send theirs along. It knows numpy
+and the contract only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlservo.export.contract.bundle import REWARD, Contract, DiscreteSpec, StateSpec
+from rlservo.export.contract.errors import RequestError
+
+State: TypeAlias = dict[str, NDArray[Any]]
+"""Arrays `[batch, *shape]` by state name."""
+
+
+class Memory:
+    """Reads and writes the state of one policy; empty for a stateless one."""
+
+    def __init__(self, contract: Contract) -> None:
+        self._policy = contract.name
+        self._specs: dict[str, StateSpec] = {state.name: state for state in contract.state}
+        self._rewarded = any(tensor.name == REWARD for tensor in contract.inputs)
+        self._choices = contract.action_space if isinstance(contract.action_space, DiscreteSpec) else None
+        self.outputs = [f"state_out.{name}" for name in self._specs]
+        """The graph's outputs to ask for beside the action."""
+
+    def feed(self, state: State | None, rows: int, reward: ArrayLike | None) -> dict[str, NDArray[Any]]:
+        """Return the graph's inputs beside the observation; a state of None begins an episode in every row.
+
+        Raises RequestError when the policy needs a reward, and none that fits is given.
+        """
+        now = {name: spec.initial_value(rows) for name, spec in self._specs.items()} if state is None else state
+        given = {f"state_in.{name}": value for name, value in now.items()}
+        if self._rewarded:
+            given[REWARD] = self._reward(state is None, rows, reward)
+        return given
+
+    def keep(self, computed: Mapping[str, NDArray[Any]], sampled: Mapping[str, NDArray[Any]] | None) -> State:
+        """Return the next state from the graph's outputs; `sampled` is the action where it is not the graph's own."""
+        after = {name: computed[f"state_out.{name}"] for name in self._specs}
+        if sampled is not None and self._choices is not None:
+            for name, spec in self._specs.items():
+                if spec.kind == "previous_actions":
+                    width = self._choices.n
+                    codes = after[name].copy()
+                    codes[:, -width:] = np.eye(width, dtype=codes.dtype)[sampled["action"] - self._choices.start]
+                    after[name] = codes
+        return after
+
+    def read(self, state: Mapping[str, ArrayLike], rows: int, *, batch: bool) -> State:
+        """Return a caller's state as the graph's arrays. Raises RequestError, naming what does not fit."""
+        missing = [name for name in self._specs if name not in state]
+        unknown = [str(name)[:64] for name in state if name not in self._specs]
+        if missing or unknown:
+            parts = [f"missing {', '.join(missing)}"] if missing else []
+            parts += [f"unknown {', '.join(unknown[:8])}"] if unknown else []
+            known = ", ".join(self._specs) or "none: it is stateless"
+            raise RequestError(
+                f"the state does not fit policy '{self._policy}' (its state: {known}): {'; '.join(parts)}"
+            )
+        found: State = {}
+        for name, spec in self._specs.items():
+            expected = (rows, *spec.shape) if batch else spec.shape
+            try:
+                with np.errstate(over="ignore"):  # the infinity is refused below
+                    array = np.asarray(state[name], spec.dtype)
+            except (ValueError, TypeError, OverflowError) as error:
+                raise RequestError(f"state '{name}' of policy '{self._policy}' cannot be read: {error}") from error
+            if array.shape != expected:
+                raise RequestError(
+                    f"policy '{self._policy}' expects state '{name}' of shape {expected}, got {array.shape}"
+                )
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise RequestError(f"state '{name}' of policy '{self._policy}' holds a number that is not finite")
+            found[name] = array if batch else array[None]
+        return found
+
+    def _reward(self, starting: bool, rows: int, reward: ArrayLike | None) -> NDArray[np.float32]:
+        if starting and self._specs:  # where nothing else is remembered, an episode's start looks like any step
+            return np.zeros(rows, np.float32)  # nothing has been earned yet, whatever the caller says
+        if reward is None:
+            start = "" if self._specs else ", 0 at an episode's start"
+            raise RequestError(
+                f"policy '{self._policy}' was trained to see the reward of its last action: give "
+                f"act(obs, reward=...), over a network 'reward'{start}"
+            )
+        try:
+            with np.errstate(over="ignore"):
+                array = np.asarray(reward, np.float32).reshape(-1)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise RequestError(f"the reward for policy '{self._policy}' cannot be read: {error}") from error
+        if len(array) != rows or not np.isfinite(array).all():
+            raise RequestError(
+                f"policy '{self._policy}' expects {rows} finite reward{'s' if rows > 1 else ''}, got {reward!r:.80}"
+            )
+        return array

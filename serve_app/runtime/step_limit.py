@@ -1,0 +1,106 @@
+"""Keeps an action near the one before it: a limit per element on how far a command may jump in one step.
+
+A network may answer a small change of its observation with a large change of its action; a gearbox may not. It knows
+numpy and the contract's action space; who remembers the last action is the caller's affair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.bundle import BoxSpec, LeafSpec, iter_elements
+from rlservo.export.contract.errors import ActionError, RequestError, UsageError
+from rlservo.serve_app.runtime.options import PolicyOptions
+
+ROUNDING = 1e-6  # relative to the step: what float32 may add to a step that is allowed
+
+
+class StepLimit:
+    """The limits of one policy, by leaf of its action space (`action` or `action.<path>`)."""
+
+    def __init__(self, policy: str, leaves: Mapping[str, LeafSpec], options: PolicyOptions) -> None:
+        """Raise UsageError where the options do not fit the action space."""
+        self._policy = policy
+        self._leaves = leaves
+        self._refuses = options.beyond_action_step == "refuse"
+        given = options.max_action_step
+        by_leaf = given if isinstance(given, dict) else {"action": given} if given is not None else {}
+        self._steps = {name: self._read(name, steps) for name, steps in by_leaf.items()}
+
+    def __bool__(self) -> bool:
+        return bool(self._steps)
+
+    def read(self, last: Mapping[str, Any], rows: int, *, batch: bool) -> dict[str, NDArray[Any]]:
+        """Return a caller's last action, by leaf, as `[batch, *shape]`.
+
+        Raises RequestError unless it is an action of the space: no limit holds against something else.
+        """
+        found: dict[str, NDArray[Any]] = {}
+        for name, space in self._leaves.items():
+            expected = (rows, *space.shape) if batch else space.shape
+            try:
+                with np.errstate(over="ignore"):  # the infinity is refused below
+                    array = np.asarray(last[name], space.dtype)
+            except (ValueError, TypeError, OverflowError) as error:
+                raise RequestError(f"last_action of policy '{self._policy}' cannot be read: {error}") from error
+            if not space.shape and array.shape == (*expected, 1):  # as RLlib, and so the graph, gives such an action
+                array = array.reshape(expected)
+            low, high = space.bounds()
+            slack = 1e-5 * np.maximum(1.0, np.minimum(np.abs(low), np.abs(high)))
+            if array.shape != expected:
+                raise RequestError(
+                    f"policy '{self._policy}' expects {name} of last_action of shape {expected}, got {array.shape}"
+                )
+            if not (np.isfinite(array) & (array >= low - slack) & (array <= high + slack)).all():
+                raise RequestError(f"last_action of policy '{self._policy}': {name} is not in the action space")
+            found[name] = np.clip(array, low, high).astype(space.dtype).reshape(rows, *space.shape)
+        return found
+
+    def apply(
+        self, action: dict[str, NDArray[Any]], last: Mapping[str, NDArray[Any]]
+    ) -> tuple[dict[str, NDArray[Any]], list[str]]:
+        """Return (the action within its limits, a sentence for each leaf that was limited).
+
+        Raises ActionError where the options refuse instead.
+        """
+        notices: list[str] = []
+        limited = dict(action)
+        for name, steps in self._steps.items():
+            before = last[name].reshape(action[name].shape)
+            step = action[name].astype(np.float64) - before
+            beyond = np.abs(step) > steps * (1 + ROUNDING)
+            if not beyond.any():
+                continue
+            index = tuple(int(i) for i in np.argwhere(beyond)[0])
+            space = self._leaves[name]
+            flat = int(np.ravel_multi_index(index[1:], space.shape)) if space.shape else 0
+            label = dict(iter_elements(space))[flat] if space.shape else "0"
+            of = "" if name == "action" else f" of {name}"
+            sentence = (
+                f"element {label}{of} of the action would step by {step[index]:.6g}, at most "
+                f"{np.broadcast_to(steps, space.shape)[index[1:]]:g} is allowed"
+            )
+            if self._refuses:
+                raise ActionError(f"policy '{self._policy}': {sentence}", {"policy": self._policy})
+            notices.append(f"{sentence}: limited")
+            limited[name] = (before + np.clip(step, -steps, steps)).astype(action[name].dtype)
+        return limited, notices
+
+    def _read(self, name: str, steps: Any) -> NDArray[np.float64]:
+        space = self._leaves.get(name)
+        if space is None:
+            raise UsageError(
+                f"max_action_step of policy '{self._policy}' names {name!r}: its action has {', '.join(self._leaves)}"
+            )
+        if not isinstance(space, BoxSpec) or np.dtype(space.dtype).kind != "f":
+            raise UsageError(f"max_action_step of policy '{self._policy}': {name} is a choice, which has no step size")
+        values = [np.inf if one is None else one for one in steps] if isinstance(steps, tuple) else [steps] * space.size
+        if len(values) != space.size:
+            raise UsageError(
+                f"max_action_step of policy '{self._policy}' has {len(values)} numbers for {space.size} elements"
+            )
+        return np.array(values, np.float64).reshape(space.shape)

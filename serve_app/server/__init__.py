@@ -1,0 +1,1 @@
+"""Request handling that all protocols share: admission, keys, settings, logs, metrics."""

@@ -1,0 +1,67 @@
+"""The key by which `rlservo serve` lets its operator administer it: a file for this user alone, gone with the server.
+
+The file's place follows from the port, so that `rlservo policy` on the same machine finds it by itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.server.api_keys import new_key
+
+LONGEST_KEY_FILE = 4096  # [bytes] far more than a key
+
+
+def key_file(port: int) -> Path:
+    """Return where the key of a server on this port is kept: below XDG_RUNTIME_DIR, else in the user's cache."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    folder = Path(runtime) if runtime else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return folder / "rlservo" / f"admin-{port}.key"
+
+
+@contextlib.contextmanager
+def operator_key(file: Path) -> Iterator[str]:
+    """Write a new key to `file`, for this user alone, and remove it in the end; gives its `sha256:<hash>`.
+
+    Raises OSError when the file cannot be written.
+    """
+    key, _ = new_key("operator", admin=True)
+    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    file.unlink(missing_ok=True)  # of a server that was killed
+    # Made anew and for us alone: whoever put a file or a link there before does not get to read it.
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+    try:
+        with os.fdopen(descriptor, "w") as stream:
+            stream.write(key + "\n")
+        yield digest_of(key)
+    finally:
+        remove_key(file, digest_of(key))
+
+
+def digest_of(key: str) -> str:
+    """Return `sha256:<hash>` of a key."""
+    return f"sha256:{hashlib.sha256(key.encode()).hexdigest()}"
+
+
+def remove_key(file: Path, digest: str) -> None:
+    """Remove the key file of the server whose key has this digest; one of a server that came after it stays."""
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        if digest_of(file.read_text(encoding="ascii").strip()) == digest:
+            file.unlink()
+
+
+def read_key(file: Path) -> str:
+    """Return the key in a file. Raises UsageError."""
+    try:
+        with file.open(encoding="ascii") as stream:
+            key = stream.read(LONGEST_KEY_FILE).strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"the key file {file} cannot be read: {error}") from None
+    if not key or len(key.split()) != 1:
+        raise UsageError(f"the key file {file} should hold one key and nothing else")
+    return key

@@ -1,0 +1,114 @@
+"""The API keys as their file has them now: read again while the server runs, on every replica by itself.
+
+The file is read twice a second in a thread of its own: a stat or read of a file system that hangs must not stop those
+who act. Its whole content is compared, so it does not matter how it was changed: written in place, renamed over,
+or behind the symbolic links that Kubernetes swaps. What would refuse the start changes nothing, and is said once.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import weakref
+from pathlib import Path
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.server.api_keys import Key, Keys, read_key_file
+from rlservo.serve_app.server.settings import ServerSettings
+
+logger = logging.getLogger(__name__)
+
+PERIOD_S = 0.5  # [s] between looks; what two in a row saw is used, as one alone may see half of what is being written
+STALE_S = 10.0  # [s] without an answer of the file system until the keys count as not current
+
+
+class CurrentKeys:
+    """`Keys` that follow their file for as long as somebody holds this object."""
+
+    def __init__(self, settings: ServerSettings) -> None:
+        """Read what the settings name, as `Keys.from_settings`. Raises UsageError."""
+        self._settings = settings
+        file = settings.api_keys_file
+        content = None if file is None else read_key_file(Path(file))
+        self._keys = Keys.from_settings(settings, file_content=content)
+        self._seen: bytes | str | None = content
+        self._used: bytes | str | None = content
+        self._refused = ""
+        self._looked_at = time.monotonic()
+        self.changes = 0
+        """Counts the changes, so that whoever has checked a key before can see whether to check it again."""
+        if file is not None:
+            watcher = threading.Thread(target=_watch, args=(weakref.ref(self),), name="key-file", daemon=True)
+            watcher.start()
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """The keys that are accepted now."""
+        return self._keys.keys
+
+    @property
+    def operator(self) -> Key | None:
+        """The operator's key, which is in no file."""
+        return self._keys.operator
+
+    @property
+    def current(self) -> bool:
+        """Whether these are the file's keys, and not older ones because the file cannot be used or read."""
+        if self._settings.api_keys_file is None:
+            return True
+        return not self._refused and time.monotonic() - self._looked_at < STALE_S
+
+    def find(self, presented: bytes) -> Key | None:
+        """Return the key that was presented."""
+        return self._keys.find(presented)
+
+    def refresh(self) -> None:
+        """Look at the file; use what it holds when this is the second look in a row to see the same."""
+        assert self._settings.api_keys_file is not None
+        seen, before = _look(Path(self._settings.api_keys_file)), self._seen
+        self._seen, self._looked_at = seen, time.monotonic()
+        if seen != before or seen == self._used:
+            return
+        self._used = seen
+        try:
+            if isinstance(seen, str):
+                raise UsageError(seen)
+            keys = Keys.from_settings(self._settings, file_content=seen)
+        except UsageError as error:
+            self._refused = error.message
+            logger.error("the API keys stay as they were: %s", error.message)
+            return
+        if self._refused or keys != self._keys:
+            logger.warning("the API keys were read again: %s", _difference(self._keys, keys))
+        self._refused = ""
+        if keys != self._keys:
+            self._keys = keys
+            self.changes += 1
+
+
+def _look(file: Path) -> bytes | str:
+    """Return the file's content, or why it cannot be used."""
+    try:
+        return read_key_file(file)
+    except UsageError as error:
+        return error.message
+
+
+def _watch(reference: weakref.ref[CurrentKeys]) -> None:
+    while True:
+        time.sleep(PERIOD_S)
+        keys = reference()
+        if keys is None:
+            return
+        try:
+            keys.refresh()
+        except Exception:
+            logger.exception("the API keys' file could not be looked at; the keys stay as they were")
+        del keys
+
+
+def _difference(before: Keys, after: Keys) -> str:
+    added = [f"'{key.label}' added" for key in after.keys if key not in before.keys]
+    removed = [f"'{key.label}' removed" for key in before.keys if key not in after.keys]
+    return ", ".join(added + removed) or "they are as they were"

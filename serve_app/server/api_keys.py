@@ -1,0 +1,221 @@
+"""Who may ask: API keys, kept as hashes, and the check of each request against them.
+
+A key is 256 random bits, so its plain SHA-256 is all that needs keeping: there is no dictionary to try. A line of the
+key file, or an entry of RLSERVO_API_KEYS (separated by commas), is
+
+    <label> <act|admin> sha256:<64 hexadecimal digits>
+
+`rlservo key LABEL` makes a key and its line. It knows nothing of HTTP or of policies.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import ipaddress
+import os
+import re
+import secrets
+import stat
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from typing_extensions import Self
+
+from rlservo.export.contract.errors import ForbiddenError, UnauthenticatedError, UsageError
+from rlservo.export.contract.regular_files import NotReadableError, blocks, open_regular
+from rlservo.serve_app.server.settings import ServerSettings
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.server.api_key_file import CurrentKeys
+
+LINE = re.compile(r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|admin)\s+sha256:(?P<digest>[0-9a-f]{64})")
+KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets can tell what they found
+KEY_BYTES = 32
+LONGEST_FILE = 1 << 20  # [bytes] of the key file: some ten thousand keys
+SCHEMES = (b"bearer", b"api-key")  # the second is what openpi's clients say
+ACCESS = "access"  # the attribute of a route, or of its endpoint, that says who may use it
+
+Endpoint = TypeVar("Endpoint")
+
+
+class Role(str, Enum):
+    """What a key is for; an admin key may also do all that an act key may."""
+
+    act = "act"
+    admin = "admin"
+
+
+class Access(Enum):
+    """Who may use a route or a method; `grant` and the route classes write it down where a route is made."""
+
+    open = "open"
+    """Everybody, without a key: what orchestrators probe, and the documentation, which tells nothing of policies."""
+
+    act = "act"
+    """Whoever has a key; where the server has none, everybody."""
+
+    admin = "admin"
+    """Whoever has an admin key, or the operator's; where the server has none, nobody."""
+
+
+def grant(access: Access) -> Callable[[Endpoint], Endpoint]:
+    """Write down who may use a route, on its endpoint."""
+
+    def mark(endpoint: Endpoint) -> Endpoint:
+        setattr(endpoint, ACCESS, access)
+        return endpoint
+
+    return mark
+
+
+def access_of(route: Any) -> Access:
+    """Return who may use a route; where nobody has said so, administrators alone."""
+    for part in (route, getattr(route, "endpoint", None)):
+        found = getattr(part, ACCESS, None)
+        if isinstance(found, Access):
+            return found
+    return Access.admin
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key as it is kept: not the key itself."""
+
+    label: str
+    role: Role
+    digest: bytes
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The keys a server accepts; none at all means that it asks for none."""
+
+    keys: tuple[Key, ...] = ()
+    operator: Key | None = None
+    """For administration; a server with this one alone still asks nobody for a key who only wants actions."""
+
+    @classmethod
+    def from_settings(cls, settings: ServerSettings, *, file_content: bytes | None = None) -> Self:
+        """Read the file (unless its content is given) and the entries that the settings name. Raises UsageError."""
+        lines: list[tuple[str, str]] = []
+        if settings.api_keys_file is not None:
+            file = Path(settings.api_keys_file)
+            lines += _lines(file, read_key_file(file) if file_content is None else file_content)
+        entries = [entry.strip() for entry in settings.api_keys.split(",")]
+        lines += [(f"entry {n} of RLSERVO_API_KEYS", entry) for n, entry in enumerate(entries, start=1) if entry]
+        keys = []
+        for where, line in lines:
+            match = LINE.fullmatch(line)
+            if match is None:  # the line is not shown: it may be a key by mistake
+                raise UsageError(
+                    f"{where}: expected '<label> <act|admin> sha256:<64 hexadecimal digits>', as "
+                    "'rlservo key LABEL' makes it"
+                )
+            keys.append(Key(match["label"], Role(match["role"]), bytes.fromhex(match["digest"])))
+        if (settings.api_keys_file is not None or settings.api_keys.strip()) and not keys:
+            raise UsageError(
+                "the key settings name no key, and would leave the server open: add one, or leave them out"
+            )
+        digest = settings.operator_key.removeprefix("sha256:")
+        return cls(tuple(keys), Key("operator", Role.admin, bytes.fromhex(digest)) if digest else None)
+
+    def find(self, presented: bytes) -> Key | None:
+        """Return the key that was presented. Every kept digest is compared, each in constant time."""
+        digest = hashlib.sha256(presented).digest()
+        found = None
+        for key in self.keys if self.operator is None else (*self.keys, self.operator):
+            if hmac.compare_digest(digest, key.digest):
+                found = key
+        return found
+
+
+class Guard:
+    """Decides by a request's key whether it may use what its route, or its method, grants."""
+
+    def __init__(self, keys: Keys | CurrentKeys) -> None:
+        self._keys = keys
+
+    @property
+    def asks_for_keys(self) -> bool:
+        """Whether whoever wants actions needs a key."""
+        return bool(self._keys.keys)
+
+    def check(self, presented: bytes | None, access: Access) -> Key | None:
+        """Return the key that opens this, None where it needs none. Raises UnauthenticatedError or ForbiddenError."""
+        if access is Access.open:
+            return None
+        admin = access is not Access.act
+        if not self._keys.keys and not (admin and self._keys.operator):
+            if admin:
+                raise ForbiddenError(
+                    "administration needs an admin key, and this server has none: see 'rlservo key --help'"
+                )
+            return None
+        if presented is None:
+            what = "administration needs an admin" if admin else "this server wants an API"
+            raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
+        key = self._keys.find(presented)
+        if key is None:
+            raise UnauthenticatedError("this API key is not known to the server")
+        if admin and key.role is not Role.admin:
+            raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key")
+        return key
+
+
+def new_key(label: str, *, admin: bool = False) -> tuple[str, str]:
+    """Return (the key, for the client alone; its line, for the server). Raises UsageError."""
+    key = KEY_PREFIX + secrets.token_urlsafe(KEY_BYTES)
+    line = f"{label} {'admin' if admin else 'act'} sha256:{hashlib.sha256(key.encode()).hexdigest()}"
+    if LINE.fullmatch(line) is None:
+        raise UsageError(f"label {label[:80]!r}: expected 1 to 64 letters, digits, '.', '_' and '-'")
+    return key, line
+
+
+def check_exposure(host: str, settings: ServerSettings) -> Keys:
+    """Return the keys; raise UsageError where others than this machine could ask for actions without one."""
+    keys = Keys.from_settings(settings)
+    if not keys.keys and not settings.allow_unauthenticated and not is_loopback(host):
+        raise UsageError(
+            f"listening on {host} without API keys would let whoever reaches this port ask for actions: make a key "
+            "with 'rlservo key LABEL' and name its file in RLSERVO_API_KEYS_FILE, listen on 127.0.0.1, or say "
+            "RLSERVO_ALLOW_UNAUTHENTICATED=1"
+        )
+    return keys
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a server that listens on `host`."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:  # a name: wherever it points
+        return False
+
+
+def read_key_file(file: Path) -> bytes:
+    """Return the file's content. Raises UsageError where it cannot be read or anybody could have written it."""
+    try:
+        with open_regular(file, LONGEST_FILE) as stream:
+            mode = os.fstat(stream.fileno()).st_mode
+            content = b"".join(blocks(stream, LONGEST_FILE))
+    except NotReadableError as error:
+        raise UsageError(f"the key file {file} {error}") from None
+    except OSError as error:
+        raise UsageError(f"the key file {file} cannot be read: {error.strerror}") from None
+    if mode & stat.S_IWOTH:
+        raise UsageError(f"the key file {file} can be written by every user of this machine: chmod o-w {file}")
+    return content
+
+
+def _lines(file: Path, content: bytes) -> list[tuple[str, str]]:
+    try:
+        lines = content.decode("utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise UsageError(f"the key file {file} cannot be read: {error}") from None
+    stripped = ((number, line.strip()) for number, line in enumerate(lines, start=1))
+    return [(f"{file}, line {number}", line) for number, line in stripped if line and not line.startswith("#")]

@@ -1,0 +1,146 @@
+"""A line of JSON per event, with the request's id, and without what the robot saw.
+
+Requests that fail are always written, with their code; `log_requests` adds those that succeed, `log_values` the
+sentences of errors, which name values of observations. It knows logging; nothing of HTTP or of policies.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import time
+from typing import Any
+
+from rlservo.serve_app.server.settings import ServerSettings
+
+LOGGER = "rlservo"
+FIELDS = "fields"  # where a record carries its fields
+LONGEST_ID = 128
+
+_requests = logging.getLogger(f"{LOGGER}.requests")
+_administration = logging.getLogger(f"{LOGGER}.administration")
+
+
+class JsonFormatter(logging.Formatter):
+    """Writes a record as one JSON object on one line."""
+
+    def __init__(self, replica: str = "") -> None:
+        super().__init__()
+        self._replica = replica
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
+        line: dict[str, Any] = {
+            "time": f"{seconds}.{int(record.msecs):03d}Z",
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if self._replica:
+            line["replica"] = self._replica
+        line.update(getattr(record, FIELDS, {}))
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+def configure(settings: ServerSettings, *, replica: str = "") -> None:
+    """Send this process's log, in JSON, to the settings' file or to standard error."""
+    handler: logging.Handler
+    handler = logging.StreamHandler(sys.stderr) if settings.log_file is None else logging.FileHandler(settings.log_file)
+    handler.setFormatter(JsonFormatter(replica))
+    logger = logging.getLogger(LOGGER)
+    for previous in list(logger.handlers):
+        logger.removeHandler(previous)
+        previous.close()
+    logger.addHandler(handler)
+    logger.setLevel(settings.log_level.upper())
+    logger.propagate = False
+
+
+class RequestLog:
+    """Writes what became of requests."""
+
+    def __init__(self, settings: ServerSettings) -> None:
+        self.every = settings.log_requests
+        self._values = settings.log_values
+
+    def answered(
+        self,
+        protocol: str,
+        policy: str,
+        version: str,
+        seconds: float,
+        *,
+        batch: int,
+        request_id: str | None,
+        seq: int | None = None,
+    ) -> None:
+        """Write a request that got its action; ask `every` before. `seq` is its number on a stream."""
+        fields: dict[str, Any] = {
+            "request_id": _short(request_id),
+            "protocol": protocol,
+            "policy": policy,
+            "version": version,
+            "code": "ok",
+            "ms": round(seconds * 1e3, 3),
+            "batch": batch,
+        }
+        if seq is not None:
+            fields["seq"] = seq
+        _requests.info("answered", extra={FIELDS: fields})
+
+    def failed(
+        self,
+        protocol: str,
+        policy: str,
+        version: str | None,
+        code: str,
+        sentence: str,
+        *,
+        request_id: str | None,
+        seconds: float | None = None,
+        seq: Any = None,
+        peer: str | None = None,
+    ) -> None:
+        """Write a request that got none; `seq` is its client's number on a stream, `peer` its client's address."""
+        if not _requests.isEnabledFor(logging.INFO):
+            return
+        fields: dict[str, Any] = {
+            "request_id": _short(request_id),
+            "protocol": protocol,
+            "policy": policy[:64],
+            "version": version and version[:32],
+            "code": code,
+        }
+        if seconds is not None:
+            fields["ms"] = round(seconds * 1e3, 3)
+        if type(seq) is int:
+            fields["seq"] = seq
+        if peer is not None:
+            fields["peer"] = peer
+        if self._values:
+            fields["error"] = sentence
+        _requests.info("refused", extra={FIELDS: fields})
+
+
+def administered(
+    change: str, code: str, *, key: str, peer: str | None, request_id: str | None, generation: int | None = None
+) -> None:
+    """Write a change of what is served, or one that was refused: whose key asked for it, from which address."""
+    fields: dict[str, Any] = {
+        "request_id": _short(request_id),
+        "change": change.strip(),
+        "code": code,
+        "key": key,
+        "peer": peer,
+    }
+    if generation is not None:
+        fields["generation"] = generation
+    _administration.info("changed" if code == "ok" else "refused", extra={FIELDS: fields})
+
+
+def _short(request_id: str | None) -> str | None:
+    return request_id and request_id[:LONGEST_ID]

@@ -1,0 +1,193 @@
+"""The server's settings: one class, one environment prefix, a sentence under each field.
+
+`RLSERVO_MAX_BODY_BYTES=1000000 rlservo serve ...` sets one. Nothing here is read at import.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from typing_extensions import Self
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.runtime.options import PolicyOptions
+
+if TYPE_CHECKING:
+    from rlservo.export.contract.bundle import BundleLimits
+
+PREFIX = "RLSERVO_"
+
+
+class ServerSettings(BaseModel):
+    """What may be set about a policy server."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    threads: int = Field(1, ge=1, le=256)
+    """onnxruntime threads per session; one is fastest for networks of kilobytes and keeps concurrent requests apart."""
+
+    max_body_bytes: int = Field(4 << 20, ge=1024)
+    """A larger request body is refused with 413 before it is read to the end."""
+
+    max_batch: int = Field(4096, ge=1)
+    """More observations in one request are refused with 413: the event loop computes a batch in one go."""
+
+    body_timeout_s: float = Field(2.0, gt=0, allow_inf_nan=False)
+    """[s] A client that takes longer to send its body is answered 408. HAProxy passes on what fits its buffer of 16 KB,
+    head included, only when it is complete, and gives it 5 s."""
+
+    max_ongoing_requests: int = Field(128, ge=1)
+    """Requests that may wait for one replica's processor at once; further ones are answered 503 immediately."""
+
+    max_queue_ms: float = Field(1000.0, gt=0, allow_inf_nan=False)
+    """[ms] Requests that have waited longer in a replica are answered 503 instead of being computed."""
+
+    max_incoming: int = Field(512, ge=1)
+    """Requests whose body may be half sent at once, per replica; those that come complete do not count."""
+
+    max_streams: int = Field(256, ge=1)
+    """Streams (WebSocket, gRPC) that may be open at once, per replica."""
+
+    max_connections_per_address: int = Field(1024, ge=0)
+    """Connections that one client address may have to HAProxy; further ones are answered 429, many more are closed at
+    once. Ray's HAProxy takes 4096 altogether. 0: no bound, for a server that has another proxy before it."""
+
+    stream_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
+    """[s] A stream (WebSocket, gRPC) whose client says nothing for so long is closed."""
+
+    api_keys_file: str | None = None
+    """File of the API keys' hashes, a line each: `<label> <act|admin> sha256:<hash>`; `rlservo key` makes them."""
+
+    api_keys: str = Field("", repr=False)
+    """The same lines, separated by commas, for where a variable is easier to set than a file."""
+
+    operator_key: str = Field("", repr=False, pattern=r"^(sha256:[0-9a-f]{64})?$")
+    """`sha256:<hash>` of a key for administration alone; unlike `api_keys` it asks nobody else for a key."""
+
+    allow_unauthenticated: bool = False
+    """Listen beyond this machine without any key: whoever reaches the port can ask for actions."""
+
+    allowed_hosts: str = ""
+    """Names, separated by commas, by which requests may call this server beside `localhost`, the address listened on
+    and, beyond this machine, every address and the machine's own name; `*` is any. A server beyond this machine with
+    API keys takes any name unless some are given here: a web page whose name leads to it has no key."""
+
+    default_policy: str | None = None
+    """The policy of a WebSocket at `/`, where openpi's clients connect; the only one, where there is one.
+    `rlservo serve --default-policy` sets it, too."""
+
+    log_file: str | None = None
+    """Append the log to this file; without one it goes to standard error, which Ray keeps in its session folder."""
+
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """The least that is logged; at `info`, every request that got no action."""
+
+    log_requests: bool = False
+    """Log also every request that got its action: a line costs about as much as the policy."""
+
+    log_values: bool = False
+    """Log the sentences of errors, which may name values of observations."""
+
+    max_sessions: int = Field(1024, ge=1)
+    """Episodes one replica remembers at once, in sessions and on streams (a batch is so many); a further one is
+    answered 503."""
+
+    session_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
+    """[s] A session that nobody asks anything for so long is forgotten; a stream's lives as long as the stream."""
+
+    policy_options: dict[str, PolicyOptions] = {}
+    """How strict each policy is at its edges, by policy name; '*' is for the others. As a variable: a JSON object."""
+
+    ahead_of_serve: bool = True
+    """Answer requests for actions, and streams, before Ray Serve's own handling, which takes as long as the rest of a
+    replica does. Off, Serve counts them in its own metrics and holds them to its `request_timeout_s`; where its tracing
+    is on, it handles them in any case."""
+
+    max_policy_bytes: int = Field(512 << 20, ge=1024)
+    """A larger policy.onnx (or policy.ts) is refused before it is read. Loading takes about twice its size."""
+
+    max_golden_bytes: int = Field(512 << 20, ge=1024)
+    """A larger golden.npz, packed or unpacked, is refused before it is read."""
+
+    max_contract_bytes: int = Field(16 << 20, ge=1024)
+    """A larger contract.json is refused before it is read."""
+
+    scan_timeout_s: float = Field(10.0, gt=0, allow_inf_nan=False)
+    """[s] A look through the policies' folders that takes longer is given up: a file system may hang."""
+
+    load_timeout_s: float = Field(30.0, gt=0, allow_inf_nan=False)
+    """[s] Loading and proving one version that takes longer is given up. Below 45, within which every replica has to
+    follow a change."""
+
+    docs: bool = True
+    """Serve the interactive API documentation at /docs, from files that come with the server."""
+
+    @property
+    def bundle_limits(self) -> BundleLimits:
+        """How large a bundle's files may be."""
+        from rlservo.export.contract.bundle import (
+            BundleLimits,  # which imports numpy: `rlservo key` reads the settings, too
+        )
+
+        return BundleLimits(
+            max_policy_bytes=self.max_policy_bytes,
+            max_golden_bytes=self.max_golden_bytes,
+            max_contract_bytes=self.max_contract_bytes,
+        )
+
+    @field_validator("api_keys_file", "log_file")
+    @classmethod
+    def _absolute(cls, value: str | None) -> str | None:
+        """A replica's working directory is not the caller's."""
+        return None if value is None else str(Path(value).expanduser().absolute())
+
+    @field_validator("allowed_hosts")
+    @classmethod
+    def _names(cls, value: str) -> str:
+        for name in value.split(","):
+            if re.fullmatch(r"\s*(\*|\[?[A-Za-z0-9._:-]+\]?)?\s*", name) is None:
+                raise ValueError(f"expected names without scheme or path, such as robot-7.local, got {name[:80]!r}")
+        return value
+
+    @field_validator("policy_options", mode="before")
+    @classmethod
+    def _parse(cls, value: Any) -> Any:
+        return json.loads(value) if isinstance(value, str) else value
+
+    @classmethod
+    def from_environment(
+        cls, given: Mapping[str, Any] | None = None, *, environment: Mapping[str, str] | None = None
+    ) -> Self:
+        """Return settings from `given`, then `RLSERVO_*` of the environment, then the defaults.
+
+        Variables of other parts of rlservo share the prefix and are not this class's to judge. Raises UsageError.
+        """
+        given = given or {}
+        environment = os.environ if environment is None else environment
+        values: dict[str, Any] = {
+            name: environment[PREFIX + name.upper()]
+            for name in cls.model_fields
+            if PREFIX + name.upper() in environment
+        }
+        values.update(given)
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            name = str(first["loc"][0]) if first["loc"] else "settings"
+            source = PREFIX + name.upper() if name in values and name not in given else f"the setting '{name}'"
+            path = ".".join(map(str, first["loc"][1:]))
+            inside = f" at '{path}'" if path else ""
+            known = ", ".join(PolicyOptions.model_fields if inside else cls.model_fields)
+            hint = f"; known: {known}" if first["type"] == "extra_forbidden" else ""
+            field = cls.model_fields.get(name)
+            given_text = "" if field is not None and not field.repr else f" (given: {first['input']!r:.80})"
+            raise UsageError(
+                f"{source} is not usable{inside}: {first['msg']}{given_text}{hint}"
+            ) from None  # it may be a key

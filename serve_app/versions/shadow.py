@@ -1,0 +1,126 @@
+"""A candidate computes along: after the reply, in a thread of its own, and only the difference is kept.
+
+Nothing waits for it: what comes while too much is waiting is left out and counted. Exploring actions are not compared,
+since they differ by chance. The difference is the largest of |candidate - default| over an action's elements, in the
+action's own units; for discrete actions it is 0 or the distance of their numbers. It knows nothing of HTTP.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from prometheus_client.core import CounterMetricFamily, HistogramMetricFamily
+from prometheus_client.metrics_core import Metric
+
+from rlservo.export.contract.errors import RlservoError
+from rlservo.serve_app.versions.policy_store import Decision, Shadow
+
+logger = logging.getLogger(__name__)
+
+WAITING = 64  # requests at most, so that a slow candidate costs neither memory nor the default version's time
+BOUNDS = (1e-6, 1e-5, 1e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+
+
+class _Series:
+    """What is known of one candidate beside one default version."""
+
+    def __init__(self) -> None:
+        self.counts = np.zeros(len(BOUNDS) + 1, np.int64)
+        self.total = 0.0
+        self.largest = 0.0
+        self.failed = 0
+        self.left_out = 0
+
+
+class Shadows:
+    """Compares the candidates' actions with those that were sent."""
+
+    def __init__(self) -> None:
+        self._waiting: queue.Queue[tuple[Shadow, Any, Decision]] = queue.Queue(WAITING)
+        self._thread: threading.Thread | None = None
+        self._series: dict[tuple[str, str, str], _Series] = {}
+
+    def offer(self, shadow: Shadow, obs: Any, decision: Decision) -> None:
+        """Have the candidate compute on `obs` some time later. Never waits.
+
+        One that remembers its episode is left out: it would need a memory of its own beside every caller's.
+        """
+        if shadow.policy.episodic:
+            self._of(shadow, decision).left_out += 1
+            return
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="shadow", daemon=True)
+            self._thread.start()
+        try:
+            self._waiting.put_nowait((shadow, obs, decision))
+        except queue.Full:
+            self._of(shadow, decision).left_out += 1
+
+    def describe(self, policy: str, version: str, shadow: str) -> dict[str, Any]:
+        """Return how the candidate compares so far, on this replica."""
+        series = self._series.get((policy, version, shadow)) or _Series()
+        compared = int(series.counts.sum())
+        return {
+            "version": shadow,
+            "compared": compared,
+            "mean_difference": series.total / compared if compared else None,
+            "largest_difference": series.largest if compared else None,
+            "failed": series.failed,
+            "left_out": series.left_out,
+        }
+
+    def families(self, replica: str) -> Iterator[Metric]:
+        """Yield the metrics as they are now."""
+        names = ["replica", "policy", "version", "shadow"]
+        difference = HistogramMetricFamily(
+            "rlservo_shadow_difference",
+            "Largest difference between a shadow's action and the one sent, over the elements, in their own units",
+            labels=names,
+        )
+        missed = CounterMetricFamily(
+            "rlservo_shadow_missed", "Actions without a comparison, by reason", labels=[*names, "reason"]
+        )
+        for key, series in list(self._series.items()):
+            labels = [replica, *key]
+            cumulative = zip([*map(repr, BOUNDS), "+Inf"], series.counts.cumsum().astype(float), strict=True)
+            difference.add_metric(labels, list(cumulative), series.total)
+            missed.add_metric([*labels, "failed"], series.failed)
+            missed.add_metric([*labels, "left-out"], series.left_out)
+        yield difference
+        yield missed
+
+    def _run(self) -> None:
+        while True:
+            shadow, obs, decision = self._waiting.get()
+            series = self._of(shadow, decision)
+            try:
+                differences = _differences(shadow.policy.act(obs), decision.action, batch=decision.batch)
+            except RlservoError:  # its action left the space, say: that is what a shadow is run for
+                series.failed += 1
+                continue
+            except Exception:  # this thread serves every shadow, and has to outlive one that is broken
+                logger.exception("shadow %s of policy '%s' failed", shadow.version, decision.name)
+                series.failed += 1
+                continue
+            np.add.at(series.counts, np.searchsorted(BOUNDS, differences), 1)
+            series.total += float(differences.sum())
+            series.largest = max(series.largest, float(differences.max(initial=0.0)))
+
+    def _of(self, shadow: Shadow, decision: Decision) -> _Series:
+        return self._series.setdefault((decision.name, decision.version, shadow.version), _Series())
+
+
+def _differences(ours: Any, theirs: Any, *, batch: int | None) -> NDArray[np.float64]:
+    """Return the largest difference of each observation's action; nested actions part by part."""
+    if isinstance(ours, Mapping):
+        return np.max([_differences(ours[key], theirs[key], batch=batch) for key in ours], axis=0)  # type: ignore[no-any-return]
+    if isinstance(ours, tuple):
+        return np.max([_differences(a, b, batch=batch) for a, b in zip(ours, theirs, strict=True)], axis=0)  # type: ignore[no-any-return]
+    difference = np.abs(np.asarray(ours, np.float64) - np.asarray(theirs, np.float64))
+    return difference.reshape(1 if batch is None else batch, -1).max(axis=1)  # type: ignore[no-any-return]

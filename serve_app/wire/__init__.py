@@ -1,0 +1,1 @@
+"""Formats and names that client and server must agree on."""

@@ -1,0 +1,86 @@
+"""msgpack with numpy arrays, as openpi's clients and servers exchange them. Nothing here can run code.
+
+An array is `{b"__ndarray__": True, b"data": bytes, b"dtype": dtype.str, b"shape": shape}`, a numpy scalar
+`{b"__npgeneric__": True, b"data": item, b"dtype": dtype.str}`; the marker keys are bytes, so that no name of an
+observation is taken for one. Source: github.com/Physical-Intelligence/openpi, packages/openpi-client.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import msgpack  # type: ignore[import-untyped]
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.errors import ObservationError, RequestError
+
+KINDS = ("b1", "u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f2", "f4", "f8")  # numbers; no objects, no records
+DTYPES = {order + kind: np.dtype(order + kind) for kind in KINDS for order in ("<", ">", "|", "=", "")}
+MAX_AXES = 32  # numpy itself stops at 64
+
+
+def pack(document: Mapping[str, Any]) -> bytes:
+    """Return the document as msgpack; arrays and numpy scalars of number types may be anywhere in it."""
+    packed: Any = msgpack.packb(document, default=_pack_array)
+    return bytes(packed)
+
+
+def unpack(content: bytes) -> Any:
+    """Return the document in `content`, with arrays in it as numpy's (not writable: they are the message's memory).
+
+    Raises RequestError when it is not msgpack, ObservationError when an array in it does not add up.
+    """
+    try:
+        return msgpack.unpackb(content, object_hook=_unpack_array, strict_map_key=True)
+    except (ValueError, TypeError, msgpack.exceptions.UnpackException, RecursionError) as error:
+        raise RequestError(f"the message is not msgpack: {str(error)[:200] or type(error).__name__}") from None
+
+
+def _pack_array(value: Any) -> dict[bytes, Any]:
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+        return {
+            b"__ndarray__": True,
+            b"data": value.tobytes(),
+            b"dtype": value.dtype.str,
+            b"shape": value.shape,
+        }
+    if isinstance(value, np.generic) and value.dtype.kind in "fiub":
+        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
+    raise TypeError(f"cannot send a {type(value).__name__}")
+
+
+def _unpack_array(document: dict[Any, Any]) -> Any:
+    if b"__ndarray__" in document:
+        return _array(document)
+    if b"__npgeneric__" in document:
+        value = document.get(b"data")
+        if not isinstance(value, bool | int | float):
+            raise ObservationError(f"a numpy scalar in the message holds a {type(value).__name__}, not a number")
+        return value
+    return document
+
+
+def _array(document: Mapping[Any, Any]) -> NDArray[Any]:
+    data: Any = document.get(b"data")
+    name: Any = document.get(b"dtype")
+    shape: Any = document.get(b"shape")
+    dtype = (
+        DTYPES.get(name.decode("latin-1") if isinstance(name, bytes) else name) if type(name) in (str, bytes) else None
+    )
+    if dtype is None:
+        raise ObservationError(f"an array in the message is of dtype {name!r:.32}: send numbers, such as '<f4'")
+    if type(shape) is not list or len(shape) > MAX_AXES or not all(type(n) is int and 0 <= n < 2**31 for n in shape):
+        raise ObservationError(f"an array in the message has the shape {shape!r:.64}: expected a list of sizes")
+    if type(data) is not bytes or len(data) != math.prod(shape) * dtype.itemsize:
+        got = f"{len(data)} bytes" if type(data) is bytes else f"a {type(data).__name__}"
+        raise ObservationError(
+            f"an array in the message of shape {shape} and dtype {name} needs "
+            f"{math.prod(shape) * dtype.itemsize} bytes, got {got}"
+        )
+    if dtype.kind == "b":  # any non-zero byte is true; numpy's own view of such a byte is undefined
+        return (np.frombuffer(data, np.uint8) != 0).reshape(shape)  # type: ignore[no-any-return]
+    array: NDArray[Any] = np.frombuffer(data, dtype).reshape(shape)
+    return array

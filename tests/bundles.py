@@ -1,0 +1,489 @@
+"""Small real bundles for the runtime and the server: an ONNX graph, TorchScript, golden vectors and hashes.
+
+They are written with `onnx.helper` and `rlservo.export.contract.bundle` alone, so that these tests need no exporter.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import secrets
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import uvicorn
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from rlservo.export.contract import bundle as bundle_files
+from rlservo.export.contract.bundle import (
+    BakedStep,
+    BoxSpec,
+    Contract,
+    DiscreteSpec,
+    Distribution,
+    Element,
+    FormatParity,
+    Parity,
+    Provenance,
+    StateSpec,
+    TensorSpec,
+)
+from rlservo.serve_app.ray_serve.launcher import serve_policies
+from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.server.api_keys import new_key
+from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.repository import Library, Repository
+
+OBS = 27
+HIDDEN = 256
+ACTIONS = 6
+UR5_ELEMENTS = tuple(Element(name=f"element_{i}", unit="rad") for i in range(OBS))
+PROVENANCE = Provenance(
+    algorithm="PPO",
+    api_stack="new",
+    module_id="default_policy",
+    module_class="DefaultPPOTorchRLModule",
+    checkpoint_sha256="0" * 64,
+    ray_version="2.60.0",
+    torch_version="2.13.0",
+    rlservo_version="0.1.0",
+    exported_at="2026-01-01T00:00:00Z",
+)
+PARITY = Parity(
+    reference="tests",
+    samples=8,
+    batch_sizes=(8,),
+    rtol=1e-5,
+    atol=1e-6,
+    formats={"onnx": FormatParity(max_abs=0, max_rel=0)},
+)
+
+
+def weights(rng: np.random.Generator, rows: int, columns: int) -> NDArray[np.float32]:
+    return (rng.standard_normal((rows, columns)) / np.sqrt(rows)).astype(np.float32)
+
+
+def save_graph(
+    file: Path,
+    nodes: list[onnx.NodeProto],
+    constants: dict[str, NDArray[Any]],
+    inputs: list[tuple[str, int, list[Any]]],
+    outputs: list[tuple[str, int, list[Any]]],
+) -> None:
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [helper.make_tensor_value_info(*tensor) for tensor in inputs],
+        [helper.make_tensor_value_info(*tensor) for tensor in outputs],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    onnx.checker.check_model(model)
+    onnx.save(model, file)
+
+
+def write_bundle(folder: Path, contract: Contract, obs: NDArray[Any], **more: NDArray[Any]) -> Path:
+    """Complete a folder that holds policy.onnx: TorchScript, golden vectors of `obs`, contract and hashes.
+
+    `more` are further inputs by name, a dot written as two underscores.
+    """
+    import torch
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # torch 2.13 prefers torch.export; bundles hold TorchScript
+        scripted = torch.jit.trace(torch.nn.Tanh(), torch.zeros(1, 2))  # never opened here, but its hash is checked
+        torch.jit.save(scripted, folder / bundle_files.TORCHSCRIPT_FILE)
+    session = onnxruntime.InferenceSession(folder / bundle_files.ONNX_FILE)
+    names = [tensor.name for tensor in contract.outputs]
+    inputs = {"obs": obs, **{name.replace("__", "."): array for name, array in more.items()}}
+    outputs = dict(zip(names, session.run(names, inputs), strict=True))
+    bundle_files.write_golden(folder, inputs, outputs)
+    bundle_files.write_contract(folder, contract)
+    return folder
+
+
+def write_box_policy(
+    root: Path,
+    *,
+    name: str = "ur5",
+    version: str = "1",
+    seed: int = 0,
+    action_scale: float = 1.0,
+    unbounded: bool = False,
+    named: bool = True,
+) -> Path:
+    """A 27 -> 6 Gaussian policy with a 2x256 tanh network, unsquashed to [-1, 1] x [-2, 2] ... and clipped.
+
+    `action_scale` above 1 leaves the clip out and lets actions walk out of the space.
+    """
+    rng = np.random.default_rng(seed)
+    folder = root / name / version
+    folder.mkdir(parents=True)
+    high = np.array([1, 1, 1, 2, 1, 1], np.float32)
+    constants = {
+        "w1": weights(rng, OBS, HIDDEN),
+        "w2": weights(rng, HIDDEN, HIDDEN),
+        "w3": weights(rng, HIDDEN, ACTIONS),
+        "b1": np.zeros(HIDDEN, np.float32),
+        "b2": np.zeros(HIDDEN, np.float32),
+        "b3": np.zeros(ACTIONS, np.float32),
+        "log_std": np.full((1, ACTIONS), -1.0, np.float32),
+        "low": -high,
+        "high": high,
+        "scale": high * np.float32(action_scale),
+        "batch_of": np.array([0], np.int64),
+        "six": np.array([ACTIONS], np.int64),
+    }
+    nodes = [
+        helper.make_node("Gemm", ["obs", "w1", "b1"], ["z1"]),
+        helper.make_node("Tanh", ["z1"], ["h1"]),
+        helper.make_node("Gemm", ["h1", "w2", "b2"], ["z2"]),
+        helper.make_node("Tanh", ["z2"], ["h2"]),
+        helper.make_node("Gemm", ["h2", "w3", "b3"], ["mean"]),
+        helper.make_node("Shape", ["obs"], ["shape"]),
+        helper.make_node("Gather", ["shape", "batch_of"], ["batch"]),
+        helper.make_node("Concat", ["batch", "six"], ["wide"], axis=0),
+        helper.make_node("Expand", ["log_std", "wide"], ["log_stds"]),
+        helper.make_node("Concat", ["mean", "log_stds"], ["action_dist_inputs"], axis=1),
+        helper.make_node("Mul", ["mean", "scale"], ["scaled"]),
+    ]
+    if action_scale > 1 or unbounded:
+        nodes.append(helper.make_node("Identity", ["scaled"], ["action"]))
+    else:
+        nodes.append(helper.make_node("Max", ["scaled", "low"], ["floored"]))
+        nodes.append(helper.make_node("Min", ["floored", "high"], ["action"]))
+    save_graph(
+        folder / bundle_files.ONNX_FILE,
+        nodes,
+        constants,
+        [("obs", TensorProto.FLOAT, ["batch", OBS])],
+        [("action", TensorProto.FLOAT, ["batch", ACTIONS]), ("action_dist_inputs", TensorProto.FLOAT, ["batch", 12])],
+    )
+    bounds = tuple(high.tolist())
+    contract = Contract(
+        name=name,
+        version=version,
+        observation_space=BoxSpec(
+            shape=(OBS,), dtype="float32", low=None, high=None, elements=UR5_ELEMENTS if named else ()
+        ),
+        action_space=BoxSpec(
+            shape=(ACTIONS,),
+            dtype="float32",
+            low=None if unbounded else tuple(-b for b in bounds),
+            high=None if unbounded else bounds,
+            elements=tuple(Element(name=f"joint_{i}", unit="rad") for i in range(ACTIONS)),
+        ),
+        inputs=(TensorSpec(name="obs", dtype="float32", shape=(-1, OBS)),),
+        outputs=(
+            TensorSpec(name="action", dtype="float32", shape=(-1, ACTIONS)),
+            TensorSpec(name="action_dist_inputs", dtype="float32", shape=(-1, 12)),
+        ),
+        distribution=Distribution(kind="diag_gaussian", transform="none" if unbounded else "unsquash"),
+        baked_in=(BakedStep(step="network"), BakedStep(step="clip")),
+        control_rate_hz=10.0,
+        provenance=PROVENANCE,
+        parity=PARITY,
+    )
+    # Small golden observations keep the actions of an unclipped policy inside its space.
+    obs = (rng.standard_normal((8, OBS)) * (0.05 if action_scale > 1 else 1.0)).astype(np.float32)
+    return write_bundle(folder, contract, obs)
+
+
+def write_discrete_policy(root: Path, *, name: str = "gridworld", version: str = "1", start: int = 0) -> Path:
+    """A Discrete(5) observation, one-hot, to a Discrete(3) action by argmax of a linear layer."""
+    rng = np.random.default_rng(1)
+    folder = root / name / version
+    folder.mkdir(parents=True)
+    constants = {
+        "depth": np.array(5, np.int64),
+        "zero_one": np.array([0, 1], np.float32),
+        "w": weights(rng, 5, 3),
+        "b": np.zeros(3, np.float32),
+        "start": np.array(start, np.int64),
+    }
+    nodes = [
+        helper.make_node("OneHot", ["obs", "depth", "zero_one"], ["hot"]),
+        helper.make_node("Gemm", ["hot", "w", "b"], ["action_dist_inputs"]),
+        helper.make_node("ArgMax", ["action_dist_inputs"], ["index"], axis=1, keepdims=0),
+        helper.make_node("Add", ["index", "start"], ["action"]),
+    ]
+    save_graph(
+        folder / bundle_files.ONNX_FILE,
+        nodes,
+        constants,
+        [("obs", TensorProto.INT64, ["batch"])],
+        [("action", TensorProto.INT64, ["batch"]), ("action_dist_inputs", TensorProto.FLOAT, ["batch", 3])],
+    )
+    contract = Contract(
+        name=name,
+        version=version,
+        observation_space=DiscreteSpec(n=5),
+        action_space=DiscreteSpec(n=3, start=start),
+        inputs=(TensorSpec(name="obs", dtype="int64", shape=(-1,)),),
+        outputs=(
+            TensorSpec(name="action", dtype="int64", shape=(-1,)),
+            TensorSpec(name="action_dist_inputs", dtype="float32", shape=(-1, 3)),
+        ),
+        distribution=Distribution(kind="categorical", transform="none"),
+        baked_in=(BakedStep(step="one_hot"), BakedStep(step="network")),
+        control_rate_hz=None,
+        provenance=PROVENANCE,
+        parity=PARITY,
+    )
+    return write_bundle(folder, contract, np.arange(5, dtype=np.int64))
+
+
+def write_leaky_policy(root: Path, *, name: str = "leaky", version: str = "1", seed: int = 0) -> Path:
+    """A policy with a memory, of three numbers: h becomes h / 2 + obs @ w, and h in [-1, 1] is the action of two."""
+    rng = np.random.default_rng(seed)
+    folder = root / name / version
+    folder.mkdir(parents=True)
+    nodes = [
+        helper.make_node("MatMul", ["obs", "w"], ["seen"]),
+        helper.make_node("Mul", ["state_in.h", "half"], ["left"]),
+        helper.make_node("Add", ["left", "seen"], ["state_out.h"]),
+        helper.make_node("Clip", ["state_out.h", "low", "high"], ["action"]),
+    ]
+    constants = {"w": weights(rng, 3, 2), "half": np.float32([0.5]), "low": np.float32(-1), "high": np.float32(1)}
+    save_graph(
+        folder / bundle_files.ONNX_FILE,
+        nodes,
+        {key: np.asarray(value) for key, value in constants.items()},
+        [("obs", TensorProto.FLOAT, ["batch", 3]), ("state_in.h", TensorProto.FLOAT, ["batch", 2])],
+        [("action", TensorProto.FLOAT, ["batch", 2]), ("state_out.h", TensorProto.FLOAT, ["batch", 2])],
+    )
+    contract = Contract(
+        name=name,
+        version=version,
+        observation_space=BoxSpec(shape=(3,), dtype="float32", low=None, high=None),
+        action_space=BoxSpec(shape=(2,), dtype="float32", low=-1.0, high=1.0),
+        inputs=(
+            TensorSpec(name="obs", dtype="float32", shape=(-1, 3)),
+            TensorSpec(name="state_in.h", dtype="float32", shape=(-1, 2)),
+        ),
+        outputs=(
+            TensorSpec(name="action", dtype="float32", shape=(-1, 2)),
+            TensorSpec(name="state_out.h", dtype="float32", shape=(-1, 2)),
+        ),
+        state=(StateSpec(name="h", dtype="float32", shape=(2,)),),
+        distribution=None,
+        baked_in=(BakedStep(step="network"), BakedStep(step="clip")),
+        control_rate_hz=10.0,
+        provenance=PROVENANCE,
+        parity=PARITY,
+    )
+    obs, state = (rng.standard_normal((8, size)).astype(np.float32) for size in (3, 2))
+    return write_bundle(folder, contract, obs, state_in__h=state)
+
+
+@pytest.fixture(scope="session")
+def leaky_policy() -> Callable[..., Path]:
+    """`write_leaky_policy`."""
+    return write_leaky_policy
+
+
+@pytest.fixture(scope="session")
+def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A repository: ur5 in versions 1, 2 and 10 (different weights), gridworld in version 1."""
+    root = tmp_path_factory.mktemp("policies")
+    for seed, version in enumerate(("1", "2", "10")):
+        write_box_policy(root, version=version, seed=seed)
+    write_discrete_policy(root)
+    return root
+
+
+@pytest.fixture(scope="session")
+def ur5(policies: Path) -> Path:
+    """The newest ur5 bundle."""
+    return policies / "ur5" / "10"
+
+
+@pytest.fixture
+def rewrite_contract() -> Callable[..., None]:
+    """Change fields of a bundle's contract and record the hashes anew: tampering that hashes cannot see."""
+
+    def rewrite(folder: Path, **changes: Any) -> None:
+        contract = bundle_files.read_contract(folder).model_copy(update=changes)
+        bundle_files.write_contract(folder, contract)
+
+    return rewrite
+
+
+@pytest.fixture(scope="session")
+def box_policy() -> Callable[..., Path]:
+    """`write_box_policy`: fixtures are how test modules reach this file."""
+    return write_box_policy
+
+
+@pytest.fixture(scope="session")
+def discrete_policy() -> Callable[..., Path]:
+    """`write_discrete_policy`."""
+    return write_discrete_policy
+
+
+RECURRENT = ("lstm_box", "lstm_previous", "act_nested")
+
+
+@pytest.fixture(scope="session")
+def recurrent(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A repository of three LSTM policies, trained for one iteration by RLlib and exported.
+
+    lstm_box: 3 numbers to a Box; lstm_previous: sees its last actions and rewards; act_nested: nested both ways.
+    """
+    from rlservo.export.commands.export import export_checkpoint
+
+    scripts = Path(__file__).resolve().with_name("zoo")
+    root = tmp_path_factory.mktemp("recurrent")
+    folder = Path(tempfile.mkdtemp(prefix="zoo-"))  # a short path: Ray's sockets live below it
+    environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
+    command = [sys.executable, "-W", "ignore", str(scripts / "train_wide_zoo.py"), str(folder), *RECURRENT]
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+        assert done.returncode == 0, done.stderr[-3000:]
+        for name in RECURRENT:
+            export_checkpoint(folder / name, root, name=name, app_dir=scripts / "app", notify=lambda line: None)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return root
+
+
+@contextlib.contextmanager
+def over_uvicorn(app: Any) -> Iterator[int]:
+    """Serve an ASGI application from a thread; gives the port."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", access_log=False, lifespan="on"))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            while not server.started:
+                time.sleep(0.01)
+            yield listener.getsockname()[1]
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+@pytest.fixture(scope="session")
+def served() -> Callable[[Any], AbstractContextManager[int]]:
+    """`over_uvicorn`."""
+    return over_uvicorn
+
+
+class MemoryLedger:
+    """The plans of one process, without Ray."""
+
+    def __init__(self) -> None:
+        self.plans: dict[int, bytes] = {}
+
+    def newest(self) -> int:
+        return max(self.plans, default=0)
+
+    def read(self, generation: int) -> bytes | None:
+        return self.plans.get(generation)
+
+    def append(self, generation: int, content: bytes) -> bool:
+        return self.plans.setdefault(generation, content) is content
+
+
+@pytest.fixture(scope="session")
+def controlled() -> Callable[..., AbstractContextManager[Control]]:
+    """Control over what is served of some folders, for an application that can be administered."""
+
+    @contextlib.contextmanager
+    def control_of(*folders: Path, config: Any = None) -> Iterator[Control]:
+        control = Control(Library(Repository(list(folders))), MemoryLedger(), replica="only")
+        try:
+            asyncio.run(control.configure({} if config is None else config))
+            yield control
+        finally:
+            control.close()
+
+    return control_of
+
+
+@dataclass(frozen=True)
+class LiveServer:
+    """A policy server on Ray Serve, with a key, gRPC and a log file."""
+
+    port: int
+    grpc_port: int
+    key: str
+    log: Path
+
+    @property
+    def bearer(self) -> str:
+        return f"Bearer {self.key}"
+
+
+@pytest.fixture(scope="session")
+def live_server(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
+    """Start `rlservo serve` once for all the tests that need nothing special of it."""
+    port, grpc_port = free_ports(2)
+    key, line = new_key("tests")
+    log = tmp_path_factory.mktemp("log") / "server.jsonl"
+    ready, stop = threading.Event(), threading.Event()
+    failures: list[Exception] = []
+
+    def serve() -> None:
+        try:
+            serve_policies(
+                [policies],
+                port=port,
+                grpc_port=grpc_port,
+                settings={"api_keys": line, "default_policy": "ur5", "log_file": str(log), "log_requests": True},
+                on_ready=lambda _: ready.set(),
+                stop=stop,
+            )
+        except Exception as error:
+            failures.append(error)
+            ready.set()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        assert ready.wait(120) and not failures, failures
+        yield LiveServer(port, grpc_port, key, log)
+    finally:
+        stop.set()
+        thread.join(60)
+    assert not thread.is_alive()
+
+
+@pytest.fixture(scope="session")
+def client_environment(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Install packages that cannot share our environment into one of their own; gives its Python, or skips."""
+    made: dict[tuple[str, ...], Path] = {}
+
+    def install(*packages: str) -> Path:
+        if packages not in made:
+            made[packages] = new(*packages)
+        return made[packages]
+
+    def new(*packages: str) -> Path:
+        folder = tmp_path_factory.mktemp("client")
+        commands = [[sys.executable, "-m", "venv", str(folder)]]
+        commands.append([str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", *packages])
+        for command in commands:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+            if done.returncode != 0:
+                pytest.skip(f"{', '.join(packages)} cannot be installed here: {done.stderr.strip()[-300:]}")
+        return folder / "bin" / "python"
+
+    return install

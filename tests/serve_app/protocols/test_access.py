@@ -1,0 +1,413 @@
+"""Who may use a route: every route, in every spelling of its path, as bytes on a socket, with too little of a key.
+
+A path that a check reads differently from the router is a way around the check, so no client that mends paths is used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rlservo.serve_app.protocols.json_act import PolicyApp, create_app
+from rlservo.serve_app.server.api_keys import ACCESS, Access, access_of, grant, new_key
+from rlservo.serve_app.server.request_log import FIELDS
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.replica_versions import Control
+
+Serve = Callable[[Any], AbstractContextManager[int]]
+Controlled = Callable[..., AbstractContextManager[Control]]
+
+# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
+pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+
+ROBOT, ROBOT_LINE = new_key("cell-7")
+ADMIN, ADMIN_LINE = new_key("boss", admin=True)
+WRONG, _ = new_key("nobody")
+BODY = b'{"obs": [0], "version": "1", "alias": "production"}'
+OBS = b'{"obs": [0]}'
+COMMANDS = ("load", "unload", "alias", "rollback", "canary", "shadow")
+ADMIN_PATHS = (
+    "/v1/admin/policies",
+    *(f"/v1/admin/policies/{{name}}/{command}" for command in COMMANDS),
+    "/v2/repository/models/{name}/load",
+    "/v2/repository/models/{name}/unload",
+)
+# What programs are known to drop, to decode twice, to take for a slash, or to end a line or a path at.
+INSERTED = (
+    *(b"%0a %0d %0d%0a %00 %09 %20 %7f %85 %c2%85 %e2%80%a8 %e2%80%a9 %c2%a0 %ef%bb%bf %ff".split()),
+    *(b"%2f %2F %252f %5c \\ / // /. /./ /.. /../ /x/.. %2e %2e%2e /%2e%2e/ /..;/".split()),
+    *(b";x ;x=1 ;/ . .. .json ~ * + @ :".split()),
+    *(b"? ?x ?%0a # #x %23 %3f %3b %250a %u000a %".split()),
+    *(b"\x01 \x7f \x80 \xc2\x85 \xe2\x80\xa8 \xff".split()),
+    b"\t",
+    b"\x0b",
+    b"\x00",
+)  # fmt: skip
+
+
+def spellings(path: str) -> Iterator[bytes]:
+    """Yield ways in which somebody might write a path."""
+    plain = path.encode()
+    yield plain
+    yield plain.upper()
+    yield plain.title()
+    yield b"http://127.0.0.1" + plain
+    yield b"http://evil.example" + plain
+    yield b"//evil.example" + plain
+    cuts = sorted({0, 1, len(plain), *(index for index in range(len(plain)) if plain[index : index + 1] == b"/")})
+    for inserted in INSERTED:
+        for cut in cuts:
+            yield plain[:cut] + inserted + plain[cut:]
+    for index in (1, len(plain) // 2, len(plain) - 1):  # one of its own characters, escaped
+        if index < len(plain):
+            yield plain[:index] + b"%%%02x" % plain[index] + plain[index + 1 :]
+    yield plain.replace(b"/", b"%2f")
+    yield plain[:1] + plain[1:].replace(b"/", b"\\")
+
+
+def plain_of(target: bytes) -> str:
+    """Return the path that a target means, where it is written as it should be."""
+    for absolute in (b"http://127.0.0.1", b"http://evil.example"):  # a browser writes so to proxies alone
+        target = target.removeprefix(absolute)
+    return target.partition(b"#")[0].partition(b"?")[0].decode("latin-1")
+
+
+class Wire:
+    """A connection that sends requests byte for byte, and another one when that is gone."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._socket: socket.socket | None = None
+
+    def ask(self, method: bytes, target: bytes, *headers: bytes, body: bytes = BODY) -> tuple[int, bytes]:
+        lines = [method + b" " + target + b" HTTP/1.1", b"host: 127.0.0.1", b"content-type: application/json", *headers]
+        content = b"\r\n".join([*lines, b"content-length: %d" % len(body), b"", body])
+        for _ in range(2):  # it may have been closed since the last answer
+            with contextlib.suppress(ConnectionError, http.client.BadStatusLine):
+                return self._exchange(method, content)
+            self.close()
+        return 0, b""  # closed without a word
+
+    def _exchange(self, method: bytes, content: bytes) -> tuple[int, bytes]:
+        if self._socket is None:
+            self._socket = socket.create_connection(("127.0.0.1", self._port), timeout=30)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.sendall(content)
+        reply = http.client.HTTPResponse(self._socket, method=method.decode())
+        reply.begin()
+        answer = reply.read()
+        if reply.will_close or reply.status == 101:
+            self.close()
+        return reply.status, answer
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def __enter__(self) -> Wire:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@dataclass(frozen=True)
+class Served:
+    app: PolicyApp
+    control: Control
+    port: int
+    kind: str
+
+    @property
+    def plan(self) -> Any:
+        return self.control.plan
+
+
+@pytest.fixture(params=["keys", "operator", "none"])
+def server(request: pytest.FixtureRequest, policies: Path, controlled: Controlled, served: Serve) -> Iterator[Served]:
+    """With keys of both kinds; with an operator's key alone; with none."""
+    settings = {
+        "keys": ServerSettings(api_keys=f"{ROBOT_LINE},{ADMIN_LINE}"),
+        "operator": ServerSettings(operator_key=ADMIN_LINE.split()[-1]),
+        "none": ServerSettings(),
+    }[request.param]
+    with controlled(policies) as control:
+        app = create_app(lambda: control.store, settings, control=control)
+        with served(app) as port:
+            yield Served(app, control, port, request.param)
+
+
+@pytest.fixture(scope="module")
+def app(policies: Path, controlled: Controlled) -> Iterator[PolicyApp]:
+    with controlled(policies) as control:
+        yield create_app(lambda: control.store, ServerSettings(), control=control)
+
+
+def paths(app: PolicyApp) -> list[tuple[str, str, Access]]:
+    """Return (method, path with real names, who may use it) of every route, streams and files included."""
+    found = []
+    for route in app.routes:
+        path = route.path.replace("{name}", "ur5").replace("{version}", "1")  # type: ignore[attr-defined]
+        if path == "/docs/files":
+            path += "/swagger-ui.css"
+        for method in sorted(getattr(route, "methods", None) or {"GET"}):
+            found.append((method, path, access_of(route)))
+    return found
+
+
+def test_every_route_says_who_may_use_it(app: PolicyApp) -> None:
+    for route in app.routes:
+        said = getattr(route, ACCESS, None) or getattr(getattr(route, "endpoint", None), ACCESS, None)
+        assert isinstance(said, Access), f"{route} does not say who may use it"
+    levels = {route.path: access_of(route) for route in app.routes}  # type: ignore[attr-defined]
+    assert {path for path, access in levels.items() if access is Access.admin} == set(ADMIN_PATHS)
+    assert {path for path, access in levels.items() if access is Access.open} == {
+        "/healthz", "/v2/health/live", "/v2/health/ready", "/docs", "/docs/files", "/openapi.json",
+    }  # fmt: skip
+    document = app.openapi()["paths"]
+    assert set(document) <= set(levels)
+
+
+def test_a_route_that_says_nothing_is_for_administrators_alone(
+    policies: Path, controlled: Controlled, served: Serve
+) -> None:
+    with controlled(policies) as control:
+        settings = ServerSettings(api_keys=f"{ROBOT_LINE},{ADMIN_LINE}")
+        app = create_app(lambda: control.store, settings, control=control)
+
+        @app.get("/new")
+        async def new() -> str:
+            return "secret"
+
+        @app.post("/more")
+        @grant(Access.act)
+        async def more() -> str:
+            return "of it"
+
+        with served(app) as port, Wire(port) as wire:
+            assert [wire.ask(b"GET", b"/new", *key)[0] for key in ((), bearer(WRONG), bearer(ROBOT))] == [
+                401,
+                401,
+                403,
+            ]
+            assert wire.ask(b"GET", b"/new", *bearer(ADMIN)) == (200, b'"secret"')
+            assert wire.ask(b"DELETE", b"/new", *bearer(ROBOT))[0] == 403
+            assert wire.ask(b"POST", b"/more", *bearer(ROBOT))[0] == 200
+
+
+def bearer(key: str) -> tuple[bytes, ...]:
+    return (b"authorization: Bearer " + key.encode(),)
+
+
+def attempts(app: PolicyApp, kind: str) -> Iterator[tuple[bytes, bytes, str | None, Access]]:
+    """Yield (method, target, key, who may use it): with keys that do not suffice, or none."""
+    for method, path, access in paths(app):
+        if access is Access.admin:
+            keys, methods = [None, ROBOT, WRONG], {method, "POST"}
+        elif kind == "keys":
+            keys, methods = [WRONG], {method}
+        else:
+            continue
+        for key in keys:
+            for target in spellings(path):
+                for verb in sorted(methods):
+                    yield verb.encode(), target, key, access
+
+
+def test_no_spelling_of_a_path_gets_around_the_keys(server: Served) -> None:
+    before, asked = server.plan, 0
+    opened = {path for _, path, access in paths(server.app) if access is Access.open}
+    with Wire(server.port) as wire:
+        for verb, target, key, access in attempts(server.app, server.kind):
+            status, answer = wire.ask(verb, target, *(() if key is None else bearer(key)))
+            shown = (verb, target, key and key[:12], status, answer[:200])
+            asked += 1
+            assert status < 500, shown
+            if access is not Access.open:
+                assert status in (0, 400, 401, 403, 404, 405), shown
+                assert status != 404 or key == ROBOT or server.kind != "keys", shown
+            elif 200 <= status < 300:
+                assert plain_of(target).rstrip("/") in opened, shown
+    assert asked > 1000
+    assert server.plan == before and server.control.store is not None
+    assert server.control.store.names == ("gridworld", "ur5")
+
+
+def test_other_methods_of_a_path_are_kept_as_its_own_is(server: Served) -> None:
+    with Wire(server.port) as wire:
+        for method, path, access in paths(server.app):
+            for verb in ("GET", "HEAD", "OPTIONS", "POST", "PUT", "DELETE", "PATCH", "TRACE", "QUERY"):
+                if verb == method:
+                    continue
+                status, _ = wire.ask(verb.encode(), path.encode(), body=b"")
+                shown = (verb, path, status)
+                if access is Access.admin:
+                    assert status in ((401,) if server.kind != "none" else (403,)), shown
+                elif access is Access.act and server.kind == "keys":
+                    assert status == 401, shown
+                else:
+                    assert status < 500, shown
+
+
+def test_a_path_that_is_not_there_wants_a_key_first(server: Served) -> None:
+    with Wire(server.port) as wire:
+        for path in (b"/nowhere", b"/v1/admin", b"/v1/admin/", b"/v1/admin/policies/", b"/docs/", b"/healthz/", b"/V2"):
+            assert wire.ask(b"GET", path)[0] == (401 if server.kind == "keys" else 404), path
+            assert wire.ask(b"GET", path, *bearer(ADMIN))[0] == 404, path
+
+
+def test_an_admin_key_administers_and_paths_have_one_spelling(server: Served) -> None:
+    with Wire(server.port) as wire:
+        path = b"/v2/repository/models/gridworld/unload"
+        if server.kind == "none":
+            assert wire.ask(b"POST", path, *bearer(ADMIN))[0] == 403
+            return
+        for target in spellings(path.decode()):
+            if plain_of(target) != path.decode():
+                assert wire.ask(b"POST", target, *bearer(ADMIN))[0] in (0, 400, 403, 404, 405), target
+        assert server.control.store is not None and "gridworld" in server.control.store.names
+        assert wire.ask(b"POST", path + b"?x=1", *bearer(ADMIN))[0] == 200
+        assert "gridworld" not in server.control.store.names
+
+
+UPGRADE = (
+    b"connection: Upgrade",
+    b"upgrade: websocket",
+    b"sec-websocket-version: 13",
+    b"sec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==",
+)
+
+
+@pytest.mark.parametrize("path", ["/", "/v1/policies/ur5/stream", "/v1/policies/ur5/versions/1/stream"])
+def test_no_spelling_of_a_streams_path_opens_it_without_a_key(
+    policies: Path, controlled: Controlled, served: Serve, path: str
+) -> None:
+    with controlled(policies) as control:
+        settings = ServerSettings(api_keys=ROBOT_LINE, default_policy="ur5")
+        with served(create_app(lambda: control.store, settings, control=control)) as port, Wire(port) as wire:
+            for target in spellings(path):
+                for key in ((), bearer(WRONG)):
+                    status, _ = wire.ask(b"GET", target, *UPGRADE, *key, body=b"")
+                    assert status in (0, 400, 401, 403, 404), (target, status)
+                status, _ = wire.ask(b"GET", target, *UPGRADE, *bearer(ROBOT), body=b"")
+                assert status < 500 and (status != 101 or plain_of(target) in ("/", path)), (target, status)
+            assert wire.ask(b"GET", path.encode(), *UPGRADE, *bearer(ROBOT), body=b"")[0] == 101
+
+
+def entries(caplog: pytest.LogCaptureFixture, logger: str) -> list[dict[str, Any]]:
+    return [vars(record)[FIELDS] for record in caplog.records if record.name == logger]
+
+
+def test_who_administers_and_whose_key_is_refused_is_in_the_log(
+    policies: Path, controlled: Controlled, served: Serve, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", logger="rlservo")
+    path = b"/v1/admin/policies/ur5/alias"
+    with controlled(policies) as control:
+        settings = ServerSettings(api_keys=f"{ROBOT_LINE},{ADMIN_LINE}")
+        with served(create_app(lambda: control.store, settings, control=control)) as port, Wire(port) as wire:
+            body = b'{"alias": "candidate", "version": "2"}'
+            assert wire.ask(b"POST", path, *bearer(ADMIN), b"x-request-id: change-1", body=body)[0] == 200
+            wrong = b'{"alias": "candidate", "version": "77"}'
+            assert wire.ask(b"POST", path, *bearer(ADMIN), b"x-request-id: change-2", body=wrong)[0] == 404
+            unload = b"/v2/repository/models/gridworld/unload"
+            assert wire.ask(b"POST", unload, *bearer(ADMIN), b"x-request-id: change-3")[0] == 200
+            for key in (WRONG, ROBOT):
+                assert wire.ask(b"POST", path, *bearer(key), b"x-request-id: refused", body=body)[0] in (401, 403)
+    changes = entries(caplog, "rlservo.administration")
+    told = [(entry["request_id"], entry["change"], entry["code"]) for entry in changes]
+    assert told == [
+        ("change-1", "alias ur5 candidate=2", "ok"),
+        ("change-2", "alias ur5 candidate=77", "unknown-version"),
+        ("change-3", "unload gridworld", "ok"),
+    ]
+    assert {(entry["key"], entry["peer"]) for entry in changes} == {("boss", "127.0.0.1")}
+    assert changes[0]["generation"] == 2
+    refused = [entry for entry in entries(caplog, "rlservo.requests") if entry["request_id"] == "refused"]
+    assert [(entry["code"], entry["peer"]) for entry in refused] == [
+        ("unauthenticated", "127.0.0.1"),
+        ("forbidden", "127.0.0.1"),
+    ]
+    assert WRONG not in caplog.text and ADMIN not in caplog.text
+
+
+def test_no_route_reads_a_body_beyond_the_limit(server: Served) -> None:
+    """Announced or in chunks: refused before FastAPI, or whoever parses, holds it; with an admin key, too."""
+    limit = server.app.state.core.settings.max_body_bytes
+    chunk = b"%x\r\n" % 65536 + b" " * 65536 + b"\r\n"
+    for method, path, access in paths(server.app):
+        if path == "/" or path.endswith("/stream"):
+            continue
+        expected = 403 if access is Access.admin and server.kind == "none" else 413
+        head = f"{method} {path} HTTP/1.1\r\nhost: 127.0.0.1\r\ncontent-type: application/json\r\n".encode()
+        head += bearer(ADMIN)[0] + b"\r\n"
+        for rest in (b"content-length: %d\r\n\r\n{" % (limit + 1), b"transfer-encoding: chunked\r\n\r\n"):
+            with socket.create_connection(("127.0.0.1", server.port), timeout=30) as client:
+                client.sendall(head + rest)
+                if rest.endswith(b"chunked\r\n\r\n"):
+                    with contextlib.suppress(OSError):  # it may have been answered and closed by then
+                        for _ in range(limit // 65536 + 2):
+                            client.sendall(chunk)
+                status = int(client.recv(65536)[9:12])
+            assert status == expected, (method, path, rest[:20])
+
+
+def test_a_body_that_stays_away_is_late_on_every_route(policies: Path, controlled: Controlled, served: Serve) -> None:
+    with controlled(policies) as control:
+        settings = ServerSettings(operator_key=ADMIN_LINE.split()[-1], body_timeout_s=0.2)
+        app = create_app(lambda: control.store, settings, control=control)
+        with served(app) as port:
+            for path in (b"/v1/admin/policies/ur5/load", b"/v2/repository/models/ur5/load", b"/v2/repository/index"):
+                with socket.create_connection(("127.0.0.1", port), timeout=30) as client:
+                    client.sendall(b"POST " + path + b" HTTP/1.1\r\nhost: 127.0.0.1\r\n" + bearer(ADMIN)[0])
+                    client.sendall(b"\r\ncontent-type: application/json\r\ncontent-length: 10\r\n\r\n{")
+                    assert int(client.recv(65536)[9:12]) == 408, path
+
+
+@pytest.mark.parametrize("name", [b"x-request-id", b"x-session-id", b"serve_multiplexed_model_id", b"user-agent"])
+def test_a_header_that_is_not_utf8_is_refused_after_the_key_in_our_form(server: Served, name: bytes) -> None:
+    with Wire(server.port) as wire:
+        for method, path in ((b"GET", b"/v1/policies"), (b"POST", b"/v1/policies/ur5/act"), (b"GET", b"/nowhere")):
+            status, answer = wire.ask(method, path, name + b": caf\xe9")
+            assert status == (401 if server.kind == "keys" else 400), (path, answer)
+            status, answer = wire.ask(method, path, name + b": caf\xe9", *bearer(ADMIN))
+            assert (status, json.loads(answer)["code"]) == (400, "bad-request") and name in answer
+            assert wire.ask(method, path, name + ": café".encode(), *bearer(ADMIN), body=OBS)[0] in (200, 404, 422)
+
+
+def test_on_ray_serve_a_header_that_is_not_utf8_is_no_failure(live_server: Any) -> None:
+    """Serve itself decodes these, before the application sees the request (ray 2.60)."""
+    with Wire(live_server.port) as wire:
+        for name in (b"x-request-id", b"x-session-id", b"serve_multiplexed_model_id"):
+            for path in (b"/v1/policies", b"/v1/policies/ur5", b"/nowhere"):
+                status, answer = wire.ask(b"GET", path, name + b": caf\xe9", body=b"")
+                assert (status, json.loads(answer)["code"]) == (401, "unauthenticated"), (name, path, answer)
+                status, answer = wire.ask(b"GET", path, name + b": caf\xe9", *bearer(live_server.key), body=b"")
+                assert (status, json.loads(answer)["code"]) == (400, "bad-request") and name in answer, answer
+        for value in (b"inf", b"1" * 310, b"nan", b"1e999"):
+            status, answer = wire.ask(
+                b"GET", b"/v1/policies", b"x-request-timeout-seconds: " + value, *bearer(live_server.key), body=b""
+            )
+            assert status == 200, (value, answer)
+
+
+def test_on_ray_serve_no_spelling_reaches_administration(live_server: Any) -> None:
+    """Through HAProxy, uvicorn and Serve, of which each reads a path in its own way; the server has no admin key."""
+    with Wire(live_server.port) as wire:
+        for path in (*(p.replace("{name}", "gridworld") for p in ADMIN_PATHS),):
+            for target in spellings(path):
+                for key in ((), bearer(live_server.key)):
+                    status, answer = wire.ask(b"GET" if path.endswith("policies") else b"POST", target, *key)
+                    assert status in (0, 400, 401, 403, 404, 405), (target, status, answer)
+        status, answer = wire.ask(b"GET", b"/v1/policies", *bearer(live_server.key))
+        assert status == 200 and b"gridworld" in answer and b'"generation":1' in answer.replace(b" ", b""), answer

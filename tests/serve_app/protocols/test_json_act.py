@@ -1,0 +1,370 @@
+"""The JSON protocol over real bundles, through uvicorn and http.client: no mock between the bytes and the policy."""
+
+from __future__ import annotations
+
+import gzip
+import http.client
+import json
+import random
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import uvicorn
+
+from rlservo.export.contract.bundle import Contract
+from rlservo.serve_app.protocols.docs_page import PAGE
+from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.policy_store import PolicyStore
+
+OBS = [round(0.01 * i, 2) for i in range(27)]
+JSON = {"content-type": "application/json"}
+HALF_SENT = (
+    b"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: 127.0.0.1\r\n"
+    b'content-type: application/json\r\ncontent-length: 1000\r\n\r\n{"obs": ['
+)
+SETTINGS = ServerSettings(max_body_bytes=200_000, max_batch=64, body_timeout_s=1.0)
+Ask = Callable[..., tuple[int, dict[str, str], Any]]
+
+
+@pytest.fixture(scope="module")
+def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
+    unsafe = box_policy(tmp_path_factory.mktemp("unsafe"), name="unsafe", action_scale=5.0)
+    return PolicyStore.load([policies, unsafe])
+
+
+class Loading:
+    """A store provider that can be told to have nothing yet."""
+
+    def __init__(self, store: PolicyStore) -> None:
+        self.store: PolicyStore | None = store
+
+    def __call__(self) -> PolicyStore | None:
+        return self.store
+
+
+@pytest.fixture(scope="module")
+def loading(store: PolicyStore) -> Loading:
+    return Loading(store)
+
+
+@pytest.fixture(scope="module")
+def port(loading: Loading) -> Iterator[int]:
+    listener = socket.create_server(("127.0.0.1", 0))
+    config = uvicorn.Config(create_app(loading, SETTINGS), log_level="critical", access_log=False, lifespan="off")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    yield listener.getsockname()[1]
+    server.should_exit = True
+    thread.join()
+    listener.close()
+
+
+@pytest.fixture(scope="module")
+def ask(port: int) -> Iterator[Ask]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+
+    def call(
+        method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
+    ) -> tuple[int, dict[str, str], Any]:
+        content = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
+        connection.request(method, path, content, JSON if headers is None and body is not None else headers or {})
+        reply = connection.getresponse()
+        received = reply.read()
+        if reply.status == 500:
+            connection.close()  # uvicorn does, after an exception that reached it
+        is_json = reply.headers.get("content-type", "").startswith("application/json")
+        return reply.status, dict(reply.headers), json.loads(received) if is_json else received
+
+    yield call
+    connection.close()
+
+
+def act(ask: Ask, body: Any, name: str = "ur5") -> tuple[int, Any]:
+    status, _, reply = ask("POST", f"/v1/policies/{name}/act", body)
+    return status, reply
+
+
+def test_act_answers_with_the_newest_versions_action(ask: Ask, store: PolicyStore) -> None:
+    status, reply = act(ask, {"obs": OBS, "seq": 41})
+    assert status == 200
+    assert {key: reply[key] for key in ("policy", "version", "seq")} == {"policy": "ur5", "version": "10", "seq": 41}
+    assert reply["infer_ms"] > 0
+    np.testing.assert_allclose(reply["action"], store.act("ur5", None, OBS).action, rtol=1e-6)
+
+
+def test_a_version_a_batch_and_a_named_observation(ask: Ask, store: PolicyStore) -> None:
+    status, _, reply = ask("POST", "/v1/policies/ur5/versions/2/act", {"obs": [OBS, OBS]})
+    assert (status, reply["version"], np.shape(reply["action"])) == (200, "2", (2, 6))
+    np.testing.assert_allclose(reply["action"][0], store.act("ur5", "2", OBS).action, rtol=1e-6)
+    named = {f"element_{i}": value for i, value in enumerate(OBS)}
+    assert act(ask, {"obs": named})[1]["action"] == act(ask, {"obs": OBS})[1]["action"]
+    assert "seq" not in reply
+
+
+def test_a_discrete_action_is_a_plain_integer(ask: Ask) -> None:
+    assert type(act(ask, {"obs": 2}, "gridworld")[1]["action"]) is int
+    assert len(act(ask, {"obs": [0, 1, 2]}, "gridworld")[1]["action"]) == 3
+
+
+def test_exploring_is_repeatable_by_seed(ask: Ask) -> None:
+    first, again, other = (act(ask, {"obs": OBS, "explore": True, "seed": s})[1]["action"] for s in (1, 1, 2))
+    assert first == again != other
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "code", "sentence"),
+    [
+        ({"obs": OBS[:26]}, 422, "bad-observation", "policy 'ur5' expects obs of shape (27,), got (26,)"),
+        ({"obs": [*OBS[:26], "x"]}, 422, "bad-observation", "element 26 (element_26) is the string 'x'"),
+        (
+            b'{"obs": [%s NaN]}' % (b"0," * 26),
+            422,
+            "bad-observation",
+            "(element_26) is nan, not a finite number; JSON has no NaN",
+        ),
+        (b'{"obs": [%s 1e400]}' % (b"0," * 26), 422, "bad-observation", "(element_26) is inf"),
+        (b'{"obs": %s, "seq": NaN}' % json.dumps(OBS).encode(), 400, "bad-request", "'seq' must be an integer"),
+        ({}, 422, "bad-observation", "no 'obs'"),
+        ({"obs": OBS, "observation": OBS}, 400, "bad-request", "unknown field 'observation': known are deadline_ms"),
+        ({"observation": OBS}, 400, "bad-request", "unknown field 'observation'"),
+        ({"obs": OBS, "state": {"h": [0]}}, 400, "bad-request", "does not fit policy 'ur5' (its state: none"),
+        ({"obs": OBS, "state": [0]}, 400, "bad-request", "'state' must be an object, state names to numbers, got a l"),
+        ({"obs": OBS, "session_id": 7}, 400, "bad-request", "'session_id' must be a string of 1 to 128 characters"),
+        ({"obs": OBS, "reset": True}, 400, "bad-request", "'reset' is for a session: send its 'session_id', too"),
+        ({"obs": OBS, "timestamp": "now"}, 400, "bad-request", "'timestamp' must be a number of seconds"),
+        ({"obs": OBS, "explore": 1}, 400, "bad-request", "'explore' must be true or false"),
+        ({"obs": OBS, "seed": -1}, 400, "bad-request", "'seed' must be in 0"),
+        ({"obs": OBS, "seed": True}, 400, "bad-request", "'seed' must be an integer, got true"),
+        ({"obs": OBS, "deadline_ms": "1"}, 400, "bad-request", "'deadline_ms' must be a number"),
+        ({"obs": OBS, "deadline_ms": 0}, 408, "deadline-passed", "nothing computed"),
+        ([OBS], 400, "bad-request", "must be a JSON object"),
+        (b"", 400, "bad-request", "the request body is empty"),
+        (b"{", 400, "bad-request", "the request body is not JSON"),
+        (b"[" * 100_000, 400, "bad-request", "not JSON"),
+        ({"obs": [OBS] * 65}, 413, "too-large", "at most 64"),
+        (b" " * 200_001, 413, "too-large", "larger than 200000 bytes"),
+    ],
+)
+def test_a_bad_request_gets_its_status_code_and_sentence(
+    ask: Ask, body: Any, status: int, code: str, sentence: str
+) -> None:
+    got, reply = act(ask, body)
+    assert (got, reply["code"]) == (status, code), reply
+    assert sentence in reply["error"]
+    assert act(ask, {"obs": OBS, "deadline_ms": 5000})[0] == 200
+
+
+def test_unknown_names_versions_paths_and_methods(ask: Ask) -> None:
+    cases = [
+        ("POST", "/v1/policies/ur6/act", 404, "unknown-policy", "this server has gridworld, unsafe, ur5"),
+        ("POST", "/v1/policies/ur5/versions/9/act", 404, "unknown-version", "loaded are 1, 2, 10"),
+        ("POST", "/v1/policies/..%2f..%2fetc/act", 400, "bad-request", "without percent-encoding"),
+        ("POST", "/v1/policies/ur5/act/", 404, "not-found", "nothing is at"),
+        ("GET", "/v1/policies/ur6", 404, "unknown-policy", "this server has"),
+        ("GET", "/v1/policies/ur5/versions/9", 404, "unknown-version", "loaded are"),
+        ("GET", "/nowhere", 404, "not-found", "policies are under /v1/policies"),
+        ("GET", "/v1/policies/ur5/act", 405, "method-not-allowed", "POST is"),
+        ("DELETE", "/v1/policies/ur5", 405, "method-not-allowed", "GET is"),
+    ]
+    for method, path, status, code, sentence in cases:
+        got, _, reply = ask(method, path, {"obs": OBS} if method == "POST" else None)
+        assert (got, reply["code"]) == (status, code), (path, reply)
+        assert sentence in reply["error"]
+
+
+def test_other_content_types_and_encodings_are_refused(ask: Ask) -> None:
+    body = json.dumps({"obs": OBS}).encode()
+    for headers in ({"content-type": "application/x-www-form-urlencoded"}, {"content-type": "text/plain"}):
+        status, _, reply = ask("POST", "/v1/policies/ur5/act", body, headers)
+        assert (status, reply["code"]) == (415, "wrong-media-type")
+        assert headers["content-type"] in reply["error"]
+    for content in (gzip.compress(body), gzip.compress(body)[:20]):
+        status, _, reply = ask("POST", "/v1/policies/ur5/act", content, {**JSON, "content-encoding": "gzip"})
+        assert (status, reply["code"]) == (415, "wrong-media-type")
+    for accepted in ("application/json; charset=utf-8", "Application/JSON"):
+        assert ask("POST", "/v1/policies/ur5/act", body, {"content-type": accepted})[0] == 200
+
+
+def test_an_unsafe_action_stays_on_the_server(ask: Ask) -> None:
+    status, reply = act(ask, {"obs": [9.0] * 27}, "unsafe")
+    assert (status, reply["code"]) == (500, "unsafe-action")
+    assert "action" not in reply and "joint_" in reply["error"]
+
+
+def test_a_body_that_never_arrives_is_answered_in_time(port: int) -> None:
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+        client.sendall(HALF_SENT)
+        started = time.monotonic()
+        reply = client.recv(65536)
+    assert reply.startswith(b"HTTP/1.1 408") and b"did not arrive within 1 s" in reply
+    assert time.monotonic() - started < 5
+
+
+def test_a_client_that_hangs_up_halfway_does_no_harm(port: int, ask: Ask) -> None:
+    for _ in range(5):
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+            client.sendall(HALF_SENT)
+    assert act(ask, {"obs": OBS})[0] == 200
+
+
+def test_a_body_in_chunks_is_read_and_limited(port: int) -> None:
+    for size, status in ((len(json.dumps({"obs": OBS})), 200), (SETTINGS.max_body_bytes + 1, 413)):
+        body = json.dumps({"obs": OBS}).encode().ljust(size)
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        pieces = (body[i : i + 5000] for i in range(0, len(body), 5000))
+        connection.request("POST", "/v1/policies/ur5/act", pieces, JSON, encode_chunked=True)
+        assert connection.getresponse().status == status
+        connection.close()
+
+
+def test_until_the_policies_are_loaded_everything_but_health_is_503_with_retry_after(
+    ask: Ask, loading: Loading
+) -> None:
+    store, loading.store = loading.store, None
+    try:
+        for method, path in (("GET", "/v2/health/ready"), ("GET", "/v1/policies"), ("POST", "/v1/policies/ur5/act")):
+            status, headers, reply = ask(method, path, {"obs": OBS} if method == "POST" else None)
+            assert (status, reply["code"], headers["retry-after"]) == (503, "unavailable", "1")
+        assert ask("GET", "/healthz")[0] == ask("GET", "/v2/health/live")[0] == 200
+    finally:
+        loading.store = store
+    assert ask("GET", "/v2/health/ready")[2] == {"ready": True}
+    assert ask("GET", "/healthz")[2] == b"OK"
+
+
+def test_listings_and_contracts_are_the_bundles_own(ask: Ask, store: PolicyStore) -> None:
+    listed = {policy["name"]: policy for policy in ask("GET", "/v1/policies")[2]["policies"]}
+    assert listed["ur5"]["version"] == "10" and listed["ur5"]["versions"] == ["1", "2", "10"]
+    for path, version in (("/v1/policies/ur5", None), ("/v1/policies/ur5/versions/2", "2")):
+        assert Contract.model_validate(ask("GET", path)[2]) == store.get("ur5", version).contract
+
+
+def test_an_unexpected_failure_says_no_more_than_that(
+    ask: Ask, loading: Loading, caplog: pytest.LogCaptureFixture
+) -> None:
+    store, loading.store = loading.store, object()  # type: ignore[assignment]  # whatever is used of it, raises
+    try:
+        for method, path in (("POST", "/v1/policies/ur5/act"), ("GET", "/v1/policies")):
+            status, _, reply = ask(method, path, {"obs": OBS} if method == "POST" else None)
+            assert status == 500
+            assert reply == {"error": "the server failed on this request; its log says how", "code": "internal"}
+    finally:
+        loading.store = store
+    assert "AttributeError" in caplog.text
+
+
+def test_the_documentation_is_whole_without_a_network(ask: Ask) -> None:
+    assert ask("GET", "/docs")[2].decode() == PAGE
+    assert "http" not in PAGE.replace("html", "")
+    for reference in re.findall(r'(?:href|src)="([^"]+)"', PAGE):
+        status, _, content = ask("GET", f"/{reference}")
+        assert status == 200 and len(content) > 500
+    assert ask("GET", "/redoc")[0] == 404
+
+
+def test_the_openapi_document_is_valid_3_0_and_describes_every_route(ask: Ask) -> None:
+    document = ask("GET", "/openapi.json")[2]
+    assert document["openapi"] == "3.0.3"
+    assert set(document["paths"]) == {
+        "/v1/policies",
+        "/v1/policies/{name}",
+        "/v1/policies/{name}/versions/{version}",
+        "/v1/policies/{name}/act",
+        "/v1/policies/{name}/versions/{version}/act",
+        "/healthz",
+        "/metrics",
+        "/v2",
+        "/v2/health/live",
+        "/v2/health/ready",
+        "/v2/models/{name}",
+        "/v2/models/{name}/versions/{version}",
+        "/v2/models/{name}/ready",
+        "/v2/models/{name}/versions/{version}/ready",
+        "/v2/models/{name}/infer",
+        "/v2/models/{name}/versions/{version}/infer",
+        "/v2/models/stats",
+        "/v2/models/{name}/stats",
+        "/v2/models/{name}/config",
+        "/v2/models/{name}/versions/{version}/stats",
+        "/v2/models/{name}/versions/{version}/config",
+        "/v2/repository/index",
+    }
+    request = document["paths"]["/v1/policies/{name}/act"]["post"]["requestBody"]["content"]["application/json"][
+        "schema"
+    ]
+    of_episode = {"state", "session_id", "reset", "end", "reward", "last_action"}
+    assert set(request["properties"]) == {"obs", "explore", "seed", "seq", "deadline_ms", "timestamp", *of_episode}
+
+    def walk(node: Any) -> None:
+        if isinstance(node, list):
+            for item in node:
+                walk(item)
+        elif isinstance(node, dict):
+            assert node.get("type") != "null" and not {"const", "prefixItems", "$defs"} & set(node), node
+            if "$ref" in node:
+                target: Any = document
+                for part in node["$ref"].removeprefix("#/").split("/"):
+                    target = target[part]
+            for key, value in node.items():
+                if key not in ("example", "default", "properties"):
+                    walk(value)
+                elif key == "properties":
+                    for schema in value.values():
+                        walk(schema)
+
+    walk(document)
+
+
+def malformed_bodies() -> Iterator[bytes]:
+    """Yield about 300 bodies, from wrong types in every place to random damage; the same ones each time."""
+    rng = random.Random(0)
+    good = json.dumps({"obs": OBS, "explore": True, "seed": 1, "seq": 2, "deadline_ms": 1000}).encode()
+    values = [
+        b"null", b"true", b"-1", b"1e400", b"-1e999", b"1e-400", b"123456789012345678901234567890", b'""', b'"\\ud800"',
+        b'"\xff"', b"[]", b"{}", b"[[]]", b"[[[[[]]]]]", b'[{"a":[1]}]', b"NaN", b"-Infinity", b"1.5", b"0x10", b'"1"',
+        b"[true]", "\"\N{SNOWMAN}\"".encode(), b"[null,1]", b"[" * 900 + b"]" * 900, b"[" * 60 + b"1" + b"]" * 60,
+    ]  # fmt: skip
+    for value in values:
+        yield value
+        yield b'{"obs": ' + value + b"}"
+        yield b'{"obs": [' + b"0," * 26 + value + b"]}"
+        yield b'{"obs": [[' + b"0," * 26 + value + b"]]}"
+        yield b'{"obs": {"element_0": ' + value + b"}}"
+        for field in (b"explore", b"seed", b"seq", b"deadline_ms", b"state", b"\\u0000"):
+            yield b'{"obs": ' + json.dumps(OBS).encode() + b', "' + field + b'": ' + value + b"}"
+    for _ in range(60):
+        damaged = bytearray(good)
+        for _ in range(rng.randint(1, 4)):
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+        yield bytes(damaged)
+    for _ in range(30):
+        yield good[: rng.randrange(len(good))]
+
+
+def test_no_malformed_body_gets_a_5xx_or_stops_the_server(ask: Ask) -> None:
+    seen: dict[int, int] = {}
+    for body in malformed_bodies():
+        for name in ("ur5", "gridworld"):
+            status, reply = act(ask, body, name)
+            seen[status] = seen.get(status, 0) + 1
+            assert status < 500, (body[:200], reply)
+            if status != 200:
+                assert set(reply) <= {"error", "code", "details"} and "Traceback" not in reply["error"], (
+                    body[:200],
+                    reply,
+                )
+            else:
+                assert np.isfinite(reply["action"]).all()
+    assert sum(seen.values()) > 600 and seen[400] > 100 and seen[422] > 100
+    assert act(ask, {"obs": OBS})[0] == 200

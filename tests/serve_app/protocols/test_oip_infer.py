@@ -1,0 +1,327 @@
+"""The Open Inference Protocol over real bundles: Triton's own client, and by hand what that client never sends."""
+
+from __future__ import annotations
+
+import gzip
+import http.client
+import json
+import random
+import subprocess
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.policy_store import PolicyStore
+
+LENGTH = "Inference-Header-Content-Length"
+BATCH = np.random.default_rng(5).standard_normal((33, 27)).astype(np.float32)
+ONE = BATCH[:1]
+CLIENT = Path(__file__).resolve().parents[2] / "clients" / "triton_http.py"
+Ask = Callable[..., tuple[int, dict[str, str], bytes]]
+
+
+@pytest.fixture(scope="module")
+def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
+    unsafe = box_policy(tmp_path_factory.mktemp("unsafe"), name="unsafe", action_scale=5.0)
+    return PolicyStore.load([policies, unsafe])
+
+
+@pytest.fixture(scope="module")
+def port(store: PolicyStore, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[int]:
+    settings = ServerSettings(max_body_bytes=200_000, max_batch=64, body_timeout_s=1.0)
+    with served(create_app(lambda: store, settings)) as port:
+        yield port
+
+
+@pytest.fixture(scope="module")
+def ask(port: int) -> Iterator[Ask]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+
+    def call(method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, dict[str, str], bytes]:
+        connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
+        reply = connection.getresponse()
+        return reply.status, {name.lower(): value for name, value in reply.headers.items()}, reply.read()
+
+    yield call
+    connection.close()
+
+
+def infer(ask: Ask, body: Any, model: str = "ur5", **headers: str) -> tuple[int, Any]:
+    content = body if isinstance(body, bytes) else json.dumps(body).encode()
+    status, _, reply = ask("POST", f"/v2/models/{model}/infer", content, **headers)
+    return status, json.loads(reply)
+
+
+def tensor(data: Any, shape: list[int], datatype: str = "FP32", name: str = "obs", **more: Any) -> dict[str, Any]:
+    return {"name": name, "shape": shape, "datatype": datatype, "data": data, **more}
+
+
+def request(*tensors: dict[str, Any], **more: Any) -> dict[str, Any]:
+    return {"inputs": list(tensors), **more}
+
+
+@pytest.mark.slow
+def test_tritons_own_client_works_unchanged(
+    client_environment: Callable[..., Path], port: int, store: PolicyStore
+) -> None:
+    python = client_environment("tritonclient[http,grpc]==2.71.0")
+    done = subprocess.run(
+        [str(python), str(CLIENT), f"127.0.0.1:{port}"],
+        input=json.dumps({"obs": BATCH.tolist()}),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["live"] and facts["ready"] and facts["aio_ready"]
+    assert facts["model_ready"] == [True, True, False, False]
+    assert facts["server"]["name"] == "rlservo" and "binary_tensor_data" in facts["server"]["extensions"]
+    assert facts["model"] == {
+        "name": "ur5",
+        "versions": ["1", "2", "10"],
+        "platform": "onnx_onnxv1",
+        "inputs": [{"name": "obs", "datatype": "FP32", "shape": [-1, 27]}],
+        "outputs": [{"name": "action", "datatype": "FP32", "shape": [-1, 6]}],
+    }
+    assert facts["version"]["versions"] == ["2"]
+    assert {"name": "ur5", "version": "10", "state": "READY", "reason": ""} in facts["index"]
+    assert len(facts["index"]) == 5
+    older = facts["older"]
+    assert (older["id"], older["model_version"], older["parameters"]["seq"]) == ("r-7", "2", 5)
+    measured = facts["measured"]
+    assert measured["config"]["max_batch_size"] == 64
+    assert measured["config"]["input"] == [{"name": "obs", "data_type": "TYPE_FP32", "dims": [27]}]
+    (before,), (after,) = measured["before"]["model_stats"], measured["after"]["model_stats"]
+    assert (after["name"], after["version"]) == ("ur5", "2")
+    assert after["inference_count"] - before["inference_count"] == 3 + len(BATCH)
+    assert after["execution_count"] - before["execution_count"] == 4
+    gained = {name: after["inference_stats"][name]["count"] - before["inference_stats"][name]["count"]
+              for name in ("success", "fail")}  # fmt: skip
+    assert gained == {"success": 4, "fail": 1}
+    assert [(each["name"], each["version"]) for each in measured["all"]["model_stats"]] == [
+        ("gridworld", "1"), ("unsafe", "1"), ("ur5", "1"), ("ur5", "2"), ("ur5", "10")
+    ]  # fmt: skip
+    assert facts["dtypes"] == ["float32"]
+    expected = store.act("ur5", None, BATCH).action
+    np.testing.assert_array_equal(np.float32(facts["actions"].pop("older")), store.act("ur5", "2", BATCH).action)
+    assert len(facts["actions"]) == 4 + 1 + 4 + 8 + 2
+    for name, action in facts["actions"].items():
+        np.testing.assert_array_equal(np.float32(action), expected, err_msg=name)
+    assert facts["unknown"] == ["404", "no policy 'nobody' is loaded: this server has gridworld, unsafe, ur5"]
+    assert facts["short"][0] == "422" and "of shape [-1, 27] (-1 is the batch), got [33, 26]" in facts["short"][1]
+    assert facts["nan"][0] == "422" and "element 0 (element_0) is nan" in facts["nan"][1]
+    assert facts["late"][0] == "408" and "nothing computed" in facts["late"][1]
+
+
+def test_json_data_may_be_nested_or_flat_and_of_any_number_type(ask: Ask, store: PolicyStore) -> None:
+    expected = store.act("ur5", None, BATCH).action
+    flat = infer(ask, request(tensor(BATCH.ravel().tolist(), [33, 27])))[1]
+    nested = infer(ask, request(tensor(BATCH.tolist(), [33, 27], "FP64"), id="a"))[1]
+    assert flat["outputs"] == nested["outputs"] and nested["id"] == "a" and "id" not in flat
+    assert flat["outputs"][0]["datatype"] == "FP32" and flat["outputs"][0]["shape"] == [33, 6]
+    np.testing.assert_array_equal(np.float32(flat["outputs"][0]["data"]).reshape(33, 6), expected)
+    whole = infer(ask, request(tensor([1] * 27, [1, 27], "INT8")))[1]["outputs"][0]["data"]
+    np.testing.assert_array_equal(np.float32(whole), store.act("ur5", None, np.ones(27, np.float32)).action)
+    discrete = infer(ask, request(tensor([0, 1, 4], [3], "INT64")), "gridworld")[1]["outputs"][0]
+    assert (discrete["datatype"], discrete["shape"]) == ("INT64", [3])
+    assert discrete["data"] == store.act("gridworld", None, [0, 1, 4]).action.tolist()
+
+
+@pytest.mark.parametrize("pad", range(8))  # so that the tensor begins at every alignment
+def test_binary_tensors_go_in_and_come_out(ask: Ask, store: PolicyStore, pad: int) -> None:
+    header = json.dumps(
+        {
+            "inputs": [
+                {
+                    "name": "obs",
+                    "shape": [33, 27],
+                    "datatype": "FP32",
+                    "parameters": {"binary_data_size": BATCH.nbytes},
+                }
+            ],
+            "outputs": [{"name": "action", "parameters": {"binary_data": True}}],
+            "id": "x" * pad,
+        }
+    ).encode()
+    status, headers, reply = ask("POST", "/v2/models/ur5/infer", header + BATCH.tobytes(), **{LENGTH: str(len(header))})
+    assert status == 200 and headers["content-type"] == "application/octet-stream"
+    length = int(headers[LENGTH.lower()])
+    document = json.loads(reply[:length])
+    (output,) = document["outputs"]
+    assert output["parameters"]["binary_data_size"] == len(reply) - length == 33 * 6 * 4 and "data" not in output
+    action = np.frombuffer(reply[length:], "<f4").reshape(output["shape"])
+    np.testing.assert_array_equal(action, store.act("ur5", None, BATCH).action)
+
+
+def test_a_body_of_nothing_but_one_tensor_is_read(ask: Ask, store: PolicyStore) -> None:
+    status, reply = infer(ask, BATCH.tobytes(), **{LENGTH: "0"})
+    assert status == 200 and reply["outputs"][0]["shape"] == [33, 6]
+    np.testing.assert_array_equal(
+        np.float32(reply["outputs"][0]["data"]).reshape(33, 6), store.act("ur5", None, BATCH).action
+    )
+    status, reply = infer(ask, BATCH.tobytes()[:-1], **{LENGTH: "0"})
+    assert status == 422 and "108 bytes per observation, and the body has 3563" in reply["error"]
+
+
+def test_output_parameters_override_the_requests_own(ask: Ask) -> None:
+    body = request(tensor(ONE.tolist(), [1, 27]), parameters={"binary_data_output": True})
+    content = json.dumps(body).encode()
+    assert LENGTH.lower() in ask("POST", "/v2/models/ur5/infer", content)[1]
+    body["outputs"] = [{"name": "action", "parameters": {"binary_data": False}}]
+    assert "data" in infer(ask, body)[1]["outputs"][0]
+
+
+def test_exploring_is_repeatable_by_seed(ask: Ask) -> None:
+    first, again, other = (
+        infer(ask, request(tensor(ONE.tolist(), [1, 27]), parameters={"explore": True, "seed": seed}))[1]["outputs"]
+        for seed in (1, 1, 2)
+    )
+    assert first == again != other
+
+
+@pytest.mark.parametrize(("name", "pack"), [("gzip", gzip.compress), ("deflate", zlib.compress)])
+def test_bodies_may_be_compressed_both_ways(ask: Ask, name: str, pack: Callable[[bytes], bytes]) -> None:
+    content = json.dumps(request(tensor(BATCH.tolist(), [33, 27]))).encode()
+    plain = ask("POST", "/v2/models/ur5/infer", content)
+    assert "content-encoding" not in plain[1]
+    status, headers, reply = ask(
+        "POST", "/v2/models/ur5/infer", pack(content), content_encoding=name, accept_encoding=name
+    )
+    assert (status, headers["content-encoding"]) == (200, name)
+    unpacked = gzip.decompress(reply) if name == "gzip" else zlib.decompress(reply)
+    assert json.loads(unpacked)["outputs"] == json.loads(plain[2])["outputs"]
+    refused = ask("POST", "/v2/models/ur5/infer", content, accept_encoding=f"{name};q=0")
+    assert refused[0] == 200 and "content-encoding" not in refused[1]
+
+
+def test_a_body_that_unpacks_to_too_much_is_refused(ask: Ask) -> None:
+    bomb = gzip.compress(b"[" + b"0," * 5_000_000 + b"0]")
+    assert len(bomb) < 20_000
+    status, reply = infer(ask, bomb, content_encoding="gzip")
+    assert (status, reply["code"]) == (413, "too-large")
+
+
+@pytest.mark.parametrize("name", ["gzip", "deflate"])
+def test_a_damaged_compressed_body_is_refused(ask: Ask, name: str) -> None:
+    packed = (gzip.compress if name == "gzip" else zlib.compress)(json.dumps(request(tensor([0], [1]))).encode())
+    for damaged in (b"", b"not packed", packed[:-3], packed + b"more", packed[:-9] + b"\0" * 9):
+        status, reply = infer(ask, damaged, content_encoding=name)
+        assert status == 400 and name in reply["error"], (damaged, reply)
+    assert infer(ask, packed, content_encoding="br")[0] == 415
+
+
+ROW = ONE[0].tolist()
+
+
+def test_the_models_name_may_be_said_again(ask: Ask) -> None:
+    """KServe's client does."""
+    status, reply = infer(ask, request(tensor(ROW, [1, 27])) | {"model_name": "ur5"})
+    assert (status, reply["model_name"]) == (200, "ur5")
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "sentence"),
+    [
+        (b"", 400, "the request body is empty"),
+        (b"[]", 400, "must be a JSON object such as {\"inputs\""),
+        ({"inputs": []}, 400, "'inputs' must be a list of tensors"),
+        ({"inputs": [7]}, 400, "must be an object, got the number 7"),
+        (request(tensor(ROW, [1, 27])) | {"extra": 1}, 400, "unknown field 'extra'"),
+        (request(tensor(ROW, [1, 27])) | {"model_name": "ur10"}, 400, "'model_name' is not 'ur5'"),
+        (request(tensor(ROW, [1, 27]), id=7), 400, "'id' must be a string, got the number 7"),
+        (request(tensor(ROW, [27])), 422, "expects input 'obs' of shape [-1, 27] (-1 is the batch), got [27]"),
+        (request(tensor([], [0, 27])), 422, "got an empty batch"),
+        (request(tensor(ROW[:26], [1, 27])), 422, "'data' has the shape [26], and 'shape' says [1, 27]"),
+        (request(tensor([[1, 2], [3]], [1, 27])), 422, "not of equal length"),
+        (request(tensor([*ROW[:26], "x"], [1, 27])), 422, "'data' holds a string, not only numbers"),
+        (request(tensor([*ROW[:26], None], [1, 27])), 422, "'data' holds null"),
+        (
+            b'{"inputs": [{"name": "obs", "shape": [2], "datatype": "FP32", "data": [NaN, %d]}]}' % 10**30,
+            422,
+            "more than 64 bits",
+        ),
+        (request(tensor([*ROW[:26], 300], [1, 27], "INT8")), 422, "is not an integer in -128..127"),
+        (request(tensor([*ROW[:26], 1e39], [1, 27])), 422, "element 26 (element_26) is inf"),
+        (b'{"inputs": [{"name": "obs", "shape": [1], "datatype": "FP32", "data": [NaN]}]}', 422, "of shape [-1, 27]"),
+        (request(tensor(ROW, [1, 27], "FP8")), 400, "datatype must be one of BOOL, UINT8"),
+        (request(tensor(ROW, [1, 27], "BYTES")), 400, "holds strings: a policy reads numbers"),
+        (request(tensor(ROW, [-1, 27])), 400, "'shape' must be a list of sizes"),
+        (request(tensor(ROW, [1, 2**62])), 400, "'shape' must be a list of sizes"),
+        (request(tensor(ROW, [1, 27], name="image")), 422, "has the input 'obs' and has no input 'image'"),
+        (request(tensor(ROW, [1, 27]), tensor(ROW, [1, 27])), 400, "input 'obs' is there twice"),
+        (request(tensor(ROW, [1, 27], parameters={"shared_memory_region": "r"})), 400, "shared memory"),
+        (request(tensor(ROW, [1, 27], parameters={"binary_data_size": 108})), 400, "both 'data' and"),
+        (request(tensor(ROW, [1, 27]), outputs=[{"name": "value"}]), 400, "the model's output is 'action'"),
+        (request(tensor(ROW, [1, 27]), outputs=[{"name": "action", "parameters": {"classification": 3}}]), 400, "not"),
+        (request(tensor(ROW, [1, 27]), parameters={"binary_data_output": 1}), 400, "must be true or false"),
+        (request(tensor(ROW, [1, 27]), parameters={"explor": True}), 400, "unknown parameter 'explor'"),
+        (request(tensor(ROW, [1, 27]), parameters={"seed": -1}), 400, "'seed' must be in 0.."),
+        (request(tensor(ROW, [1, 27]), parameters={"sequence_id": True}), 400, "'sequence_id' must be an integer, or"),
+        (request(tensor(ROW, [1, 27]), parameters={"deadline_ms": 0}), 408, "nothing computed"),
+        (request(tensor([0.0] * 27 * 65, [65, 27])), 413, "a batch of 65 observations is too large: at most 64"),
+    ],
+)  # fmt: skip
+def test_a_wrong_request_is_told_what_is_wrong(ask: Ask, body: Any, status: int, sentence: str) -> None:
+    got, reply = infer(ask, body)
+    assert got == status and sentence in reply["error"], reply
+
+
+@pytest.mark.parametrize(
+    ("length", "raw", "sentence"),
+    [
+        ("9999999", 108, "Inference-Header-Content-Length is 9999999, and the body has"),
+        ("-1", 108, "must be the JSON's length, got '-1'"),
+        (None, 104, "needs 108 bytes after the JSON and 104 are left"),
+        (None, 112, "the body has 4 bytes after the last tensor's data"),
+    ],
+)
+def test_binary_lengths_must_add_up(ask: Ask, length: str | None, raw: int, sentence: str) -> None:
+    header = json.dumps(
+        {"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "parameters": {"binary_data_size": 108}}]}
+    ).encode()
+    status, reply = infer(ask, header + b"\0" * raw, **{LENGTH: length or str(len(header))})
+    assert status == 400 and sentence in reply["error"], reply
+
+
+def test_an_unsafe_action_does_not_leave_over_this_protocol_either(ask: Ask) -> None:
+    status, reply = infer(ask, request(tensor([[100.0] * 27], [1, 27])), "unsafe")
+    assert (status, reply["code"]) == (500, "unsafe-action")
+
+
+def test_no_damaged_request_gets_a_5xx_or_stops_the_server(ask: Ask) -> None:
+    header = json.dumps(
+        {
+            "inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "parameters": {"binary_data_size": 108}}],
+            "outputs": [{"name": "action", "parameters": {"binary_data": True}}],
+            "parameters": {"explore": True, "seed": 3, "seq": 1, "deadline_ms": 1000, "timeout": 100000},
+        }
+    ).encode()
+    rng = random.Random(0)
+    seen: dict[int, int] = {}
+    for number in range(600):
+        body = bytearray(header + ONE.tobytes())
+        for _ in range(rng.randint(1, 2)):
+            body[rng.randrange(len(header))] = rng.choice((rng.randrange(256), *b"0189-x[}"))
+        if number % 5 == 0:
+            body = body[: rng.randrange(len(body))]
+        length = len(header) if number % 7 else rng.randrange(len(header) + 50)
+        status, _, reply = ask("POST", "/v2/models/ur5/infer", bytes(body), **{LENGTH: str(length)})
+        seen[status] = seen.get(status, 0) + 1
+        assert status < 500, (bytes(body), reply)
+        if status != 200:
+            assert set(json.loads(reply)) <= {"error", "code", "details"}
+    assert seen[400] > 200 and seen[422] and seen[200] > 5, seen
+    assert infer(ask, request(tensor(ONE.tolist(), [1, 27])))[0] == 200
+
+
+def test_the_repository_index_reads_the_protocols_filter(ask: Ask) -> None:
+    assert ask("POST", "/v2/repository/index", b'{"ready": true}')[0] == 200
+    assert ask("POST", "/v2/repository/index", b"[")[0] == 400

@@ -1,0 +1,291 @@
+"""The WebSocket protocol over real bundles and a real socket, with a client as openpi's is written."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import http.client
+import json
+import random
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import websockets.sync.client
+from numpy.typing import NDArray
+from uvicorn.protocols.utils import ClientDisconnected
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from rlservo.export.contract.bundle import Contract
+from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.policy_store import PolicyStore
+
+OBS = (np.arange(27) * 0.01).astype(np.float32)
+ARRAY = b"__ndarray__"
+
+# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
+pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+
+
+def pack_array(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return {ARRAY: True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
+    if isinstance(value, np.generic):
+        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
+    return value
+
+
+def unpack_array(value: Any) -> Any:
+    if ARRAY in value:
+        return np.ndarray(buffer=value[b"data"], dtype=np.dtype(value[b"dtype"]), shape=value[b"shape"])
+    return value
+
+
+pack = functools.partial(msgpack.packb, default=pack_array)
+unpack = functools.partial(msgpack.unpackb, object_hook=unpack_array)
+
+
+class OpenpiClient:
+    """The behaviour of openpi's WebsocketClientPolicy: metadata first, then request and response; text raises."""
+
+    def __init__(self, port: int, path: str = "", **headers: str) -> None:
+        self._connection = websockets.sync.client.connect(
+            f"ws://127.0.0.1:{port}{path}", compression=None, max_size=None, additional_headers=headers
+        )
+        self._socket = self._connection.__enter__()
+        self.metadata = unpack(self._socket.recv())
+
+    def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
+        return self.exchange(pack(obs))
+
+    def exchange(self, content: bytes | str) -> dict[str, Any]:
+        self._socket.send(content)
+        response = self._socket.recv()
+        if isinstance(response, str):
+            raise RuntimeError(response)
+        reply: dict[str, Any] = unpack(response)
+        return reply
+
+    def close_code(self) -> int | None:
+        with pytest.raises(ConnectionClosed):
+            self._socket.recv()
+        return self._socket.close_code
+
+    def __enter__(self) -> OpenpiClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._connection.__exit__(None, None, None)
+
+
+@pytest.fixture(scope="module")
+def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
+    unsafe = box_policy(tmp_path_factory.mktemp("unsafe"), name="unsafe", action_scale=5.0)
+    return PolicyStore.load([policies, unsafe])
+
+
+Serve = Callable[[Any], AbstractContextManager[int]]
+
+
+@pytest.fixture(scope="module")
+def port(store: PolicyStore, served: Serve) -> Iterator[int]:
+    settings = ServerSettings(max_body_bytes=100_000, max_batch=64, default_policy="ur5")
+    with served(create_app(lambda: store, settings)) as port:
+        yield port
+
+
+def expected(store: PolicyStore, obs: Any = OBS, name: str = "ur5", version: str | None = None) -> NDArray[Any]:
+    return store.act(name, version, obs).action
+
+
+def test_an_openpi_client_at_the_root_gets_metadata_and_actions(port: int, store: PolicyStore) -> None:
+    with OpenpiClient(port) as client:
+        assert (client.metadata["policy"], client.metadata["version"]) == ("ur5", "10")
+        assert Contract.model_validate(client.metadata["contract"]) == store.get("ur5").contract
+        first = client.infer({"obs": OBS})
+        assert first["actions"].shape == (1, 6) and first["actions"].dtype == np.float32
+        np.testing.assert_array_equal(first["actions"][0], expected(store))
+        assert set(first["server_timing"]) == {"infer_ms"} and first["server_timing"]["infer_ms"] > 0
+        second = client.infer({"obs": 2 * OBS, "seq": 7})
+        np.testing.assert_array_equal(second["actions"][0], expected(store, 2 * OBS))
+        assert second["seq"] == 7 and second["server_timing"]["prev_total_ms"] > first["server_timing"]["infer_ms"]
+
+
+def test_the_health_check_openpi_clients_poll_answers_ok(port: int) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", "/healthz")
+    assert connection.getresponse().read() == b"OK"
+    connection.close()
+
+
+def test_a_policy_and_a_version_have_streams_of_their_own(port: int, store: PolicyStore) -> None:
+    with OpenpiClient(port, "/v1/policies/ur5/versions/2/stream") as client:
+        reply = client.infer({"obs": OBS})
+        assert (reply["version"], client.metadata["version"]) == ("2", "2")
+        np.testing.assert_array_equal(reply["actions"][0], expected(store, version="2"))
+    with OpenpiClient(port, "/v1/policies/gridworld/stream") as client:
+        assert client.infer({"obs": np.int64(2)})["actions"].tolist() == [expected(store, 2, "gridworld").item()]
+        assert client.infer({"obs": 2})["actions"].shape == (1,)
+
+
+def test_observations_come_as_named_elements_lists_batches_and_other_dtypes(port: int, store: PolicyStore) -> None:
+    with OpenpiClient(port) as client:
+        named = {f"element_{i}": value for i, value in enumerate(OBS)}
+        for obs in (named, {"obs": named}, {"obs": OBS.tolist()}, {"obs": OBS.astype(">f8")}):
+            np.testing.assert_array_equal(client.infer(obs)["actions"][0], expected(store))
+        batch = np.stack([OBS, -OBS, 3 * OBS])
+        actions = client.infer({"obs": batch})["actions"]
+        assert actions.shape == (3, 1, 6)  # a chunk of one for each, so that no client plays the batch as a chunk
+        np.testing.assert_array_equal(actions[:, 0], expected(store, batch))
+
+
+def test_a_reset_is_taken_where_nothing_is_remembered(port: int, store: PolicyStore) -> None:
+    named = {f"element_{i}": value for i, value in enumerate(OBS)}
+    with OpenpiClient(port) as client:
+        for request in ({"obs": OBS, "reset": True}, {**named, "reset": True}):
+            np.testing.assert_array_equal(client.infer(request)["actions"][0], expected(store))
+
+
+def test_exploring_is_repeatable_by_seed(port: int) -> None:
+    with OpenpiClient(port) as client:
+        first, again, other = (
+            client.infer({"obs": OBS, "explore": True, "seed": seed})["actions"].tolist() for seed in (1, 1, 2)
+        )
+    assert first == again != other
+
+
+def array(**changes: Any) -> bytes:
+    document = {ARRAY: True, b"data": OBS.tobytes(), b"dtype": "<f4", b"shape": [27]}
+    document.update({key.encode(): value for key, value in changes.items()})
+    return msgpack.packb({"obs": document})
+
+
+@pytest.mark.parametrize(
+    ("content", "code", "sentence"),
+    [
+        ("text", "bad-request", "text frame: send msgpack in a binary one"),
+        (b"\xc1", "bad-request", "is not msgpack"),
+        (b"", "bad-request", "is not msgpack"),
+        (pack({"obs": OBS}) + b"\0", "bad-request", "is not msgpack"),
+        (b"\x91" * 5000 + b"\xc0", "bad-request", "is not msgpack"),
+        (pack([1]), "bad-request", "must be a map"),
+        (pack({1: 2}), "bad-request", "is not msgpack"),
+        (pack({"obs": OBS, "sed": 1}), "bad-request", "unknown field 'sed'"),
+        (pack({"obs": OBS, "seed": -1}), "bad-request", "'seed' must be in 0.."),
+        (pack({"obs": OBS[:26]}), "bad-observation", "expects obs of shape (27,), got (26,)"),
+        (pack({"obs": OBS * np.float32(np.nan)}), "bad-observation", "element 0 (element_0) is nan"),
+        (pack({"obs": msgpack.ExtType(5, b"x")}), "bad-observation", "cannot read obs"),
+        (pack({"element_0": 1.0}), "bad-observation", "missing 'element_1'"),
+        (array(dtype="|O"), "bad-observation", "is of dtype '|O': send numbers"),
+        (array(dtype="<c8"), "bad-observation", "is of dtype '<c8'"),
+        (array(dtype="f4,f4"), "bad-observation", "is of dtype 'f4,f4'"),
+        (array(dtype="<f8"), "bad-observation", "needs 216 bytes, got 108 bytes"),
+        (array(shape=[-1]), "bad-observation", "has the shape [-1]"),
+        (array(shape=[2**40, 2**40]), "bad-observation", "expected a list of sizes"),
+        (array(data="x" * 108), "bad-observation", "needs 108 bytes, got a str"),
+        (pack({"obs": {b"__npgeneric__": True, b"data": "x", b"dtype": "<f4"}}), "bad-observation", "holds a str"),
+        (pack({"obs": np.zeros((65, 27), np.float32)}), "too-large", "a batch of 65 observations"),
+        (pack({"obs": np.zeros(30_000, np.float32)}), "too-large", "larger than 100000 bytes"),
+        (pack({"obs": OBS, "deadline_ms": 0}), "deadline-passed", "nothing computed"),
+    ],
+)  # fmt: skip
+def test_an_error_is_a_text_frame_then_close_1011(port: int, content: bytes | str, code: str, sentence: str) -> None:
+    with OpenpiClient(port) as client:
+        with pytest.raises(RuntimeError) as caught:
+            client.exchange(content)
+        reply = json.loads(str(caught.value))
+        assert reply["code"] == code and sentence in reply["error"], reply
+        assert client.close_code() == 1011
+
+
+def test_an_unsafe_action_does_not_leave_over_this_protocol_either(port: int) -> None:
+    with OpenpiClient(port, "/v1/policies/unsafe/stream") as client, pytest.raises(RuntimeError, match="unsafe-action"):
+        client.infer({"obs": np.full(27, 100.0)})
+
+
+@pytest.mark.parametrize("path", ["/v1/policies/nobody/stream", "/v1/policies/ur5/versions/99/stream", "/other"])
+def test_a_stream_that_does_not_exist_is_refused_with_404_in_our_form(port: int, path: str) -> None:
+    with pytest.raises(InvalidStatus) as caught:
+        OpenpiClient(port, path)
+    response = caught.value.response
+    assert response.status_code == 404
+    assert json.loads(response.body or b"")["code"] in ("unknown-policy", "unknown-version")
+
+
+def test_without_a_default_policy_the_root_says_where_to_connect(store: PolicyStore, served: Serve) -> None:
+    with served(create_app(lambda: store, ServerSettings())) as port:
+        with pytest.raises(InvalidStatus) as caught:
+            OpenpiClient(port)
+        assert b"no default policy, but gridworld, unsafe, ur5" in (caught.value.response.body or b"")
+
+
+def test_a_server_that_is_loading_refuses_streams_with_503(served: Serve) -> None:
+    with served(create_app(lambda: None, ServerSettings())) as port:
+        with pytest.raises(InvalidStatus) as caught:
+            OpenpiClient(port)
+        assert caught.value.response.status_code == 503 and caught.value.response.headers["retry-after"] == "1"
+
+
+def test_no_damaged_frame_gets_anything_but_an_answer_or_a_named_error(port: int) -> None:
+    rng = random.Random(0)
+    good = pack({"obs": OBS, "explore": True, "seed": 1, "seq": 2, "deadline_ms": 1000.0})
+    codes: dict[str, int] = {}
+    client = OpenpiClient(port)
+    for number in range(300):
+        damaged = bytearray(good)
+        for _ in range(rng.randint(1, 3)):
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+        try:
+            assert np.isfinite(
+                client.exchange(bytes(damaged[: None if number % 5 else rng.randrange(200)]))["actions"]
+            ).all()
+        except RuntimeError as error:
+            code = json.loads(str(error))["code"]
+            codes[code] = codes.get(code, 0) + 1
+            client.close()
+            client = OpenpiClient(port)
+    client.close()
+    assert set(codes) <= {"bad-request", "bad-observation", "deadline-passed"} and sum(codes.values()) > 50, codes
+
+
+def test_a_client_that_goes_while_it_is_answered_is_no_failure_of_the_server(
+    store: PolicyStore, caplog: pytest.LogCaptureFixture
+) -> None:
+    app = create_app(lambda: store, ServerSettings())
+    frames = iter([{"type": "websocket.connect"}, {"type": "websocket.receive", "bytes": pack({"obs": OBS})}])
+    sent: list[str] = []
+
+    async def receive() -> Any:
+        return next(frames)
+
+    async def send(message: Any) -> None:
+        sent.append(message["type"])
+        if len(sent) > 2:  # after the acceptance and the metadata
+            raise ClientDisconnected
+
+    scope = {"type": "websocket", "path": "/v1/policies/ur5/stream", "headers": [], "query_string": b""}
+    asyncio.run(app(scope, receive, send))
+    assert sent == ["websocket.accept", "websocket.send", "websocket.send"]
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
+    assert b'code="internal"' not in app.state.core.exposition()
+
+
+def test_many_robots_stream_at_once_and_none_gets_anothers_action(port: int, store: PolicyStore) -> None:
+    clients = [OpenpiClient(port) for _ in range(20)]
+    for _ in range(5):
+        for index, client in enumerate(clients):
+            client._socket.send(pack({"obs": OBS * index, "seq": index}))
+        for index, client in enumerate(clients):
+            reply = unpack(client._socket.recv())
+            assert reply["seq"] == index
+            np.testing.assert_array_equal(reply["actions"][0], expected(store, OBS * index))
+    for client in clients:
+        client.close()

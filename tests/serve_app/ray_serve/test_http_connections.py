@@ -1,0 +1,186 @@
+"""The time-outs of a replica's HTTP connections: every phase a client may stop in. Real uvicorn, no Ray."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import uvicorn
+from uvicorn.protocols.http import auto
+
+from rlservo.serve_app.ray_serve import http_connections
+from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
+from rlservo.serve_app.ray_serve.ingress import Ingress
+
+SOON_S = 10.0  # a busy machine's
+HANDSHAKE = (
+    "upgrade: websocket\r\nconnection: upgrade\r\nsec-websocket-version: 13\r\n"
+    "sec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+)
+
+
+async def app(scope: Any, receive: Any, send: Any) -> None:
+    """Echo bodies; below /unread answer without reading them, at /much with 64 MB; accept and echo WebSockets."""
+    if scope["type"] == "websocket":
+        await receive()
+        await send({"type": "websocket.accept"})
+        while (message := await receive())["type"] == "websocket.receive":
+            await send({"type": "websocket.send", "bytes": message["bytes"]})
+        return
+    body = b"no"
+    if scope["path"] == "/much":
+        body = bytes(64 << 20)
+    elif not scope["path"].startswith("/unread"):
+        body, more = b"", True
+        while more:
+            message = await receive()
+            if message["type"] == "http.disconnect":
+                return
+            body, more = body + message["body"], message["more_body"]
+    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"%d" % len(body))]})
+    await send({"type": "http.response.body", "body": body})
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[uvicorn.Server]:
+    """A server whose phases end after a second."""
+    monkeypatch.setattr(http_connections, "HEAD_S", 1.0)
+    monkeypatch.setattr(http_connections, "BODY_S", 1.0)
+    monkeypatch.setattr(http_connections, "UNREAD_S", 1.0)
+    monkeypatch.setattr(http_connections, "LOOK_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        config = uvicorn.Config(Ingress(app), http=TimedProtocol, log_level="critical", lifespan="off")
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            while not server.started:
+                time.sleep(0.01)
+            yield server
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+@pytest.fixture
+def port(server: uvicorn.Server) -> int:
+    return int(server.servers[0].sockets[0].getsockname()[1])
+
+
+def until_closed(port: int, content: bytes) -> bytes:
+    """Send this, and return all that comes until the server closes; fail where it does not."""
+    with socket.create_connection(("127.0.0.1", port), timeout=SOON_S) as connection:
+        connection.sendall(content)
+        return rest(connection)
+
+
+def rest(connection: socket.socket) -> bytes:
+    answer = b""
+    deadline = time.monotonic() + SOON_S
+    while piece := connection.recv(65536):
+        answer += piece
+        assert time.monotonic() < deadline
+    return answer
+
+
+@pytest.mark.parametrize("content", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nhost: x\r\n", b"\r\n"])
+def test_a_head_that_does_not_come_ends_the_connection(port: int, content: bytes) -> None:
+    answer = until_closed(port, content)
+    assert answer.startswith(b"HTTP/1.1 408")
+    assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "deadline-passed"
+
+
+@pytest.mark.parametrize("more", [b"GET / HT", b"\r\n\r\n"])
+def test_so_does_a_further_head(port: int, more: bytes) -> None:
+    with socket.create_connection(("127.0.0.1", port), timeout=SOON_S) as connection:
+        connection.sendall(b"GET /a HTTP/1.1\r\nhost: x\r\n\r\n")
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200")
+        connection.sendall(more)
+        assert rest(connection).startswith(b"HTTP/1.1 408")
+
+
+def test_a_body_that_does_not_come_ends_the_connection(port: int) -> None:
+    head = b"POST / HTTP/1.1\r\nhost: x\r\ncontent-length: 100000\r\n\r\n"
+    assert until_closed(port, head + b"x" * 1000).startswith(b"HTTP/1.1 408")
+
+
+@pytest.mark.parametrize("announced", ["content-length: 10000000", "transfer-encoding: chunked"])
+def test_a_reply_that_does_not_wait_for_the_body_ends_the_connection(port: int, announced: str) -> None:
+    sent = b"ffff\r\n" + b"x" * 5000  # less than announced, whichever way
+    for _ in range(3):  # a reply in the middle of a turn of the event loop, and one at its end
+        answer = until_closed(port, f"POST /unread HTTP/1.1\r\nhost: x\r\n{announced}\r\n\r\n".encode() + sent)
+        assert answer.startswith(b"HTTP/1.1 200") and answer.endswith(b"no")
+
+
+def test_many_replies_at_once_are_not_lost(port: int) -> None:
+    head = b"POST /unread HTTP/1.1\r\nhost: x\r\ncontent-length: 100000\r\n\r\n"
+    with contextlib.ExitStack() as stack:
+        made = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=SOON_S)) for _ in range(40)]
+        for connection in made:
+            connection.sendall(head)
+        assert all(rest(connection).endswith(b"no") for connection in made)
+
+
+def test_a_client_that_does_not_read_is_left(port: int, server: uvicorn.Server) -> None:
+    with socket.create_connection(("127.0.0.1", port), timeout=SOON_S) as connection:
+        connection.sendall(b"GET /much HTTP/1.1\r\nhost: x\r\n\r\n")
+        deadline = time.monotonic() + 3 * SOON_S
+        while not server.server_state.connections:
+            time.sleep(0.01)
+        while server.server_state.connections:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+
+
+@pytest.mark.parametrize(
+    "request_line",
+    ["POST /a", "GET /a", "PUT /a"],
+)
+@pytest.mark.parametrize(
+    "body",
+    [
+        "content-length: 5\r\n\r\nhello",
+        "content-length: 5\r\n\r\nhe",
+        "transfer-encoding: chunked\r\n\r\n5\r\nhello\r\n",
+    ],
+)
+@pytest.mark.parametrize("upgrade", [HANDSHAKE, "upgrade: h2c\r\nconnection: upgrade, http2-settings\r\n"])
+def test_an_upgrade_with_a_body_is_answered_at_once(port: int, request_line: str, body: str, upgrade: str) -> None:
+    answer = until_closed(port, f"{request_line} HTTP/1.1\r\nhost: x\r\n{upgrade}{body}".encode())
+    assert answer.startswith(b"HTTP/1.1 400")
+    assert "Upgrade" in json.loads(answer.partition(b"\r\n\r\n")[2])["error"]
+
+
+def test_a_websocket_still_begins_and_outlives_the_phases_of_a_request(port: int) -> None:
+    from websockets.sync.client import connect
+
+    with connect(f"ws://127.0.0.1:{port}/a") as stream:
+        time.sleep(2.5)
+        stream.send(b"hello")
+        assert stream.recv(timeout=SOON_S) == b"hello"
+
+
+def test_an_idle_connection_outlives_the_phases_of_a_request(port: int) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=SOON_S)
+    for _ in range(3):
+        connection.request("POST", "/", b"hello")
+        assert connection.getresponse().read() == b"hello"
+        assert connection.sock is not None
+        time.sleep(1.5)
+    connection.close()
+
+
+def test_a_uvicorn_without_what_it_changes_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http_connections, "PRIVATE", ("_start_asgi_task", "_moved_elsewhere"))
+    with pytest.raises(RuntimeError, match=rf"uvicorn {uvicorn.__version__} .*_moved_elsewhere"):
+        http_connections.install()
+    assert auto.AutoHTTPProtocol is not TimedProtocol
+    assert asyncio.iscoroutinefunction(app)

@@ -1,0 +1,479 @@
+"""Bundles that somebody made to stop a server, and file systems that hang: refused in a sentence, all else goes on."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import io
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from onnx import helper, numpy_helper
+
+from rlservo.export.contract import bundle as bundle_files
+from rlservo.export.contract import regular_files
+from rlservo.export.contract.bundle import BoxSpec, BundleLimits, load_bundle, read_contract
+from rlservo.export.contract.errors import (
+    BundleError,
+    BundleTamperedError,
+    RefusedError,
+    RequestError,
+    RlservoError,
+    UnavailableError,
+)
+from rlservo.export.contract.regular_files import open_regular
+from rlservo.serve_app.client.admin_client import AdminClient
+from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.api_keys import new_key
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions import plan
+from rlservo.serve_app.versions.blocking_calls import BlockingCalls
+from rlservo.serve_app.versions.plan import Plan, PolicyPlan, ServedConfig
+from rlservo.serve_app.versions.replica_versions import Control, Following
+from rlservo.serve_app.versions.repository import Library, Repository, load_served
+
+Serve = Callable[[Any], AbstractContextManager[int]]
+
+FILES = ("contract.json", "policy.onnx", "policy.ts", "golden.npz", "SHA256SUMS")
+OBS = np.zeros(27, np.float32) + 0.1
+OPERATOR, _ = new_key("operator", admin=True)
+DIGEST = "sha256:" + hashlib.sha256(OPERATOR.encode()).hexdigest()
+SOON_S = 5.0  # [s] a command and a request for an action; the machine may be busy
+
+
+class Shelf:
+    """A ledger in memory."""
+
+    def __init__(self) -> None:
+        self.plans: dict[int, bytes] = {}
+
+    def newest(self) -> int:
+        return max(self.plans, default=0)
+
+    def read(self, generation: int) -> bytes | None:
+        return self.plans.get(generation)
+
+    def append(self, generation: int, content: bytes) -> bool:
+        return self.plans.setdefault(generation, content) is content
+
+
+@pytest.fixture
+def root(policies: Path, tmp_path: Path) -> Path:
+    """A repository with ur5 in 1 and 2, and gridworld."""
+    root = tmp_path / "policies"
+    for bundle in ("ur5/1", "ur5/2", "gridworld/1"):
+        shutil.copytree(policies / bundle, root / bundle)
+    return root
+
+
+@pytest.fixture
+def patience_s(request: pytest.FixtureRequest) -> float:
+    """[s] How long the server waits for the file system."""
+    return float(getattr(request, "param", 60))
+
+
+@pytest.fixture
+def url(root: Path, served: Serve, patience_s: float) -> Iterator[str]:
+    """A server of ur5 in 1 and 2, and of gridworld."""
+    library = Library(Repository([root]))
+    control = Control(library, Shelf(), replica="r", scan_timeout_s=patience_s, load_timeout_s=patience_s)
+    asyncio.run(control.configure({}))
+    app = create_app(lambda: control.store, ServerSettings(operator_key=DIGEST), replica="r", control=control)
+    with served(app) as port:
+        yield f"http://127.0.0.1:{port}"
+    control.close()
+
+
+@pytest.fixture
+def admin(url: str) -> Iterator[AdminClient]:
+    with AdminClient(url, api_key=OPERATOR) as client:
+        yield client
+
+
+def make(kind: str, file: Path) -> None:
+    file.unlink()
+    if kind == "a FIFO":
+        os.mkfifo(file)
+    elif kind == "a device":
+        file.symlink_to("/dev/zero")
+    elif kind == "a folder":
+        file.mkdir()
+    elif kind == "a socket":
+        here = Path.cwd()
+        os.chdir(file.parent)  # a socket's path is short
+        try:
+            with socket.socket(socket.AF_UNIX) as listener:
+                listener.bind(file.name)
+        finally:
+            os.chdir(here)
+
+
+def work_goes_on(admin: AdminClient, url: str) -> None:
+    """Whoever acts, and every other command, is answered soon."""
+    with httpx.Client(base_url=url, timeout=SOON_S) as robot:
+        for command in (
+            lambda: admin.alias("ur5", "candidate", "1"),
+            lambda: admin.shadow("ur5", "candidate"),
+            lambda: admin.shadow("ur5", None),
+            lambda: admin.alias("ur5", "candidate", None),
+            admin.replicas,
+        ):
+            began = time.monotonic()
+            command()
+            reply = robot.post("/v1/policies/ur5/act", json={"obs": OBS.tolist()})
+            assert reply.status_code == 200 and reply.json()["version"] == "2"
+            assert time.monotonic() - began < SOON_S
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_what_is_no_regular_file_is_refused_at_once_and_administration_goes_on(
+    url: str, admin: AdminClient, root: Path, policies: Path, name: str
+) -> None:
+    for kind in ("a FIFO", "a device", "a folder", "a socket"):
+        folder = Path(shutil.copytree(policies / "ur5" / "10", root / "ur5" / "10"))
+        make(kind, folder / name)
+        began = time.monotonic()
+        with pytest.raises((RefusedError, RequestError), match=f"{name} is {kind}, not a regular file"):
+            admin.load("ur5", "10")
+        assert time.monotonic() - began < SOON_S
+        work_goes_on(admin, url)
+        shutil.rmtree(folder)
+    assert admin.load("gridworld")["versions"] == ["1"]
+
+
+def test_a_server_does_not_start_on_a_fifo_and_says_so(root: Path) -> None:
+    make("a FIFO", root / "ur5" / "2" / "policy.onnx")
+    began = time.monotonic()
+    with pytest.raises(BundleError, match=r"policy.onnx is a FIFO, not a regular file"):
+        load_served([root], ServedConfig())
+    assert time.monotonic() - began < 5
+
+
+def test_links_to_regular_files_are_a_bundle(policies: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "ur5" / "1"
+    folder.mkdir(parents=True)
+    for file in (policies / "ur5" / "1").iterdir():
+        (folder / file.name).symlink_to(file)
+    with Policy.load(folder) as policy:
+        assert policy.act(OBS).shape == (6,)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_beyond_its_limit_is_refused_before_it_is_read(root: Path, name: str) -> None:
+    folder = root / "ur5" / "2"
+    os.truncate(folder / name, 1 << 40)  # a terabyte of nothing: reading it would take hours
+    limits = BundleLimits(max_policy_bytes=1 << 20, max_golden_bytes=1 << 20, max_contract_bytes=1 << 20)
+    with pytest.raises(BundleError, match=rf"{name} is larger than [\d,]+ bytes: it has 1,099,511,627,776"):
+        Policy.load(folder, limits=limits)
+
+
+def test_the_limits_are_settings(root: Path) -> None:
+    for name, value, sentence in (
+        ("max_policy_bytes", 2048, r"policy.onnx is larger than 2,048 bytes: .* \(max_policy_bytes\)"),
+        ("max_golden_bytes", 1024, r"golden.npz is larger than 1,024 bytes: .* \(max_golden_bytes\)"),
+        ("max_contract_bytes", 1024, r"contract.json is larger than 1,024 bytes: .* \(max_contract_bytes\)"),
+    ):
+        settings = ServerSettings.from_environment(environment={f"RLSERVO_{name.upper()}": str(value)})
+        with pytest.raises(BundleError, match=sentence):
+            load_served([root / "ur5"], ServedConfig(), settings)
+
+
+def test_more_files_than_a_bundle_has_are_not_hashed(root: Path) -> None:
+    folder = root / "ur5" / "2"
+    with (folder / "SHA256SUMS").open("a") as sums:
+        sums.writelines(f"{'0' * 64}  more{number}\n" for number in range(13))
+    with pytest.raises(BundleError, match="lists 17 files: at most 16"):
+        Policy.load(folder)
+
+
+def golden_of(folder: Path, members: dict[str, bytes]) -> None:
+    """Write a golden.npz of these members, with valid hashes."""
+    with zipfile.ZipFile(folder / "golden.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(f"{name}.npy", content)
+    bundle_files.write_contract(folder, read_contract(folder))
+
+
+def npy(array: Any) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def test_golden_vectors_that_unpack_to_more_than_the_limit_are_refused(root: Path) -> None:
+    folder = root / "ur5" / "2"
+    golden_of(folder, {f"input/{n}": npy(np.zeros(1 << 20)) for n in range(4)})
+    assert (folder / "golden.npz").stat().st_size < 1 << 18
+    with pytest.raises(BundleError, match=r"golden.npz unpacks to 33,\d+,\d+ bytes: at most 16,777,216"):
+        Policy.load(folder, limits=BundleLimits(max_golden_bytes=16 << 20))
+
+
+def test_golden_vectors_that_claim_more_than_they_hold_are_refused(root: Path) -> None:
+    folder = root / "ur5" / "2"
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 42,)})
+    golden_of(folder, {"input/obs": header.getvalue() + b"\0" * 64})
+    with pytest.raises(BundleError, match=r"'input/obs.npy' says that it is of shape \(4398046511104,\) and holds"):
+        Policy.load(folder)
+
+
+def test_a_contract_that_asks_for_all_the_memory_is_refused(root: Path, rewrite_contract: Callable[..., None]) -> None:
+    folder = root / "ur5" / "2"
+    space = BoxSpec(shape=(1 << 20, 1 << 20), dtype="float32", low=None, high=None)
+    tensor = read_contract(folder).inputs[0].model_copy(update={"shape": (-1, 1 << 20, 1 << 20)})
+    rewrite_contract(folder, observation_space=space, inputs=(tensor,))
+    with pytest.raises(BundleError, match=r"has 1,099,511,627,776 elements: at most"):
+        Policy.load(folder)
+
+
+@pytest.mark.parametrize("name", ["policy.onnx", "golden.npz"])
+def test_what_is_loaded_is_what_was_hashed(root: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = root / "ur5" / "2"
+
+    def exchange_after(*arguments: Any) -> Any:
+        bundle = load_bundle(*arguments)
+        shutil.copy(root / "ur5" / "1" / name, folder / name)
+        return bundle
+
+    monkeypatch.setattr("rlservo.serve_app.runtime.policy.load_bundle", exchange_after)
+    with pytest.raises(BundleTamperedError, match=f"{name} is not the file that was exported"):
+        Policy.load(folder)
+
+
+def test_a_bundle_that_is_another_one_while_it_is_read_is_not_served_under_the_accepted_hash(root: Path) -> None:
+    def other(folder: Path) -> Policy:
+        return Policy.load(folder.with_name("1"))
+
+    library = Library(Repository([root]), other)
+    version, digest = library.repository.find_digest("ur5", "2")
+    with pytest.raises(BundleTamperedError, match="is not the bundle that was accepted"):
+        library.load("ur5", version, digest)
+
+
+class Stalled:
+    """A file system that does not answer for one file until it is let go."""
+
+    def __init__(self, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.file = file
+        self.reached, self.go_on = threading.Event(), threading.Event()
+        self.waiting = 0
+        monkeypatch.setattr(regular_files, "open_regular", self)
+
+    def __call__(self, file: Path, max_bytes: int | None = None) -> Any:
+        if file == self.file:
+            self.waiting += 1
+            self.reached.set()
+            assert self.go_on.wait(60)
+        return open_regular(file, max_bytes)
+
+
+@pytest.fixture
+def stall(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Path], Stalled]]:
+    made: list[Stalled] = []
+
+    def stall(file: Path) -> Stalled:
+        made.append(Stalled(file, monkeypatch))
+        return made[-1]
+
+    yield stall
+    for one in made:
+        one.go_on.set()
+
+
+@pytest.mark.parametrize("name", ["contract.json", "policy.onnx"])
+def test_while_a_file_system_does_not_answer_all_else_goes_on(
+    url: str, admin: AdminClient, root: Path, policies: Path, name: str, stall: Callable[[Path], Stalled]
+) -> None:
+    folder = Path(shutil.copytree(policies / "ur5" / "10", root / "ur5" / "10"))
+    stalled = stall(folder / name)
+    loaded: list[dict[str, Any]] = []
+
+    def load() -> None:
+        with AdminClient(url, api_key=OPERATOR) as another:
+            loaded.append(another.load("ur5", "10"))
+
+    loading = threading.Thread(target=load)
+    loading.start()
+    try:
+        assert stalled.reached.wait(20)
+        work_goes_on(admin, url)
+        assert loading.is_alive() and not loaded
+    finally:
+        stalled.go_on.set()
+        loading.join(40)
+    assert loaded[0]["versions"] == ["1", "2", "10"] and loaded[0]["default"] == "2"
+
+
+@pytest.mark.parametrize("patience_s", [0.5], indirect=True)
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [("contract.json", "looking through the policies' folders took longer than 0.5 s and was given up"),
+     ("policy.onnx", "loading policy 'ur5' version 10 took longer than 0.5 s and was given up")],
+)  # fmt: skip
+def test_a_file_system_that_hangs_is_given_up_with_a_few_threads_at_most(
+    url: str,
+    admin: AdminClient,
+    root: Path,
+    policies: Path,
+    name: str,
+    sentence: str,
+    stall: Callable[[Path], Stalled],
+) -> None:
+    folder = Path(shutil.copytree(policies / "ur5" / "10", root / "ur5" / "10"))
+    stalled = stall(folder / name)
+    with pytest.raises(RlservoError, match=sentence):
+        admin.load("ur5", "10")
+    for _ in range(6):
+        with pytest.raises(RlservoError, match=r"given up|could not begin"):
+            admin.load("ur5", "10")
+    assert stalled.waiting <= 4
+    work_goes_on(admin, url)
+    stalled.go_on.set()
+    for _ in range(100):
+        try:
+            assert admin.load("ur5", "10")["versions"] == ["1", "2", "10"]
+            break
+        except RlservoError:  # the machine may be busy, and half a second is little
+            time.sleep(0.1)
+    else:
+        pytest.fail("the version does not load although the file system is back")
+
+
+def test_a_replica_whose_files_hang_does_not_hold_up_the_commands_of_others(
+    root: Path, tmp_path: Path, stall: Callable[[Path], Stalled], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.WATCH_PERIOD_S", 0.05)
+    monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.RETRY_PERIOD_S", 0.3)
+    elsewhere = Path(shutil.copytree(root, tmp_path / "elsewhere"))
+
+    async def run() -> None:
+        shelf = Shelf()
+        controls: list[Control] = []
+
+        async def tell(generation: int) -> list[Following]:
+            return [await control.follow(generation) for control in controls]
+
+        for folder in (root, elsewhere):
+            library = Library(Repository([folder]))
+            controls.append(Control(library, shelf, replica=folder.name, broadcast=tell, load_timeout_s=1))
+        config = {"policies": {"ur5": {"versions": ["1"]}, "gridworld": {}}, "unlisted": "ignore"}
+        for control in controls:
+            await control.configure(config)
+        stalled = stall(elsewhere / "ur5" / "2" / "policy.onnx")
+        with pytest.raises(UnavailableError, match="elsewhere: loading policy 'ur5' version 2 took longer than 1 s"):
+            await controls[0].load("ur5", "2", what="load")
+        watching = asyncio.create_task(controls[1].watch())
+        for number in range(5):  # of the other policy, while the watching replica tries again and again
+            began = time.monotonic()
+            with pytest.raises(UnavailableError, match="elsewhere: loading policy 'ur5' version 2 took longer"):
+                await controls[0].change(lambda p, n=number: aliased(p, f"alias{n}"), what="alias")  # type: ignore[misc]
+            assert time.monotonic() - began < 0.9  # not another second
+            arranged = controls[1].arranged("gridworld")
+            assert arranged is not None and f"alias{number}" in arranged.aliases
+            await asyncio.sleep(0.1)
+        stalled.go_on.set()
+        for _ in range(200):
+            if controls[1].store is not None and controls[1].store.versions("ur5") == ("1", "2"):
+                break
+            await asyncio.sleep(0.05)
+        watching.cancel()
+        assert controls[1].following().behind == ()
+
+    asyncio.run(run())
+
+
+def aliased(before: Plan, alias: str) -> dict[str, PolicyPlan]:
+    return plan.set_alias(before, "gridworld", alias, "1")
+
+
+def test_a_start_does_not_wait_in_silence_for_a_file_system_that_hangs(
+    root: Path, stall: Callable[[Path], Stalled]
+) -> None:
+    stalled = stall(root / "ur5" / "1" / "contract.json")
+    with pytest.raises(UnavailableError, match=r"looking through the folders took longer than 0.3 s"):
+        load_served([root], ServedConfig(), ServerSettings(scan_timeout_s=0.3))
+    stalled.go_on.set()
+
+
+def test_a_functions_own_time_out_is_not_taken_for_ours() -> None:
+    def fail() -> None:
+        raise TimeoutError("of a network file system")
+
+    calls = BlockingCalls()
+    with pytest.raises(TimeoutError, match="of a network"):
+        calls.wait(fail, timeout_s=5, what="test")
+    with pytest.raises(TimeoutError, match="of a network"):
+        asyncio.run(calls.run(fail, timeout_s=5, what="test"))
+
+
+LOAD = """
+import os, sys
+from rlservo.serve_app.runtime.policy import Policy
+import onnxruntime
+
+def resident(what):
+    line = next(line for line in open("/proc/self/status") if line.startswith(what))
+    return int(line.split()[1]) / 1e3
+
+Policy.load(sys.argv[1])
+before = resident("VmRSS")
+policy = Policy.load(sys.argv[2])
+print(resident("VmHWM") - before, resident("VmRSS") - before)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_a_large_graph_is_in_memory_about_once(policies: Path, tmp_path: Path, box_policy: Callable[..., Path]) -> None:
+    folder = box_policy(tmp_path, name="large")
+    model = onnx.load(folder / "policy.onnx")
+    rng = np.random.default_rng(0)
+    wide = 5000
+    model.graph.initializer.extend(
+        [
+            numpy_helper.from_array((rng.standard_normal((27, wide), np.float32) * 1e-2), "into"),
+            numpy_helper.from_array((rng.standard_normal((wide, wide), np.float32) * 1e-2), "across"),
+            numpy_helper.from_array((rng.standard_normal((wide, 27), np.float32) * 1e-2), "out_of"),
+        ]
+    )
+    for node, (left, right) in zip(
+        ("x1", "x2", "x3"), (("obs", "into"), ("x1", "across"), ("x2", "out_of")), strict=True
+    ):
+        model.graph.node.insert(int(node[1]) - 1, helper.make_node("MatMul", [left, right], [node]))
+    first = next(node for node in model.graph.node if node.op_type == "Gemm")
+    first.input[0] = "x3"
+    onnx.save(model, folder / "policy.onnx")
+    megabytes = (folder / "policy.onnx").stat().st_size / 1e6
+    assert megabytes > 100
+    contract = read_contract(folder)
+    session = onnxruntime.InferenceSession(folder / "policy.onnx")
+    obs = rng.standard_normal((8, 27)).astype(np.float32)
+    names = [tensor.name for tensor in contract.outputs]
+    outputs = dict(zip(names, session.run(names, {"obs": obs}), strict=True))
+    bundle_files.write_golden(folder, {"obs": obs}, outputs)
+    bundle_files.write_contract(folder, contract)
+    done = subprocess.run(
+        [sys.executable, "-c", LOAD, str(policies / "ur5" / "1"), str(folder)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    peak, kept = (float(number) for number in done.stdout.split())
+    # Measured: 1.5 and 1.0 times the file; from bytes it was 2.9 and 1.9.
+    assert peak < 2.2 * megabytes and kept < 1.5 * megabytes, (peak, kept, megabytes)

@@ -1,0 +1,306 @@
+"""The key file is followed while the server runs: what revokes a key, what changes nothing, what is said of it."""
+
+from __future__ import annotations
+
+import gc
+import http.client
+import json
+import logging
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import websockets.sync.client
+from websockets.exceptions import ConnectionClosed
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.ray_serve.launcher import serve_policies
+from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.server import api_key_file, api_keys
+from rlservo.serve_app.server.api_key_file import CurrentKeys
+from rlservo.serve_app.server.api_keys import Keys, new_key
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.policy_store import PolicyStore
+
+Serve = Callable[[Any], AbstractContextManager[int]]
+
+# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
+pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+
+OLD, OLD_LINE = new_key("cell-7")
+NEW, NEW_LINE = new_key("cell-8")
+OBS = [0.1] * 27
+
+
+def status(port: int, key: str) -> int:
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+        headers = {"content-type": "application/json", "authorization": f"Bearer {key}"}
+        connection.request("POST", "/v1/policies/ur5/act", json.dumps({"obs": OBS}), headers)
+        reply = connection.getresponse()
+        reply.read()
+        return reply.status
+
+
+def wait_for(what: Callable[[], bool], seconds: float = 10) -> float:
+    """Return after how many seconds it holds."""
+    began = time.monotonic()
+    while not what():
+        assert time.monotonic() - began < seconds
+        time.sleep(0.02)
+    return time.monotonic() - began
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    file = tmp_path / "keys"
+    file.write_text(OLD_LINE + "\n")
+    return file
+
+
+@pytest.fixture(scope="module")
+def store(ur5: Path) -> PolicyStore:
+    return PolicyStore.load([ur5])
+
+
+@pytest.fixture
+def replicas(store: PolicyStore, served: Serve, file: Path) -> Iterator[tuple[int, int]]:
+    settings = ServerSettings(api_keys_file=str(file))
+    with served(create_app(lambda: store, settings)) as one, served(create_app(lambda: store, settings)) as two:
+        yield one, two
+
+
+def in_place(file: Path, text: str) -> None:
+    file.write_text(text)
+
+
+def renamed_over(file: Path, text: str) -> None:
+    beside = file.with_name("beside")
+    beside.write_text(text)
+    beside.replace(file)
+
+
+def same_size_and_time(file: Path, text: str) -> None:
+    before = file.stat()
+    assert len(text) == before.st_size
+    file.write_text(text)
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+@pytest.mark.parametrize("write", [in_place, renamed_over, same_size_and_time])
+def test_a_removed_key_stops_and_a_new_one_works_on_every_replica(
+    replicas: tuple[int, int], file: Path, write: Callable[[Path, str], None]
+) -> None:
+    assert {status(port, OLD) for port in replicas} == {200} and {status(port, NEW) for port in replicas} == {401}
+    write(file, NEW_LINE + "\n")
+    took = wait_for(lambda: [status(port, key) for port in replicas for key in (OLD, NEW)] == [401, 200] * 2)
+    assert took < 5  # two looks, half a second apart; the machine may be busy
+
+
+def test_a_secret_that_kubernetes_swaps_is_followed(store: PolicyStore, served: Serve, tmp_path: Path) -> None:
+    def publish(name: str, text: str) -> None:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "keys").write_text(text)
+        (tmp_path / "..data_tmp").symlink_to(name)
+        (tmp_path / "..data_tmp").replace(tmp_path / "..data")
+
+    publish("..one", OLD_LINE)
+    (tmp_path / "keys").symlink_to("..data/keys")
+    with served(create_app(lambda: store, ServerSettings(api_keys_file=str(tmp_path / "keys")))) as port:
+        assert status(port, OLD) == 200
+        publish("..two", NEW_LINE)
+        shutil.rmtree(tmp_path / "..one")
+        wait_for(lambda: (status(port, OLD), status(port, NEW)) == (401, 200))
+
+
+def break_by(file: Path, how: str) -> None:
+    if how == "deleted":
+        file.unlink()
+    elif how == "empty":
+        file.write_text("# nobody\n")
+    elif how == "world-writable":
+        file.write_text(NEW_LINE)
+        file.chmod(0o666)
+    elif how == "malformed":
+        file.write_text(f"{NEW_LINE}\nsecret-in-clear\n")
+    elif how == "a folder":
+        file.unlink()
+        file.mkdir()
+    elif how == "a FIFO":
+        file.unlink()
+        os.mkfifo(file)
+    elif how == "no text":
+        file.write_bytes(b"\xff\xfe" + NEW_LINE.encode())
+    elif how == "endless":
+        file.write_text(NEW_LINE)
+        os.truncate(file, 1 << 33)
+
+
+def restore(file: Path) -> None:
+    if file.is_dir():
+        file.rmdir()
+    elif file.exists():
+        file.unlink()
+    renamed_over(file, NEW_LINE)
+
+
+@pytest.mark.parametrize(
+    ("how", "sentence"),
+    [("deleted", "cannot be read"), ("empty", "name no key"), ("world-writable", "written by every user"),
+     ("malformed", "line 2: expected"), ("a folder", "is a folder"), ("a FIFO", "is a FIFO, not a regular file"),
+     ("no text", "cannot be read"), ("endless", "is larger than")],
+)  # fmt: skip
+def test_a_file_that_cannot_be_used_changes_nothing_and_is_said_once(
+    file: Path, how: str, sentence: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    keys = CurrentKeys(ServerSettings(api_keys_file=str(file)))
+    break_by(file, how)
+    for _ in range(5):
+        keys.refresh()
+    assert keys.find(OLD.encode()) and not keys.find(NEW.encode()) and not keys.current and keys.changes == 0
+    said = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    assert len(said) == 1 and "the API keys stay as they were" in said[0] and sentence in said[0]
+    assert "secret-in-clear" not in said[0]
+    restore(file)
+    for _ in range(2):
+        keys.refresh()
+    assert keys.find(NEW.encode()) and not keys.find(OLD.encode()) and keys.current and keys.changes == 1
+    assert "'cell-8' added, 'cell-7' removed" in caplog.text
+    with pytest.raises(UsageError, match=sentence):  # what the start refuses, for the same reason
+        break_by(file, how)
+        Keys.from_settings(ServerSettings(api_keys_file=str(file)))
+
+
+def test_half_a_file_is_not_used(file: Path) -> None:
+    keys = CurrentKeys(ServerSettings(api_keys_file=str(file)))
+    half, whole = f"{NEW_LINE}\n", f"{NEW_LINE}\n{OLD_LINE}\n"
+    file.write_text(half)
+    keys.refresh()
+    file.write_text(whole)
+    keys.refresh()
+    assert keys.find(OLD.encode()) and not keys.find(NEW.encode())  # each was seen once
+    keys.refresh()
+    assert keys.find(OLD.encode()) and keys.find(NEW.encode()) and keys.changes == 1
+
+
+def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
+    store: PolicyStore, served: Serve, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hanging, go_on = threading.Event(), threading.Event()
+
+    def hang(_file: Path) -> bytes:
+        hanging.set()
+        go_on.wait(30)
+        return OLD_LINE.encode()
+
+    monkeypatch.setattr(api_key_file, "STALE_S", 0.1)
+    app = create_app(lambda: store, ServerSettings(api_keys_file=str(file)))
+    monkeypatch.setattr(api_keys, "read_key_file", hang)
+    try:
+        with served(app) as port:
+            assert hanging.wait(10)
+            assert status(port, OLD) == 200
+            time.sleep(0.2)
+            assert b'rlservo_api_keys_current{replica=""} 0.0' in app.state.core.exposition()
+    finally:
+        go_on.set()
+    monkeypatch.setattr(api_key_file, "STALE_S", 10.0)
+    wait_for(lambda: b'rlservo_api_keys_current{replica=""} 1.0' in app.state.core.exposition())
+
+
+def test_the_watching_ends_with_the_application(file: Path) -> None:
+    def watching() -> set[threading.Thread]:
+        return {thread for thread in threading.enumerate() if thread.name == "key-file"}
+
+    gc.collect()
+    before = watching()
+    keys = CurrentKeys(ServerSettings(api_keys_file=str(file)))
+    (mine,) = watching() - before
+    del keys
+    mine.join(10)
+    assert not mine.is_alive()
+
+
+@pytest.mark.parametrize("query", ["", "?errors=keep"])
+def test_a_stream_opened_with_a_removed_key_gets_no_further_action(
+    replicas: tuple[int, int], file: Path, query: str
+) -> None:
+    address, headers = f"ws://127.0.0.1:{replicas[0]}/v1/policies/ur5/stream{query}", {"x-api-key": OLD}
+    frame = msgpack.packb({"obs": OBS})
+    with websockets.sync.client.connect(address, additional_headers=headers) as stream:
+        stream.recv()
+        stream.send(frame)
+        assert "actions" in msgpack.unpackb(stream.recv())
+        file.write_text(f"{OLD_LINE}\n{NEW_LINE}\n")  # a change that leaves this key alone
+        wait_for(lambda: status(replicas[0], NEW) == 200)
+        stream.send(frame)
+        assert "actions" in msgpack.unpackb(stream.recv())
+        file.write_text(f"{NEW_LINE}\n")
+        wait_for(lambda: status(replicas[0], OLD) == 401)
+        stream.send(frame)
+        assert json.loads(stream.recv())["code"] == "unauthenticated"
+        with pytest.raises(ConnectionClosed):
+            stream.recv()
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+def test_two_replicas_behind_the_proxy_follow_the_file_and_end_grpc_streams(policies: Path, file: Path) -> None:
+    import grpc
+
+    from rlservo.serve_app.protocols import oip_messages as messages
+
+    port, grpc_port = free_ports(2)
+    ready, stop = threading.Event(), threading.Event()
+
+    def serve() -> None:
+        try:
+            serve_policies(
+                [policies],
+                port=port,
+                grpc_port=grpc_port,
+                replicas=2,
+                settings={"api_keys_file": str(file)},
+                on_ready=lambda _: ready.set(),
+                stop=stop,
+            )
+        finally:
+            ready.set()
+
+    server = threading.Thread(target=serve)
+    server.start()
+    try:
+        assert ready.wait(120) and server.is_alive()
+        request = messages.ModelInferRequest(model_name="ur5")
+        tensor = request.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
+        tensor.contents.fp32_contents.extend(OBS)
+        go_on = threading.Semaphore(1)
+
+        def requests() -> Iterator[bytes]:
+            while not stop.is_set():
+                if go_on.acquire(timeout=1):
+                    yield request.SerializeToString()
+
+        with grpc.insecure_channel(f"127.0.0.1:{grpc_port}") as channel:
+            stream = channel.stream_stream("/inference.GRPCInferenceService/ModelStreamInfer")(
+                requests(), metadata=[("application", "rlservo"), ("authorization", f"Bearer {OLD}")]
+            )
+            assert not messages.ModelStreamInferResponse.FromString(next(stream)).error_message
+            file.write_text(NEW_LINE)
+            for expected, key in ((401, OLD), (200, NEW)):  # by either replica
+                wait_for(lambda key=key, expected=expected: {status(port, key) for _ in range(20)} == {expected})  # type: ignore[misc]
+            go_on.release()
+            with pytest.raises(grpc.RpcError) as caught:
+                next(stream)
+            assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
+    finally:
+        stop.set()
+        server.join(60)
+    assert not server.is_alive()

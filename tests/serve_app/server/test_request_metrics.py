@@ -1,0 +1,99 @@
+"""The metrics as Prometheus would parse them, after real requests over the three protocols."""
+
+from __future__ import annotations
+
+import http.client
+import json
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import websockets.sync.client
+from prometheus_client.parser import text_string_to_metric_families
+
+from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.server.request_metrics import Histogram
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.policy_store import PolicyStore
+
+# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
+pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+
+OBS = [0.1] * 27
+
+
+def test_requests_are_counted_by_policy_version_protocol_and_outcome(
+    policies: Path, served: Callable[[Any], AbstractContextManager[int]]
+) -> None:
+    store = PolicyStore.load([policies])
+    app = create_app(lambda: store, ServerSettings(default_policy="ur5"), replica="r1")
+    with served(app) as port:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+
+        def call(path: str, body: Any = None) -> tuple[int, bytes]:
+            method = "GET" if body is None else "POST"
+            connection.request(method, path, body and json.dumps(body), {"content-type": "application/json"})
+            reply = connection.getresponse()
+            return reply.status, reply.read()
+
+        def scrape() -> dict[tuple[str, ...], float]:
+            status, text = call("/metrics")
+            assert status == 200
+            found = {}
+            for family in text_string_to_metric_families(text.decode()):
+                for sample in family.samples:
+                    labels = (value for key, value in sorted(sample.labels.items()) if key != "replica")
+                    assert sample.labels["replica"] == "r1"
+                    found[(sample.name, *labels)] = sample.value
+            return found
+
+        for _ in range(3):
+            assert call("/v1/policies/ur5/act", {"obs": OBS})[0] == 200
+        assert call("/v1/policies/ur5/versions/2/act", {"obs": [OBS] * 5})[0] == 200
+        tensor = {"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": OBS}
+        assert call("/v2/models/ur5/infer", {"inputs": [tensor]})[0] == 200
+        assert call("/v1/policies/ur5/act", {"obs": OBS[:3]})[0] == 422
+        for name in ("made-up-1", "made-up-2"):
+            assert call(f"/v1/policies/{name}/act", {"obs": OBS})[0] == 404
+        assert call("/v1/policies/ur5/versions/77/act", {"obs": OBS})[0] == 404
+        with websockets.sync.client.connect(f"ws://127.0.0.1:{port}/") as stream:
+            stream.recv()
+            stream.send(msgpack.packb({"obs": OBS}))
+            stream.recv()
+            seen = scrape()
+            assert seen["rlservo_streams", "ur5"] == 1
+        # Labels in the order of their names: code, policy, protocol, version (le first in buckets).
+        assert seen["rlservo_requests_total", "ok", "ur5", "json", "10"] == 3
+        assert seen["rlservo_requests_total", "ok", "ur5", "json", "2"] == 1
+        assert seen["rlservo_requests_total", "ok", "ur5", "oip", "10"] == 1
+        assert seen["rlservo_requests_total", "ok", "ur5", "websocket", "10"] == 1
+        assert seen["rlservo_requests_total", "bad-observation", "ur5", "json", "10"] == 1  # the default's
+        assert seen["rlservo_requests_total", "unknown-policy", "", "json", ""] == 2  # one series for any made-up name
+        assert seen["rlservo_requests_total", "unknown-version", "ur5", "json", ""] == 1
+        assert seen["rlservo_batch_size_sum", "ur5", "json", "2"] == 5
+        assert seen["rlservo_batch_size_bucket", "4.0", "ur5", "json", "2"] == 0
+        assert seen["rlservo_batch_size_bucket", "8.0", "ur5", "json", "2"] == 1
+        assert seen["rlservo_request_seconds_count", "ur5", "json", "10"] == 3
+        latency, inference = (
+            seen[f"rlservo_{name}_seconds_sum", "ur5", "json", "10"] for name in ("request", "inference")
+        )
+        assert 0 < inference < latency < 10
+        assert seen["rlservo_request_seconds_bucket", "+Inf", "ur5", "json", "10"] == 3
+        assert seen["rlservo_policy_loaded", "ur5", "10"] == 1 and seen["rlservo_policy_loaded", "ur5", "2"] == 0
+        again = scrape()
+        assert again["rlservo_streams", "ur5"] == 0
+        assert {key: again[key] for key in seen if "streams" not in key[0]} == {
+            key: value for key, value in seen.items() if "streams" not in key[0]
+        }
+        connection.close()
+
+
+def test_a_value_on_a_bound_is_within_it_and_buckets_are_cumulative() -> None:
+    histogram = Histogram((1.0, 2.0))
+    for value in (0.5, 1.0, 1.5, 2.0, 9.0):
+        histogram.add(value)
+    assert histogram.cumulative() == [("1.0", 2.0), ("2.0", 4.0), ("+Inf", 5.0)]
+    assert histogram.total == 14.0

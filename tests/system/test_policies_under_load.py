@@ -1,0 +1,514 @@
+"""What changes under load costs nobody a request: real Ray Serve, two replicas, clients that never stop asking.
+
+One cluster for the whole file, started as an operator does: the shipped configuration, `serve deploy`, an admin key.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import os
+import re
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from rlservo.export.contract.errors import ConflictError, RefusedError, UnauthenticatedError
+from rlservo.serve_app.client.admin_client import AdminClient
+from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.ray_serve import haproxy_wrapper
+from rlservo.serve_app.ray_serve.processes import MARK, end_marked, free_ports, remove_folder
+from rlservo.serve_app.server.api_keys import new_key
+
+pytestmark = [pytest.mark.serve, pytest.mark.slow]
+
+ROOT = Path(__file__).resolve().parents[2]
+OBS = [round(0.01 * i, 2) for i in range(27)]
+KEY, LINE = new_key("operator", admin=True)
+CLIENTS = 4
+PAUSE_S = 0.002  # between a client's requests: the load is steady, and leaves the machine something
+
+# A head node as `ray start --head` makes one, but gone when its standard input is.
+CLUSTER = """
+import json, sys, ray
+plan = json.loads(sys.argv[1])
+ray.init(address="local", num_cpus=4, num_gpus=0, object_store_memory=80 << 20, include_dashboard=True,
+         dashboard_host="127.0.0.1", dashboard_port=plan["dashboard"], log_to_driver=False, configure_logging=False,
+         _temp_dir=plan["folder"], _node_ip_address="127.0.0.1")
+print("READY", flush=True)
+sys.stdin.read()
+from ray import serve
+serve.shutdown()
+ray.shutdown()
+"""
+
+
+@dataclass
+class Cluster:
+    """A Ray cluster on which the shipped configuration is deployed, and changed."""
+
+    port: int
+    dashboard: int
+    folder: Path
+    environment: dict[str, str]
+    repository: Path
+    configuration: dict[str, Any]
+
+    @property
+    def application(self) -> dict[str, Any]:
+        return self.configuration["applications"][0]  # type: ignore[no-any-return]
+
+    def deploy(
+        self,
+        user_config: dict[str, Any] | None = None,
+        settings: dict[str, Any] | None = None,
+        *,
+        by_command: bool = False,
+    ) -> None:
+        """`serve deploy` with these changes to the file, or the request that it sends; returns when Serve took it."""
+        if user_config is not None:
+            self.application["deployments"] = [{"name": "PolicyServer", "user_config": user_config}]
+        if settings is not None:
+            self.application["args"]["settings"] = {**self.application["args"]["settings"], **settings}
+        if not by_command:  # starting the command costs ten seconds on a busy machine
+            connection = http.client.HTTPConnection("127.0.0.1", self.dashboard, timeout=120)
+            headers = {
+                "content-type": "application/json",
+                "authorization": f"Bearer {self.environment['RAY_AUTH_TOKEN']}",
+            }
+            connection.request("PUT", "/api/serve/applications/", json.dumps(self.configuration), headers)
+            reply = connection.getresponse()
+            content = reply.read()
+            connection.close()
+            assert reply.status == 200, content
+            return
+        file = self.folder / "serve.yaml"
+        file.write_text(yaml.safe_dump(self.configuration))
+        program = [str(Path(sys.executable).with_name("serve")), "deploy", str(file)]
+        if not Path(program[0]).exists():
+            program = [sys.executable, "-m", "ray.serve.scripts", "deploy", str(file)]
+        done = subprocess.run(
+            [*program, "-a", f"http://127.0.0.1:{self.dashboard}"],
+            env=self.environment, cwd=ROOT, capture_output=True, text=True, timeout=240,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    def admin(self, key: str = KEY) -> AdminClient:
+        return AdminClient(f"http://127.0.0.1:{self.port}", api_key=key, timeout_s=60)
+
+    def replicas(self) -> list[dict[str, Any]]:
+        with self.admin() as admin:
+            return admin.replicas()
+
+    def wait_for(
+        self, condition: Callable[[list[dict[str, Any]]], bool], timeout_s: float = 60
+    ) -> list[dict[str, Any]]:
+        """Wait until what every replica tells fulfils a condition."""
+        deadline = time.monotonic() + timeout_s
+        seen: list[dict[str, Any]] = []
+        while time.monotonic() < deadline:
+            with contextlib.suppress(Exception):
+                seen = self.replicas()
+                if condition(seen):
+                    return seen
+            time.sleep(0.2)
+        raise AssertionError(json.dumps(seen, indent=1))
+
+    def status(self) -> tuple[str, str]:
+        """Return (status, messages) of the application, as `serve status` tells them."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.dashboard, timeout=60)
+        connection.request(
+            "GET",
+            "/api/serve/applications/",
+            headers={"authorization": f"Bearer {self.environment['RAY_AUTH_TOKEN']}"},
+        )
+        found = json.loads(connection.getresponse().read())["applications"]["rlservo"]
+        connection.close()
+        messages = [found["message"], *(each["message"] for each in found["deployments"].values())]
+        return found["status"], " ".join(messages)
+
+    def wait_for_status(self, wanted: str, timeout_s: float = 90) -> str:
+        """Wait until the application has this status; return its messages."""
+        deadline = time.monotonic() + timeout_s
+        while (found := self.status())[0] != wanted:
+            assert time.monotonic() < deadline, found
+            time.sleep(0.2)
+        return found[1]
+
+    def replica_pids(self) -> list[int]:
+        return self.pids_of("ServeReplica:rlservo:PolicyServer")
+
+    def pids_of(self, part: str) -> list[int]:
+        """Return our processes with this in their title or program."""
+        pids = []
+        for entry in Path("/proc").iterdir():
+            if entry.name.isdigit():
+                with contextlib.suppress(OSError):
+                    title = (entry / "cmdline").read_bytes().decode(errors="replace")
+                    if part in title.split("\0")[0] and self._owns(int(entry.name)):
+                        pids.append(int(entry.name))
+        return sorted(pids)
+
+    def _owns(self, pid: int) -> bool:
+        while pid > 1:
+            if str(self.folder).encode() in (Path("/proc") / str(pid) / "cmdline").read_bytes():
+                return True
+            pid = int((Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[1])
+        return False
+
+
+@dataclass
+class Load:
+    """What the clients saw while it ran."""
+
+    versions: Counter[str] = field(default_factory=Counter)
+    first_failures: list[str] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)  # also after one retry
+    longest_s: float = 0.0
+
+    @property
+    def answered(self) -> int:
+        return self.versions.total()
+
+
+@contextlib.contextmanager
+def loaded(cluster: Cluster, path: str = "/v1/policies/ur5/act") -> Iterator[Load]:
+    """Clients that ask for actions without end, each on its own connection, and retry once."""
+    load, stop, lock = Load(), threading.Event(), threading.Lock()
+    body = json.dumps({"obs": OBS}).encode()
+    headers = {"content-type": "application/json", "authorization": f"Bearer {KEY}"}
+
+    def once(connection: http.client.HTTPConnection) -> tuple[str, str]:
+        try:
+            connection.request("POST", path, body, headers)
+            reply = connection.getresponse()
+            content = reply.read()
+        except (OSError, http.client.HTTPException) as error:
+            connection.close()
+            return "", f"{type(error).__name__}: {error}"
+        if reply.status != 200:
+            return "", f"{reply.status} {content[:200]!r}"
+        return json.loads(content)["version"], ""
+
+    def client() -> None:
+        connection = http.client.HTTPConnection("127.0.0.1", cluster.port, timeout=20)
+        while not stop.is_set():
+            began = time.monotonic()
+            version, failure = once(connection)
+            if failure:
+                with lock:
+                    load.first_failures.append(failure)
+                version, failure = once(connection)
+            with lock:
+                load.longest_s = max(load.longest_s, time.monotonic() - began)
+                if failure:
+                    load.failures.append(failure)
+                else:
+                    load.versions[version] += 1
+            time.sleep(PAUSE_S)
+        connection.close()
+
+    threads = [threading.Thread(target=client) for _ in range(CLIENTS)]
+    for thread in threads:
+        thread.start()
+    try:
+        time.sleep(0.5)
+        yield load
+        time.sleep(0.5)
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+
+
+@pytest.fixture(scope="module")
+def repository(tmp_path_factory: pytest.TempPathFactory, box_policy: Callable[..., Path]) -> Path:
+    """ur5 in versions 1 to 3, and 4 with a byte of its weights changed."""
+    root = tmp_path_factory.mktemp("repository")
+    for seed, version in enumerate(("1", "2", "3", "4")):
+        box_policy(root, version=version, seed=seed)
+    weights = root / "ur5" / "4" / "policy.onnx"
+    content = bytearray(weights.read_bytes())
+    content[len(content) // 2] ^= 1
+    weights.write_bytes(content)
+    return root
+
+
+def serving(*versions: str, production: str = "1", **more: Any) -> dict[str, Any]:
+    return {"policies": {"ur5": {"versions": list(versions), "aliases": {"production": production}, **more}}}
+
+
+@pytest.fixture(scope="module")
+def cluster(repository: Path) -> Iterator[Cluster]:
+    port, dashboard, stats, metrics, fallback = free_ports(5)
+    folder, mark = Path(tempfile.mkdtemp(prefix="r")), secrets.token_hex(16)
+    configuration = yaml.safe_load((ROOT / "deploy" / "serve.yaml").read_text())
+    configuration["http_options"]["port"] = port
+    application = configuration["applications"][0]
+    # The limit on slow bodies is not what is tested, and a machine that stands still for two seconds would meet it.
+    settings = {"api_keys": LINE, "body_timeout_s": 20}
+    application["args"] = {"policies": [str(repository)], "replicas": 2, "settings": settings}
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")} | {
+        MARK: mark,
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_SERVE_ENABLE_HA_PROXY": "1",
+        "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",
+        "RAY_SERVE_RUN_ROUTER_IN_SEPARATE_LOOP": "0",
+        "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
+        "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
+        "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
+        "RAY_SERVE_HAPROXY_RETRIES": "20",
+        "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "rlservo.serve_app.ray_serve.ingress:middlewares",
+        "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
+        "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
+        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
+        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
+        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "a.sock"),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
+        "RAY_SERVE_HAPROXY_BINARY_PATH": str(
+            haproxy_wrapper.prepare(folder, haproxy_wrapper.find_binary() or "haproxy")
+        ),
+        "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "1",
+    }
+    plan = json.dumps({"dashboard": dashboard, "folder": str(folder)})
+    process = subprocess.Popen(
+        [sys.executable, "-c", CLUSTER, plan],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment,
+        start_new_session=True,
+    )  # fmt: skip
+    assert process.stdin is not None and process.stdout is not None
+    made = Cluster(port, dashboard, folder, environment, repository, configuration)
+    try:
+        assert process.stdout.readline() == "READY\n"
+        made.deploy(serving("1"))
+        made.wait_for(lambda seen: len(seen) == 2, timeout_s=180)
+        yield made
+    finally:
+        process.stdin.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(40)
+        end_marked(mark, process.pid)
+        process.wait()
+        process.stdout.close()
+        remove_folder(folder)
+
+
+def set_alias(cluster: Cluster, alias: str) -> None:
+    with cluster.admin() as admin:
+        admin.alias("ur5", alias, "1")
+
+
+def default_of(replica: dict[str, Any]) -> str:
+    return str(next(policy["version"] for policy in replica["policies"] if policy["name"] == "ur5"))
+
+
+def test_aliases_switch_on_every_replica_under_load_without_a_failed_request(cluster: Cluster) -> None:
+    with loaded(cluster) as load, cluster.admin() as admin:
+        admin.load("ur5", "2")
+        for version in ("2", "1") * 5:
+            reply = admin.alias("ur5", "production", version)
+            assert reply["default"] == version
+            # The command has returned: no replica gives the other version any more.
+            assert {default_of(replica) for replica in cluster.replicas()} == {version}
+        admin.rollback("ur5", "production")
+        # Commands at the same time, whichever replicas they reach, all happen.
+        at_once = [threading.Thread(target=set_alias, args=(cluster, f"at-once-{n}")) for n in range(6)]
+        for thread in at_once:
+            thread.start()
+        for thread in at_once:
+            thread.join()
+    assert load.first_failures == [] and set(load.versions) == {"1", "2"}
+    assert load.answered > 50
+    for replica in cluster.replicas():
+        assert default_of(replica) == "2"
+        assert set(replica["policies"][0]["aliases"]) == {"production", *(f"at-once-{n}" for n in range(6))}
+
+
+def test_a_broken_version_is_refused_under_load_and_nothing_changes(cluster: Cluster) -> None:
+    before = {default_of(replica) for replica in cluster.replicas()}
+    with loaded(cluster) as load, cluster.admin() as admin:
+        with pytest.raises(RefusedError, match=r"nothing has changed.*policy\.onnx is not the file that was exported"):
+            admin.load("ur5", "4")
+        cluster.deploy(serving("1", "4", production="4"))
+        seen = cluster.wait_for(
+            lambda replicas: (
+                len(replicas) == 2
+                and all(each["refused"] and each["refused"]["change"] == "configuration" for each in replicas)
+            )
+        )
+    assert load.first_failures == [] and set(load.versions) == before
+    for replica in seen:
+        assert default_of(replica) in before
+        assert "policy.onnx is not the file that was exported" in replica["refused"]["reason"]
+        states = {v["version"]: v for v in replica["policies"][0]["version_states"]}
+        assert (states["4"]["state"], states["2"]["state"]) == ("failed", "ready")
+        assert "is not the file" in states["4"]["reason"]
+
+
+def test_a_changed_configuration_wins_over_earlier_commands_without_a_failed_request(cluster: Cluster) -> None:
+    with loaded(cluster) as load:
+        cluster.deploy(serving("1", "3", production="3"), by_command=True)
+        cluster.wait_for(lambda replicas: len(replicas) == 2 and {default_of(each) for each in replicas} == {"3"})
+    assert load.first_failures == [] and set(load.versions) >= {"3"}
+    with cluster.admin() as admin:  # the alias led to 2 before, and the way back goes there, though 2 was not listed
+        assert admin.rollback("ur5", "production")["default"] == "2"
+        admin.alias("ur5", "production", "3")
+
+
+@contextlib.contextmanager
+def half_sent(cluster: Cluster) -> Iterator[Callable[[], list[int]]]:
+    """A request that each replica has the first half of; yields what sends the rest and returns the statuses.
+
+    Straight to the replicas: the proxy would keep a small one until it has all of it.
+    """
+    configuration = next(cluster.folder.rglob("haproxy.cfg")).read_text()
+    (backend,) = re.findall(r"^backend http-\S+\n(?: .*\n|\n)*", configuration, re.MULTILINE)
+    ports = {int(port) for port in re.findall(r"server SERVE_REPLICA\S+ [\d.]+:(\d+)", backend)}
+    body = json.dumps({"obs": OBS}).encode()
+    head = (
+        f"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: 127.0.0.1\r\nauthorization: Bearer {KEY}\r\n"
+        f"content-type: application/json\r\ncontent-length: {len(body)}\r\n\r\n"
+    ).encode()
+    with contextlib.ExitStack() as stack:
+        lines = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=20)) for port in ports]
+        for line in lines:
+            line.sendall(head + body[:10])
+
+        def finish() -> list[int]:
+            for line in lines:
+                line.sendall(body[10:])
+            return [int(line.recv(65536)[9:12] or 0) for line in lines]
+
+        yield finish
+
+
+def test_a_rolling_update_of_settings_costs_no_request_and_keeps_the_commands(cluster: Cluster) -> None:
+    with cluster.admin() as admin:
+        admin.alias("ur5", "candidate", "1")
+    old = {each["replica"] for each in cluster.replicas()}
+    with loaded(cluster) as load, half_sent(cluster) as finish:
+        cluster.deploy(settings={"max_batch": 2048})
+        seen = cluster.wait_for(
+            lambda replicas: len(replicas) == 2 and not old & {each["replica"] for each in replicas}, timeout_s=90
+        )
+        time.sleep(2)  # the old ones drain: a second, then they wait for who is being answered
+        assert finish() == [200, 200]
+    assert load.first_failures == [], Counter(load.first_failures)
+    assert set(load.versions) == {"3"}
+    for replica in seen:
+        assert replica["policies"][0]["aliases"] == {"production": "3", "candidate": "1"}
+
+
+def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_back_as_it_was(cluster: Cluster) -> None:
+    with cluster.admin() as admin:
+        admin.alias("ur5", "candidate", "3")
+    generation = {each["generation"] for each in cluster.replicas()}
+    cluster.wait_for(lambda _: len(cluster.replica_pids()) == 2)  # those before the update may still be ending
+    pids = cluster.replica_pids()
+    with loaded(cluster) as load:
+        os.kill(pids[0], signal.SIGKILL)
+        cluster.wait_for(lambda replicas: len(replicas) == 2 and pids[0] not in cluster.replica_pids(), timeout_s=90)
+        time.sleep(1)
+    print("first failures:", Counter(load.first_failures))
+    assert load.failures == [], Counter(load.failures)
+    assert len(load.first_failures) <= CLIENTS  # each had one request in it at most
+    assert set(load.versions) == {"3"}
+    assert {each["generation"] for each in cluster.replicas()} == generation
+
+
+def test_a_killed_proxy_is_back_at_once_and_nobody_is_told_that_the_policy_is_unknown(cluster: Cluster) -> None:
+    manager = cluster.pids_of("ray::HAProxyManager")
+    proxies = cluster.pids_of("/haproxy")
+    assert len(manager) == 1 and proxies
+    with loaded(cluster) as load:
+        for pid in proxies:
+            os.kill(pid, signal.SIGKILL)
+        began = time.monotonic()
+        while (now := cluster.pids_of("ray::HAProxyManager")) == manager or not now:
+            assert time.monotonic() - began < 60
+            time.sleep(0.2)
+        while any("bridge.cfg" in Path(f"/proc/{pid}/cmdline").read_text() for pid in cluster.pids_of("/haproxy")):
+            assert time.monotonic() - began < 60
+            time.sleep(0.2)
+        answered = load.answered
+        cluster.wait_for(lambda seen: len(seen) == 2 and load.answered > answered + 50)
+    assert load.first_failures
+    assert {failure.partition(":")[0] for failure in load.first_failures} <= {
+        "ConnectionRefusedError", "RemoteDisconnected", "ConnectionResetError", "BrokenPipeError", "IncompleteRead",
+    }, Counter(load.first_failures)  # fmt: skip
+    assert load.answered > 50
+
+
+def test_a_killed_controller_costs_nobody_anything_and_commands_work_again(cluster: Cluster) -> None:
+    (controller,) = cluster.pids_of("ray::ServeController")
+    with loaded(cluster) as load:
+        os.kill(controller, signal.SIGKILL)
+        cluster.wait_for(lambda _: cluster.pids_of("ray::ServeController") not in ([], [controller]))
+        cluster.wait_for_status("RUNNING")
+        with cluster.admin() as admin:
+            admin.alias("ur5", "candidate", "1")
+        cluster.wait_for(lambda seen: len(seen) == 2)
+    assert load.failures == [], Counter(load.failures)
+
+
+def test_a_rolling_update_of_the_environment_keeps_streams_and_broken_code_changes_nothing(
+    cluster: Cluster,
+) -> None:
+    stop, steps = threading.Event(), 0
+
+    def stream() -> None:
+        nonlocal steps
+        with StreamClient(f"http://127.0.0.1:{cluster.port}", "ur5", api_key=KEY, deadline_ms=20_000) as client:
+            while not stop.is_set():
+                client.act(np.array(OBS, np.float32))
+                steps += 1
+                time.sleep(0.01)
+
+    with loaded(cluster) as load, ThreadPoolExecutor(1) as pool:
+        streaming = pool.submit(stream)
+        try:
+            cluster.application["import_path"] = "rlservo.serve_app.ray_serve.app:not_there"
+            cluster.deploy()
+            assert "not_there" in cluster.wait_for_status("DEPLOY_FAILED")
+            cluster.application["import_path"] = "rlservo.serve_app.ray_serve.app:build"
+            old = {each["replica"] for each in cluster.replicas()}
+            cluster.application["runtime_env"] = {"env_vars": {"RLSERVO_UPDATE": "1"}}
+            cluster.deploy()
+            cluster.wait_for(lambda seen: len(seen) == 2 and not old & {each["replica"] for each in seen}, timeout_s=90)
+            cluster.wait_for_status("RUNNING")
+            time.sleep(2)  # the old ones drain
+        finally:
+            stop.set()
+        streaming.result()
+    assert load.failures == [], Counter(load.failures)
+    assert load.answered > 50 and steps > 50
+
+
+def test_administration_needs_the_admin_key_and_says_what_it_will_not_do(cluster: Cluster) -> None:
+    with cluster.admin("nobody") as nobody, pytest.raises(UnauthenticatedError):
+        nobody.replicas()
+    with cluster.admin() as admin:
+        with pytest.raises(ConflictError, match="in use by the alias 'production'"):
+            admin.unload("ur5", "3")
+        for name in ("../ur5", "..", "ur5/../../etc"):
+            with pytest.raises(Exception, match=r"nothing is at|repository has no policy"):
+                admin.load(name, "1")

@@ -1,0 +1,360 @@
+"""What a running server offers to the network: its ports, its time-outs, its share for each address, its logs."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import queue
+import re
+import socket
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import grpc
+import pytest
+
+from rlservo.serve_app.ray_serve.launcher import serve_policies
+from rlservo.serve_app.ray_serve.processes import LOG_BYTES, MARK, cut_log, free_ports
+from rlservo.serve_app.server.api_keys import new_key
+
+pytestmark = [pytest.mark.serve, pytest.mark.slow]
+
+LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}
+# Listeners that may be elsewhere than on loopback when the server is asked for loopback: (process, why). None.
+ELSEWHERE: dict[str, str] = {}
+IDLE_S = 8.0
+BODY = json.dumps({"obs": [0.1] * 27}).encode()
+ACT = b"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: 127.0.0.1:%d\r\ncontent-type: application/json\r\n%s"
+HANDSHAKE = (
+    b"connection: upgrade\r\nupgrade: websocket\r\nsec-websocket-version: 13\r\n"
+    b"sec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+)
+
+
+@dataclass(frozen=True)
+class Server:
+    port: int
+    grpc_port: int | None
+    folder: Path
+    key: str
+    pids: frozenset[int]
+
+    def listeners(self) -> dict[tuple[str, int], str]:
+        """Return the process that listens, by (address as /proc writes it, port)."""
+        sockets: dict[str, str] = {}
+        for pid in self.pids | processes_of(self.folder):
+            with contextlib.suppress(OSError):
+                name = (Path("/proc") / str(pid) / "cmdline").read_bytes().split(b"\0")[0].decode()
+                for link in (Path("/proc") / str(pid) / "fd").iterdir():
+                    with contextlib.suppress(OSError):
+                        sockets[str(link.readlink())] = name.rpartition("/")[2]
+        found = {}
+        for table in ("tcp", "tcp6"):
+            for line in (Path("/proc/net") / table).read_text().splitlines()[1:]:
+                fields = line.split()
+                if fields[3] == "0A" and f"socket:[{fields[9]}]" in sockets:
+                    address, _, port = fields[1].rpartition(":")
+                    found[address, int(port, 16)] = sockets[f"socket:[{fields[9]}]"]
+        return found
+
+    def ports(self, name: str) -> list[int]:
+        return [port for (_, port), process in self.listeners().items() if process.startswith(name)]
+
+
+def processes_of(folder: Path) -> frozenset[int]:
+    """Return the server's processes: those that carry its mark, and those of the session that the first one leads."""
+    status = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+                command = (entry / "cmdline").read_bytes()
+                mark = [
+                    word for word in (entry / "environ").read_bytes().split(b"\0") if word.startswith(MARK.encode())
+                ]
+                status[int(entry.name)] = (int(fields[3]), command, mark[0] if mark else b"")
+    ((session, mark),) = {
+        (session, mark)
+        for session, command, mark in status.values()
+        if b"rlservo.serve_app.ray_serve.cluster_process" in command and str(folder).encode() in command
+    }
+    return frozenset(pid for pid, row in status.items() if row[0] == session or row[2] == mark)
+
+
+@contextlib.contextmanager
+def serving(policies: Path, *, with_grpc: bool, with_key: bool) -> Iterator[Server]:
+    port, grpc_port = free_ports(2)
+    key, line = new_key("tests")
+    ready, stop = threading.Event(), threading.Event()
+    failures: list[BaseException] = []
+    before = _folders()
+
+    def serve() -> None:
+        try:
+            serve_policies(
+                [policies],
+                port=port,
+                grpc_port=grpc_port if with_grpc else None,
+                settings={
+                    "stream_idle_s": IDLE_S,
+                    "max_connections_per_address": 300,
+                    **({"api_keys": line} if with_key else {}),
+                },
+                on_ready=lambda _: ready.set(),
+                stop=stop,
+            )
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        while not ready.wait(0.1):
+            assert thread.is_alive(), failures
+        (folder,) = [made for made in _folders() - before if _is_of(made, port)]
+        yield Server(port, grpc_port if with_grpc else None, folder, key, processes_of(folder))
+    finally:
+        stop.set()
+        thread.join()
+    assert failures == []
+
+
+def _folders() -> set[Path]:
+    return {folder for parent in {tempfile.gettempdir(), "/tmp"} for folder in Path(parent).glob("rlservo-*")}
+
+
+def _is_of(folder: Path, port: int) -> bool:
+    return any(f":{port}" in file.read_text() for file in folder.glob("*/haproxy.cfg"))
+
+
+@pytest.fixture(scope="module")
+def server(policies: Path) -> Iterator[Server]:
+    with serving(policies, with_grpc=True, with_key=True) as made:
+        yield made
+
+
+def act(port: int, key: str, source: str = "127.0.0.1") -> int:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20, source_address=(source, 0))
+    headers = {"content-type": "application/json", "authorization": f"Bearer {key}"}
+    try:
+        connection.request("POST", "/v1/policies/ur5/act", BODY, headers)
+        return connection.getresponse().status
+    finally:
+        connection.close()
+
+
+def test_nothing_listens_beyond_loopback(server: Server) -> None:
+    found = server.listeners()
+    assert len(found) > 10 and server.port in {port for _, port in found}  # the processes are the right ones
+    names = {name for name in found.values() if name}
+    assert any("raylet" in name for name in names) and any("ServeReplica" in name for name in names)
+    elsewhere = {(address, port): name for (address, port), name in found.items() if address not in LOOPBACK}
+    assert {key: name for key, name in elsewhere.items() if name not in ELSEWHERE} == {}
+
+
+def test_the_dashboards_agent_does_not_run(server: Server) -> None:
+    commands = [(Path("/proc") / str(pid) / "cmdline").read_bytes() for pid in processes_of(server.folder)]
+    assert commands and not [command for command in commands if b"dashboard/agent.py" in command[:300]]
+    assert not [command for command in commands if command.startswith(b"ray::DashboardAgent")]
+
+
+def http_ports(server: Server) -> list[int]:
+    """Return the ports where HTTP is spoken: HAProxy's, the replica's, the fallback proxy's."""
+    spoken = []
+    for port in {server.port, *server.ports("ray::ServeReplica"), *server.ports("ray::ProxyActor")}:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+        with contextlib.suppress(OSError, http.client.HTTPException):
+            connection.request("GET", "/healthz")
+            if connection.getresponse().status == 200:
+                spoken.append(port)
+        connection.close()
+    return spoken
+
+
+PATHS = (
+    "/-/routes",
+    "/-/healthz",
+    "/%2d/routes",
+    "/-%2froutes",
+    "/-/%72outes",
+    "/-/Routes",
+    "//-/routes",
+    "/-/routes/",
+)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_serves_own_paths_answer_nobody_at_any_port(server: Server, path: str) -> None:
+    ports = http_ports(server)
+    assert len(ports) == 3
+    for port in ports:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        connection.request("GET", path)
+        reply = connection.getresponse()
+        assert reply.status in (401, 404), (port, path)
+        assert b"rlservo" not in reply.read()
+        connection.close()
+
+
+def test_serves_own_methods_answer_nobody_at_any_port(server: Server) -> None:
+    spoken = 0
+    for port in {server.grpc_port, *server.ports("ray::ServeReplica"), *server.ports("ray::ProxyActor")}:
+        with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+            try:
+                live = channel.unary_unary("/inference.GRPCInferenceService/ServerLive")(b"", timeout=5)
+            except grpc.RpcError:
+                continue  # Ray's own, which wants its token
+            assert live == b"\x08\x01"
+            spoken += 1
+            for method in ("Healthz", "ListApplications"):
+                with pytest.raises(grpc.RpcError) as raised:
+                    channel.unary_unary(f"/ray.serve.RayServeAPIService/{method}")(b"", timeout=5)
+                assert raised.value.code() is grpc.StatusCode.UNIMPLEMENTED, (port, method)
+    assert spoken == 3
+
+
+def test_a_grpc_stream_may_be_silent_for_as_long_as_the_setting_says(server: Server) -> None:
+    requests: queue.Queue[bytes] = queue.Queue()
+    with grpc.insecure_channel(f"127.0.0.1:{server.grpc_port}") as channel:
+        stream = channel.stream_stream("/inference.GRPCInferenceService/ModelStreamInfer")
+        call = stream(iter(requests.get, b"end"), metadata=[("authorization", f"Bearer {server.key}")])
+        requests.put(b"")
+        next(call)
+        time.sleep(IDLE_S - 2)  # longer than HAProxy waits for a client of HTTP
+        requests.put(b"")
+        next(call)
+        started = time.monotonic()
+        with pytest.raises(grpc.RpcError) as raised:
+            next(call)
+    assert raised.value.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+    assert raised.value.details() == f"the stream was silent for {IDLE_S:g} s: open another one"
+    assert IDLE_S - 1 < time.monotonic() - started < IDLE_S + 20
+    requests.put(b"end")
+
+
+def test_a_silent_websocket_is_ended_by_the_replica_with_a_sentence(server: Server) -> None:
+    head = b"GET /v1/policies/ur5/stream HTTP/1.1\r\nhost: 127.0.0.1:%d\r\nauthorization: Bearer %s\r\n%s\r\n"
+    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as connection:
+        connection.sendall(head % (server.port, server.key.encode(), HANDSHAKE))
+        received = b""
+        started = time.monotonic()
+        while b"silent for too long" not in received:
+            piece = connection.recv(65536)
+            assert piece, received
+            received += piece
+        assert time.monotonic() - started > IDLE_S - 1
+
+
+@pytest.mark.parametrize(
+    "more", [b"content-length: %d\r\n\r\n%s" % (len(BODY), BODY), b"content-length: 2000000\r\n\r\n" + b"x" * 100_000]
+)
+@pytest.mark.parametrize("upgrade", [b"", HANDSHAKE])
+def test_every_request_ends_in_time_at_every_port(server: Server, more: bytes, upgrade: bytes) -> None:
+    for port in http_ports(server):
+        head = ACT % (server.port, upgrade + b"authorization: Bearer %s\r\n" % server.key.encode())
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
+            started = time.monotonic()
+            connection.sendall(head.replace(b"connection: upgrade", b"connection: upgrade, close") + more)
+            answer = connection.recv(65536)
+            assert answer.startswith(b"HTTP/1.1 "), (port, answer)
+            assert answer.split()[1] in (b"200", b"400", b"408")
+            if b"x" * 100 in more:
+                with contextlib.suppress(ConnectionResetError):
+                    while connection.recv(65536):
+                        pass
+            assert time.monotonic() - started < 18  # 2 s for the body and 5 s for what the client still owes
+
+
+@pytest.mark.parametrize("kind", ["upgrade", "silent", "half"])
+def test_one_address_does_not_stop_the_service_for_another(server: Server, kind: str) -> None:
+    authorized = b"authorization: Bearer %s\r\n" % server.key.encode()
+    content = {
+        "upgrade": ACT % (server.port, authorized + HANDSHAKE) + b"content-length: %d\r\n\r\n%s" % (len(BODY), BODY),
+        "silent": b"",
+        "half": ACT % (server.port, authorized) + b"content-length: 100000\r\n\r\n" + b"x" * 40_000,
+    }[kind]
+    slowest = 0.0
+    held: list[socket.socket] = []
+    try:
+        for number in range(4200):
+            with contextlib.suppress(OSError):
+                connection = socket.create_connection(("127.0.0.1", server.port), timeout=5)
+                held.append(connection)
+                connection.setblocking(False)
+                connection.send(content)
+            if number % 300 == 299:
+                started = time.monotonic()
+                assert act(server.port, server.key, "127.0.0.2") == 200
+                slowest = max(slowest, time.monotonic() - started)
+        assert slowest < 10
+    finally:
+        for connection in held:
+            connection.close()
+    deadline = time.monotonic() + 30
+    while act_or_none(server.port, server.key) != 200:  # as soon as its connections are gone
+        assert time.monotonic() < deadline
+        time.sleep(0.2)
+
+
+def act_or_none(port: int, key: str) -> int | None:
+    with contextlib.suppress(OSError, http.client.HTTPException):
+        return act(port, key)
+    return None
+
+
+def test_the_logs_of_an_idle_server_do_not_grow(server: Server) -> None:
+    def sizes() -> dict[str, int]:
+        files = [file for file in server.folder.rglob("*") if file.is_file() and file.name != "debug_state.txt"]
+        return {str(file.relative_to(server.folder)): file.stat().st_size for file in files}
+
+    assert act(server.port, server.key) == 200
+    time.sleep(5)  # the tests before this one
+    before = sizes()
+    assert [name for name in before if name.endswith("gcs_server.out")]  # the right folder
+    time.sleep(75)  # Ray's statistics would come once a minute
+    grown = {name: size - before.get(name, 0) for name, size in sizes().items() if size > before.get(name, 0)}
+    assert sum(grown.values()) < 2000, grown
+
+
+def test_what_is_logged_is_bounded(server: Server) -> None:
+    raylets = [
+        (Path("/proc") / str(pid))
+        for pid in processes_of(server.folder)
+        if b"raylet/raylet" in (Path("/proc") / str(pid) / "cmdline").read_bytes().split(b"\0")[0]
+    ]
+    assert len(raylets) == 1
+    environment = (raylets[0] / "environ").read_bytes()
+    assert f"RAY_ROTATION_MAX_BYTES={LOG_BYTES}".encode() in environment
+    told = re.findall(rb"--logging-rotate-bytes=(\d+)", (raylets[0] / "cmdline").read_bytes())
+    assert set(told) == {str(LOG_BYTES).encode()}
+    assert all(file.stat().st_size < 2 * LOG_BYTES for file in server.folder.rglob("*.log"))
+
+
+def test_a_log_is_cut_to_its_last_lines(tmp_path: Path) -> None:
+    file = tmp_path / "server.log"
+    with file.open("ab") as writer:
+        for number in range(20_000):
+            writer.write(b"line %d\n" % number)
+        writer.flush()
+        cut_log(file, max_bytes=1 << 20)
+        assert file.stat().st_size > 100_000  # within its bound
+        cut_log(file, max_bytes=100_000)
+        writer.write(b"next\n")
+    lines = file.read_text().splitlines()
+    assert lines[-2:] == ["line 19999", "next"] and 100 < len(lines) < 1000
+    assert lines[0].startswith("line ")
+
+
+def test_without_a_grpc_port_nobody_speaks_grpc(policies: Path) -> None:
+    with serving(policies, with_grpc=False, with_key=False) as server:
+        for port in {port for _, port in server.listeners()}:
+            with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+                for method in ("inference.GRPCInferenceService/ServerLive", "ray.serve.RayServeAPIService/Healthz"):
+                    with pytest.raises(grpc.RpcError) as raised:
+                        channel.unary_unary(f"/{method}")(b"", timeout=3)
+                    assert raised.value.code() is not grpc.StatusCode.OK
