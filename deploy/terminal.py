@@ -5,8 +5,17 @@ Importing rich takes as long as everything else that `rlservo --help` needs.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rlservo.export.contract.errors import UsageError
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document for programs.")]
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,3 +35,25 @@ def errors() -> Console:
     from rich.console import Console
 
     return Console(stderr=True)
+
+
+@contextmanager
+def needs_extra(name: str) -> Iterator[None]:
+    """Say which extra to install when an import inside fails."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("rlservo"):
+            raise
+        raise UsageError(
+            f"this command needs the Python package {error.name!r}: pip install 'rlservo[{name}]'"
+        ) from error
+
+
+def note(line: str) -> None:
+    """Print a line that a program reading our output should not see."""
+    errors().print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+
+
+def print_json(document: Any) -> None:
+    print(json.dumps(document, indent=2))

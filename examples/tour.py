@@ -27,7 +27,7 @@ from gymnasium.wrappers import RecordVideo
 from shared.training_run import RETURN, STEPS, Run
 
 from rlservo import Policy
-from rlservo.deploy.cli import choose_gl_backend
+from rlservo.deploy.serve_commands import choose_gl_backend
 from rlservo.serve_app.rollout.environment import control_rate_of
 from rlservo.serve_app.rollout.video import VideoFile
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol, TypeAlias
 from numpy.typing import ArrayLike
 from typing_extensions import Self
 
-from rlservo.export.contract.bundle import Contract
+from rlservo.export.contract.contract import Contract
 
 Observation: TypeAlias = ArrayLike | Mapping[str, Any] | tuple[Any, ...]
 """An array of the observation space's shape, a batch of them, a map from element name to value (or batch), or for a

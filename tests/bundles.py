@@ -10,16 +10,12 @@ import contextlib
 import os
 import secrets
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
-import threading
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,29 +23,24 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-import uvicorn
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from rlservo.export.contract import bundle as bundle_files
-from rlservo.export.contract.bundle import (
+from rlservo.export.contract.contract import (
     BakedStep,
-    BoxSpec,
     Contract,
-    DiscreteSpec,
     Distribution,
-    Element,
     FormatParity,
     Parity,
     Provenance,
     StateSpec,
     TensorSpec,
 )
-from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.processes import free_ports
-from rlservo.serve_app.server.api_keys import new_key
+from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, Element
+from rlservo.serve_app.versions.loaded_policies import Library
 from rlservo.serve_app.versions.replica_versions import Control
-from rlservo.serve_app.versions.repository import Library, Repository
+from rlservo.serve_app.versions.repository import Repository
 
 OBS = 27
 HIDDEN = 256
@@ -364,28 +355,6 @@ def recurrent(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@contextlib.contextmanager
-def over_uvicorn(app: Any) -> Iterator[int]:
-    """Serve an ASGI application from a thread; gives the port."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", access_log=False, lifespan="on"))
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
-        try:
-            while not server.started:
-                time.sleep(0.01)
-            yield listener.getsockname()[1]
-        finally:
-            server.should_exit = True
-            thread.join()
-
-
-@pytest.fixture(scope="session")
-def served() -> Callable[[Any], AbstractContextManager[int]]:
-    """`over_uvicorn`."""
-    return over_uvicorn
-
-
 class MemoryLedger:
     """The plans of one process, without Ray."""
 
@@ -416,74 +385,3 @@ def controlled() -> Callable[..., AbstractContextManager[Control]]:
             control.close()
 
     return control_of
-
-
-@dataclass(frozen=True)
-class LiveServer:
-    """A policy server on Ray Serve, with a key, gRPC and a log file."""
-
-    port: int
-    grpc_port: int
-    key: str
-    log: Path
-
-    @property
-    def bearer(self) -> str:
-        return f"Bearer {self.key}"
-
-
-@pytest.fixture(scope="session")
-def live_server(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
-    """Start `rlservo serve` once for all the tests that need nothing special of it."""
-    port, grpc_port = free_ports(2)
-    key, line = new_key("tests")
-    log = tmp_path_factory.mktemp("log") / "server.jsonl"
-    ready, stop = threading.Event(), threading.Event()
-    failures: list[Exception] = []
-
-    def serve() -> None:
-        try:
-            serve_policies(
-                [policies],
-                port=port,
-                grpc_port=grpc_port,
-                settings={"api_keys": line, "default_policy": "ur5", "log_file": str(log), "log_requests": True},
-                on_ready=lambda _: ready.set(),
-                stop=stop,
-            )
-        except Exception as error:
-            failures.append(error)
-            ready.set()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        assert ready.wait(120) and not failures, failures
-        yield LiveServer(port, grpc_port, key, log)
-    finally:
-        stop.set()
-        thread.join(60)
-    assert not thread.is_alive()
-
-
-@pytest.fixture(scope="session")
-def client_environment(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """Install packages that cannot share our environment into one of their own; gives its Python, or skips."""
-    made: dict[tuple[str, ...], Path] = {}
-
-    def install(*packages: str) -> Path:
-        if packages not in made:
-            made[packages] = new(*packages)
-        return made[packages]
-
-    def new(*packages: str) -> Path:
-        folder = tmp_path_factory.mktemp("client")
-        commands = [[sys.executable, "-m", "venv", str(folder)]]
-        commands.append([str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", *packages])
-        for command in commands:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-            if done.returncode != 0:
-                pytest.skip(f"{', '.join(packages)} cannot be installed here: {done.stderr.strip()[-300:]}")
-        return folder / "bin" / "python"
-
-    return install

@@ -24,7 +24,7 @@ from rich.table import Table
 from typing_extensions import Self
 
 from rlservo.deploy.demo.picture import Robot, RobotRun, Trace, draw_picture, film
-from rlservo.export.contract.bundle import Contract
+from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.client.policy_client import PolicyClient

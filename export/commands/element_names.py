@@ -17,8 +17,8 @@ import gymnasium
 from gymnasium.spaces import Box
 from pydantic import ValidationError
 
-from rlservo.export.contract.bundle import Element
 from rlservo.export.contract.errors import first_line
+from rlservo.export.contract.spaces import Element
 from rlservo.export.recipe.recipe import Recipe
 
 

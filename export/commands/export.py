@@ -33,22 +33,18 @@ from rlservo.export.contract.bundle import (
     CONTRACT_KEY,
     ONNX_FILE,
     TORCHSCRIPT_FILE,
-    Contract,
-    Distribution,
-    Parity,
-    Provenance,
-    TensorSpec,
-    contract_json,
     load_bundle,
     write_contract,
     write_golden,
 )
+from rlservo.export.contract.contract import Contract, Distribution, Parity, Provenance, TensorSpec, contract_json
 from rlservo.export.contract.errors import CheckpointError, ParityError, UsageError
 from rlservo.export.graph.one_thread import one_thread
-from rlservo.export.proof.parity import GraphLoop, Outputs, Recorded, Runner, prove, record, record_moved, replay, ties
+from rlservo.export.proof.parity import GraphLoop, Recorded, prove, record, record_moved, replay, ties
 from rlservo.export.recipe.describe import baked_steps
 from rlservo.export.recipe.recipe import Recipe, loose_bounds
-from rlservo.export.recipe.samples import BATCH_SIZES, Inputs, draw_batches
+from rlservo.export.recipe.runners import Inputs, Outputs, Runner
+from rlservo.export.recipe.samples import BATCH_SIZES, draw_batches
 from rlservo.export.recipe.to_contract import space_spec, state_spec
 
 if TYPE_CHECKING:
@@ -261,7 +257,7 @@ def _write_graphs(
     from rlservo.export.graph.onnx_file import run_onnx, write_onnx
     from rlservo.export.graph.policy_graph import PolicyGraph
     from rlservo.export.graph.torchscript_file import run_torchscript, write_torchscript
-    from rlservo.export.graph.why_not_exportable import why_different
+    from rlservo.export.proof.why_different import why_different
 
     recipe = restored.recipe
     graph = PolicyGraph(recipe, restored.network)
@@ -327,8 +323,7 @@ def _tensor(name: str, values: NDArray[Any]) -> TensorSpec:
 
 
 def _provenance(files: Files, facts: CheckpointFacts, restored: Restored) -> Provenance:
-    import ray
-    import torch
+    from importlib.metadata import version
 
     return Provenance(
         algorithm=facts.algorithm,
@@ -341,8 +336,8 @@ def _provenance(files: Files, facts: CheckpointFacts, restored: Restored) -> Pro
         env_steps=facts.env_steps,
         env_id=facts.env_id,
         env_config=facts.env_config,
-        ray_version=facts.ray_version or ray.__version__,
-        torch_version=torch.__version__,
+        ray_version=facts.ray_version or version("ray"),
+        torch_version=version("torch"),
         rlservo_version=rlservo.__version__,
         exported_at=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     )

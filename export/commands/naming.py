@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from rlservo.export.contract.bundle import NAME_PATTERN, VERSION_PATTERN, version_key
+from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, version_key
 from rlservo.export.contract.errors import UsageError
 
 

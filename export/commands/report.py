@@ -17,17 +17,8 @@ from rich.console import Group, JustifyMethod, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from rlservo.export.contract.bundle import (
-    BakedStep,
-    Contract,
-    DiscreteSpec,
-    Evaluation,
-    LeafSpec,
-    Parity,
-    SpaceSpec,
-    StateSpec,
-    leaf_specs,
-)
+from rlservo.export.contract.contract import BakedStep, Contract, Evaluation, Parity, StateSpec
+from rlservo.export.contract.spaces import DiscreteSpec, LeafSpec, SpaceSpec, leaf_specs
 
 MANY = 64  # elements shown one by one; of more, the first and the last few
 ENDS = 8

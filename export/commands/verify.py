@@ -20,11 +20,14 @@ from rlservo.export.checkpoints.location import Files, locate_checkpoint
 from rlservo.export.checkpoints.remote import fetched, is_uri
 from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.commands.export import LOADING_RUNS_CODE
-from rlservo.export.contract.bundle import Bundle, Contract, Evaluation, Parity, leaf_specs, load_bundle, write_contract
+from rlservo.export.contract.bundle import Bundle, load_bundle, write_contract
+from rlservo.export.contract.contract import Contract, Evaluation, Parity
 from rlservo.export.contract.errors import BundleError, UsageError, first_line
+from rlservo.export.contract.spaces import leaf_specs
 from rlservo.export.graph.one_thread import one_thread
-from rlservo.export.proof.parity import GraphLoop, Loop, prove, record
+from rlservo.export.proof.parity import GraphLoop, prove, record
 from rlservo.export.recipe.recipe import Recipe
+from rlservo.export.recipe.runners import Loop
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.recipe.trees import build, named_leaves, space_leaves
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import math
 import re
 import tempfile
@@ -27,14 +26,16 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal, TypeAlias
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import ValidationError
 
+from rlservo.export.contract.contract import VERSION_PATTERN, Contract, contract_json, version_key
 from rlservo.export.contract.errors import BundleError, BundleTamperedError
 from rlservo.export.contract.regular_files import FileTooLargeError, NotReadableError, blocks, open_regular
+from rlservo.export.contract.spaces import DictSpec, TupleSpec
 
 ONNX_FILE = "policy.onnx"
 TORCHSCRIPT_FILE = "policy.ts"
@@ -43,302 +44,13 @@ GOLDEN_FILE = "golden.npz"
 SUMS_FILE = "SHA256SUMS"
 CONTRACT_KEY = "rlservo.contract"
 """Where the graph's own metadata repeat the contract."""
-
-REWARD = "reward"  # the graph's input for what the last action brought, of a policy that was trained to see it
 MAX_SUMS_BYTES = 1 << 16
 MAX_FILES = 16  # the four, and what a user may have added
 DESCRIPTORS = Path("/proc/self/fd")  # Linux: a file that this process has open, whether it has a name or not
 BAD_ARCHIVE = (OSError, ValueError, EOFError, RuntimeError, KeyError, MemoryError, zlib.error, zipfile.BadZipFile)
 """What zipfile and numpy raise on archives that are none."""
-
-NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
-VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
-
-
-Size: TypeAlias = Annotated[int, Field(ge=1)]
-Shape: TypeAlias = tuple[Size, ...]
-Tolerance: TypeAlias = Annotated[float, Field(ge=0.0, le=1e-2)]
-"""Beyond it a difference is no rounding, whatever a contract says."""
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Element(_Model):
-    """One number of an observation or an action, as a roboticist would call it."""
-
-    name: str
-    unit: str = Field("", description="SI unit such as 'rad', 'm/s'; '1' when dimensionless, '' when unknown")
-
-
-class BoxSpec(_Model):
-    """A Gymnasium Box.
-
-    Bounds are one number for all elements or one per element in row-major order; null is unbounded.
-    """
-
-    kind: Literal["box"] = "box"
-    shape: Shape
-    dtype: str
-    low: float | tuple[float | None, ...] | None
-    high: float | tuple[float | None, ...] | None
-    elements: tuple[Element, ...] = Field((), description="Empty, or one per element in row-major order")
-
-    @property
-    def size(self) -> int:
-        return math.prod(self.shape)
-
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (low, high), each of the space's shape, with infinities where unbounded."""
-
-        def fill(bound: float | tuple[float | None, ...] | None, infinity: float) -> NDArray[np.float64]:
-            if isinstance(bound, tuple):
-                flat = np.array([infinity if b is None else b for b in bound], dtype=np.float64)
-                return flat.reshape(self.shape)
-            return np.full(self.shape, infinity if bound is None else bound, dtype=np.float64)
-
-        return fill(self.low, -math.inf), fill(self.high, math.inf)
-
-
-class DiscreteSpec(_Model):
-    """A Gymnasium Discrete: the integers start .. start + n - 1."""
-
-    kind: Literal["discrete"] = "discrete"
-    n: int = Field(ge=1)
-    start: int = 0
-    dtype: str = "int64"
-    elements: tuple[Element, ...] = ()
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return ()
-
-    @property
-    def size(self) -> int:
-        return 1
-
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (low, high), both inclusive and of shape ()."""
-        return np.array(self.start, np.float64), np.array(self.start + self.n - 1, np.float64)
-
-
-class MultiDiscreteSpec(_Model):
-    """A Gymnasium MultiDiscrete: element i is one of `nvec[i]` integers from `start[i]` on, in row-major order."""
-
-    kind: Literal["multi_discrete"] = "multi_discrete"
-    shape: Shape
-    nvec: tuple[Size, ...]
-    start: tuple[int, ...]
-    dtype: str = "int64"
-    elements: tuple[Element, ...] = ()
-
-    @property
-    def size(self) -> int:
-        return math.prod(self.shape)
-
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (low, high), both inclusive and of the space's shape."""
-        low = np.array(self.start, np.float64).reshape(self.shape)
-        return low, low + np.array(self.nvec, np.float64).reshape(self.shape) - 1
-
-
-class MultiBinarySpec(_Model):
-    """A Gymnasium MultiBinary: every element is 0 or 1."""
-
-    kind: Literal["multi_binary"] = "multi_binary"
-    shape: Shape
-    dtype: str = "int8"
-    elements: tuple[Element, ...] = ()
-
-    @property
-    def size(self) -> int:
-        return math.prod(self.shape)
-
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (low, high), both inclusive and of the space's shape."""
-        return np.zeros(self.shape), np.ones(self.shape)
-
-
-class _NestedSpec(_Model):
-    """What the contract's Dict and Tuple share."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """A nested space is no array."""
-        return ()
-
-    @property
-    def size(self) -> int:
-        """The elements of all leaves."""
-        assert isinstance(self, DictSpec | TupleSpec)
-        return sum(leaf.size for leaf in leaf_specs(self, "").values())
-
-    @property
-    def elements(self) -> tuple[Element, ...]:
-        """Only leaves name elements."""
-        return ()
-
-
-class DictSpec(_NestedSpec):
-    """A Gymnasium Dict; its leaves are tensors of their own, called `obs.<key>` or `action.<key>`."""
-
-    kind: Literal["dict"] = "dict"
-    spaces: dict[str, SpaceSpec]
-
-
-class TupleSpec(_NestedSpec):
-    """A Gymnasium Tuple; its leaves are tensors of their own, called `obs.<index>` or `action.<index>`."""
-
-    kind: Literal["tuple"] = "tuple"
-    spaces: tuple[SpaceSpec, ...]
-
-
-LeafSpec: TypeAlias = BoxSpec | DiscreteSpec | MultiDiscreteSpec | MultiBinarySpec
-SpaceSpec = Annotated[
-    BoxSpec | DiscreteSpec | MultiDiscreteSpec | MultiBinarySpec | DictSpec | TupleSpec, Field(discriminator="kind")
-]
 DictSpec.model_rebuild()
 TupleSpec.model_rebuild()
-
-
-def leaf_specs(space: SpaceSpec, name: str) -> dict[str, LeafSpec]:
-    """Return every leaf of a space by tensor name, `name` or `name.<path>`: Dict keys sorted, as RLlib has them."""
-    if isinstance(space, DictSpec):
-        inside = {key: space.spaces[key] for key in sorted(space.spaces)}
-    elif isinstance(space, TupleSpec):
-        inside = {str(index): child for index, child in enumerate(space.spaces)}
-    else:
-        return {name: space}
-    return {path: leaf for key, child in inside.items() for path, leaf in leaf_specs(child, f"{name}.{key}").items()}
-
-
-class TensorSpec(_Model):
-    """A named input or output of the graph. The first axis is the batch, -1."""
-
-    name: str
-    dtype: str
-    shape: tuple[int, ...]
-
-    @field_validator("shape")
-    @classmethod
-    def _has_a_batch_axis(cls, shape: tuple[int, ...]) -> tuple[int, ...]:
-        if not shape or shape[0] != -1 or any(size < 1 for size in shape[1:]):
-            raise ValueError(f"expected -1 for the batch, then positive sizes, got {list(shape)}")
-        return shape
-
-
-class StateSpec(_Model):
-    """A policy's memory: graph input `state_in.<name>`, output `state_out.<name>`; `initial` starts an episode."""
-
-    name: str
-    dtype: str
-    shape: Shape = Field(description="Without the batch axis")
-    initial: float | tuple[float, ...] = Field(0.0, description="One number, or one per element in row-major order")
-    kind: Literal["recurrent", "frames", "previous_actions", "previous_rewards"] = Field(
-        "recurrent",
-        description="'previous_actions' holds the last actions' one-hot codes, oldest first: whoever acts otherwise "
-        "than the graph's own `action` (exploring) writes that action's code into the end of it",
-    )
-
-    def initial_value(self, batch: int) -> NDArray[Any]:
-        """Return the state at an episode's start, `[batch, *shape]`."""
-        one = np.asarray(self.initial, self.dtype)
-        one = one.reshape(self.shape) if one.ndim else np.full(self.shape, one)
-        return np.repeat(one[None], batch, axis=0)
-
-
-class Distribution(_Model):
-    """How `action_dist_inputs` become an exploring action; the deterministic one is the graph's own `action`."""
-
-    kind: Literal["diag_gaussian", "squashed_gaussian", "categorical", "multi_categorical", "multi"] = Field(
-        description="'multi' has one part for each leaf of a nested action space, in the order of the graph's outputs: "
-        "diag_gaussian for a box, categorical or multi_categorical for the others"
-    )
-    transform: Literal["none", "unsquash", "clip"] = Field(
-        description="What RLlib does to a sample before env.step: 'unsquash' maps [-1, 1] to the bounds and clips, "
-        "'clip' only clips, 'none' sends it as it is (discrete actions: adds the space's start). Box leaves that are "
-        "not bounded on all sides are never unsquashed"
-    )
-
-
-class BakedStep(_Model):
-    """One processing step inside the graph, in the order it is applied."""
-
-    step: str = Field(description="For example 'mean_std_filter', 'one_hot', 'network', 'mode', 'unsquash', 'clip'")
-    detail: str = Field("", description="A sentence for people")
-    values: dict[str, Any] = Field(default_factory=dict, description="For example count, mean and std of a filter")
-
-
-class Provenance(_Model):
-    """Where the policy came from."""
-
-    algorithm: str
-    api_stack: Literal["new", "old"]
-    module_id: str
-    agents: tuple[str, ...] = Field(default=(), description="For which agents of a multi-agent environment")
-    module_class: str
-    checkpoint_sha256: str = Field(description="Hash over the checkpoint files that were read")
-    training_iterations: int | None = None
-    env_steps: int | None = None
-    env_id: str | None = None
-    env_config: dict[str, Any] = Field(default_factory=dict)
-    ray_version: str
-    torch_version: str
-    rlservo_version: str
-    exported_at: str = Field(description="UTC, ISO 8601")
-
-
-class FormatParity(_Model):
-    """The largest differences between one written format and RLlib's own pipeline."""
-
-    max_abs: float = Field(ge=0.0)
-    max_rel: float = Field(ge=0.0, description="Relative to the scale that the gate measures with")
-
-
-class Parity(_Model):
-    """How the export was proven equal to what RLlib itself would send to env.step."""
-
-    reference: str
-    samples: int = Field(ge=0)
-    batch_sizes: tuple[Size, ...]
-    rtol: Tolerance
-    atol: Tolerance
-    rule: str = Field(default="", description="How the two tolerances are applied")
-    formats: dict[str, FormatParity]
-
-
-class Evaluation(_Model):
-    """One closed-loop run of exported policy and checkpoint on the same seeds."""
-
-    env_id: str
-    episodes: Size
-    first_seed: int
-    return_bundle: float
-    return_checkpoint: float
-    success_rate_bundle: float | None
-    success_rate_checkpoint: float | None
-    evaluated_at: str
-
-
-class Contract(_Model):
-    """`contract.json`: everything a client, a server or a person needs to know of a policy."""
-
-    schema_version: Literal[1] = 1
-    name: str = Field(pattern=NAME_PATTERN)
-    version: str = Field(pattern=VERSION_PATTERN)
-    description: str = ""
-    observation_space: SpaceSpec
-    action_space: SpaceSpec
-    inputs: tuple[TensorSpec, ...]
-    outputs: tuple[TensorSpec, ...]
-    state: tuple[StateSpec, ...] = ()
-    distribution: Distribution | None
-    baked_in: tuple[BakedStep, ...]
-    control_rate_hz: float | None = Field(None, gt=0.0, description="The rate the environment asks for actions at")
-    provenance: Provenance
-    parity: Parity
-    evaluations: tuple[Evaluation, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -493,12 +205,6 @@ def _versions(policy: Path) -> list[Path]:
     return sorted(folders, key=lambda f: version_key(f.name))
 
 
-def version_key(version: str) -> tuple[int, ...]:
-    """Return a sort key: '3' counts as 3.0.0."""
-    parts = tuple(int(part) for part in version.split("."))
-    return parts + (0,) * (3 - len(parts))
-
-
 def read_contract(folder: Path, limits: BundleLimits = DEFAULT_LIMITS) -> Contract:
     """Parse `contract.json`; say in one sentence which field is wrong."""
     file = folder / CONTRACT_FILE
@@ -617,20 +323,6 @@ def write_contract(folder: Path, contract: Contract) -> None:
             (beside / file).replace(folder / file)
 
 
-def embedded_contract(text: str, where: Path) -> Contract:
-    """Parse the copy of the contract that the graph's metadata hold under CONTRACT_KEY."""
-    try:
-        return Contract.model_validate_json(text)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise BundleError(f"{where}: the contract inside it is malformed: {first['msg']}") from error
-
-
-def contract_json(contract: Contract) -> str:
-    """Return the contract as the indented JSON that goes into the bundle and the ONNX metadata."""
-    return json.dumps(contract.model_dump(mode="json"), indent=2)
-
-
 def sha256(file: Path) -> str:
     """Return the file's hash as 64 hexadecimal digits."""
     digest = hashlib.sha256()
@@ -638,10 +330,3 @@ def sha256(file: Path) -> str:
         for block in iter(lambda: stream.read(1 << 20), b""):
             digest.update(block)
     return digest.hexdigest()
-
-
-def iter_elements(space: LeafSpec) -> Iterator[tuple[int, str]]:
-    """Yield (index, label) for error messages: the element's name where known, else its index."""
-    for index in range(space.size):
-        named = index < len(space.elements)
-        yield index, f"{index} ({space.elements[index].name})" if named else str(index)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.bundle import DiscreteSpec, LeafSpec, MultiDiscreteSpec, SpaceSpec, leaf_specs
+from rlservo.export.contract.spaces import DiscreteSpec, LeafSpec, MultiDiscreteSpec, SpaceSpec, leaf_specs
 
 
 def parameter_count(leaf: LeafSpec) -> int:

@@ -28,8 +28,7 @@ from rlservo.export.contract.onnx_session import open_session
 from rlservo.export.graph.operators import exact_operators
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.why_not_exportable import why_not_onnx
-from rlservo.export.proof.parity import Runner
-from rlservo.export.recipe.samples import Inputs
+from rlservo.export.recipe.runners import Inputs, Runner
 
 TORCHSCRIPT_OPSET = 17
 DYNAMO_OPSET = 18  # its lowest

@@ -18,8 +18,7 @@ from torch.jit._trace import TracerWarning
 from rlservo.export.contract.errors import UnsupportedError, first_line
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.why_not_exportable import frozen_by_tracing, raised_at
-from rlservo.export.proof.parity import Runner
-from rlservo.export.recipe.samples import Inputs
+from rlservo.export.recipe.runners import Inputs, Runner
 
 
 def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> list[str]:

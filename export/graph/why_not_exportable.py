@@ -14,16 +14,13 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch.jit._trace import TracerWarning
 
 from rlservo.export.contract.errors import first_line
-from rlservo.export.proof.parity import ATOL, RTOL, Recorded, Runner
-from rlservo.export.recipe.samples import Inputs
+from rlservo.export.recipe.runners import Inputs
 
 INSTALLED = ("site-packages", "dist-packages")
-ALONE = 4  # samples that are also shown to RLlib one at a time
 INSTEAD = {
     "cummax|cummin": "take torch.maximum or torch.minimum of one column after the other and torch.stack them",
     r"complex|polar|real|imag|view_as_\w+|fft_\w+": "keep real and imaginary parts as two tensors (torch.hypot and "
@@ -45,21 +42,6 @@ def frozen_by_tracing(caught: Sequence[warnings.WarningMessage]) -> list[str]:
         if issubclass(one.category, TracerWarning) and not any(part in INSTALLED for part in Path(one.filename).parts)
     }
     return sorted(places)
-
-
-def why_different(reference: Runner, recorded: Sequence[Recorded], frozen: Sequence[str]) -> str:
-    """Return a clause that says why a graph may differ from RLlib's own numbers; '' if nothing is found."""
-    if sample := _depends_on_batch(reference, recorded):
-        return (
-            f"RLlib's own action for sample {sample[0]} is another when it is alone: the network's result depends on "
-            "the other observations of the batch, which cannot be exported"
-        )
-    if frozen:
-        return (
-            f"tracing froze what the network does outside torch at {', '.join(frozen[:3])}: use torch's own operations "
-            "there (torch.where for an 'if')"
-        )
-    return ""
 
 
 def why_not_onnx(graph: torch.nn.Module, example: Inputs, errors: Sequence[Exception]) -> str:
@@ -139,22 +121,3 @@ def _class_at(file: str, line: int) -> str:
     classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
     holding = [node for node in classes if node.lineno <= line <= (node.end_lineno or 0)]
     return max(holding, key=lambda node: node.lineno).name if holding else ""
-
-
-def _depends_on_batch(reference: Runner, recorded: Sequence[Recorded]) -> list[int]:
-    """Return a sample whose action is another without the rest of its batch, if there is one."""
-    for one in recorded:
-        if one.batch.restart is not None or len(one.batch) < ALONE:
-            continue
-        for row in range(ALONE):
-            alone = reference({name: values[row : row + 1].copy() for name, values in one.batch.inputs.items()})
-            for name, expected in one.outputs.items():
-                if not np.allclose(
-                    np.nan_to_num(alone[name][0].astype(np.float64)),
-                    np.nan_to_num(expected[row].astype(np.float64)),
-                    rtol=100 * RTOL,
-                    atol=100 * ATOL,
-                ):
-                    return [row]
-        break
-    return []

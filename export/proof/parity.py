@@ -19,17 +19,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Protocol, TypeAlias
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from rlservo.export.contract.bundle import FormatParity, Parity
+from rlservo.export.contract.contract import FormatParity, Parity
 from rlservo.export.contract.errors import ParityError, UnsupportedError, first_line
 from rlservo.export.contract.scores import split_scores
 from rlservo.export.recipe.recipe import Recipe, StateLeaf
-from rlservo.export.recipe.samples import BATCH_SIZES, Batch, Inputs
+from rlservo.export.recipe.runners import Inputs, Loop, Outputs, Runner
+from rlservo.export.recipe.samples import BATCH_SIZES, Batch
 from rlservo.export.recipe.to_contract import space_spec
 
 RTOL = 1e-5
@@ -50,18 +51,6 @@ REFERENCES: dict[str, str] = {
     "restored from the checkpoint, observation filter frozen, exploration off",
 }
 """What an export is compared with, by API stack."""
-
-Outputs: TypeAlias = dict[str, NDArray[Any]]
-Runner: TypeAlias = Callable[[Inputs], Outputs]
-"""Every input of the graph by name to every output by name."""
-
-
-class Loop(Protocol):
-    """Something that acts step after step and remembers."""
-
-    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
-        """Return the outputs for one step of every row; rows in `restart` begin an episode with it."""
-        ...
 
 
 class GraphLoop:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from numpy.typing import NDArray
 
 from rlservo.export.recipe.recipe import ObservationFilter, Recipe
+from rlservo.export.recipe.runners import Inputs
 
 BATCH_SIZES = (1, 2, 257)
 UNBOUNDED = 1e6  # a bound beyond this (CartPole's 3.4e38) says nothing of the values that occur
@@ -22,9 +23,6 @@ WIDE = 10.0  # standard deviations
 EXTREME = 1e3
 SEQUENCE_STEPS = {1: 200, 2: 200, 257: 3}
 NEW_EPISODE = 0.02  # the chance of a row's episode to end at a step, beside the ends that are certain
-
-Inputs: TypeAlias = dict[str, NDArray[Any]]
-"""Arrays `[batch, ...]` by the graph's input names."""
 
 
 @dataclass(frozen=True)

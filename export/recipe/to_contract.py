@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 from numpy.typing import NDArray
 
-from rlservo.export.contract.bundle import (
+from rlservo.export.contract.contract import StateSpec
+from rlservo.export.contract.spaces import (
     BoxSpec,
     DictSpec,
     DiscreteSpec,
@@ -17,7 +18,6 @@ from rlservo.export.contract.bundle import (
     MultiBinarySpec,
     MultiDiscreteSpec,
     SpaceSpec,
-    StateSpec,
     TupleSpec,
 )
 from rlservo.export.recipe.recipe import StateLeaf

@@ -21,7 +21,7 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
 from rlservo.export.checkpoints.location import CheckpointFiles
 from rlservo.export.checkpoints.unpickle import unpickle
-from rlservo.export.contract.bundle import BakedStep
+from rlservo.export.contract.contract import BakedStep
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 from rlservo.export.recipe.describe import observation_step
 from rlservo.export.recipe.trees import Tree, build_like, map_tree, tree_leaves

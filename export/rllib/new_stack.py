@@ -35,7 +35,8 @@ from rlservo.export.checkpoints.unpickle import explain, unpickle
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError, first_line
 from rlservo.export.recipe.describe import surprises
 from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLeaf
-from rlservo.export.recipe.samples import Inputs, draw_batches
+from rlservo.export.recipe.runners import Inputs
+from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.recipe.trees import (
     Tree,
     build,

@@ -45,7 +45,7 @@ from rlservo.export.checkpoints.unpickle import explain, unpickle
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError, first_line
 from rlservo.export.recipe.describe import surprises
 from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLeaf
-from rlservo.export.recipe.samples import Inputs
+from rlservo.export.recipe.runners import Inputs
 from rlservo.export.recipe.trees import build, named_leaves, space_leaves, tree_leaves
 from rlservo.export.rllib.distribution_mode import find_mode
 from rlservo.export.rllib.gaussian_heads import replace_bias_layers

@@ -11,9 +11,8 @@ from torch import Tensor, nn
 
 from rlservo.export.checkpoints.location import CheckpointFiles
 from rlservo.export.checkpoints.old_location import OldStackFiles
-from rlservo.export.proof.parity import Loop
 from rlservo.export.recipe.recipe import Recipe
-from rlservo.export.recipe.samples import Inputs
+from rlservo.export.recipe.runners import Inputs, Loop
 from rlservo.export.recipe.trees import Tree
 
 

@@ -12,8 +12,8 @@ from typing_extensions import Self
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.client.http_transport import Transport, encode
-from rlservo.serve_app.server.admin_key import key_file, read_key
-from rlservo.serve_app.server.api_keys import is_loopback
+from rlservo.serve_app.wire.admin_key_file import key_file, read_key
+from rlservo.serve_app.wire.loopback import is_loopback
 
 KEY_VARIABLE = "RLSERVO_ADMIN_KEY"
 TIMEOUT_S = 90.0  # every replica loads and proves a version before the server answers

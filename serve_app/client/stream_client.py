@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from pydantic import ValidationError
 from typing_extensions import Self
 
-from rlservo.export.contract.bundle import Contract
+from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import (
     ActionError,
     DeadlineError,
@@ -30,7 +30,7 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.serve_app.client.http_transport import error_from, error_of_status
-from rlservo.serve_app.client.policy_client import carried, check_sender, check_step, is_action, restored, sendable
+from rlservo.serve_app.client.replies import carried, check_sender, check_step, is_action, restored, sendable
 from rlservo.serve_app.client.websocket_connection import BrokenError, RefusedError, WebSocket
 from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack

@@ -17,7 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rlservo.export.contract.errors import RequestError, RlservoError
 from rlservo.serve_app.protocols import json_messages, oip_infer
-from rlservo.serve_app.protocols.http_endpoint import KEY, error_models, json_only, peer_of, request_id
+from rlservo.serve_app.protocols.http_endpoint import KEY, json_only, peer_of, request_id
+from rlservo.serve_app.protocols.http_errors import error_models
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.core import Core

@@ -18,23 +18,8 @@ from fastapi import Request
 from fastapi.routing import APIRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rlservo.export.contract.errors import (
-    ActionError,
-    ConflictError,
-    DeadlineError,
-    ForbiddenError,
-    MediaTypeError,
-    ObservationError,
-    RequestError,
-    RlservoError,
-    SessionError,
-    SessionLostError,
-    TooLargeError,
-    UnauthenticatedError,
-    UnavailableError,
-    UnknownPolicyError,
-)
-from rlservo.serve_app.protocols import json_messages
+from rlservo.export.contract.errors import DeadlineError, MediaTypeError, RlservoError
+from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, encode_bug, error_answer, too_large
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_age import LEAST_S
@@ -42,30 +27,8 @@ from rlservo.serve_app.server.request_log import FIELDS
 from rlservo.serve_app.versions.policy_store import Decision
 
 logger = logging.getLogger(__name__)
-
-STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; whatever does not fit is our fault: 500
-    (ObservationError, 422),
-    (UnknownPolicyError, 404),
-    (MediaTypeError, 415),
-    (TooLargeError, 413),
-    (RequestError, 400),
-    (DeadlineError, 408),
-    (ConflictError, 409),
-    (SessionLostError, 410),
-    (SessionError, 409),
-    (UnavailableError, 503),
-    (UnauthenticatedError, 401),
-    (ForbiddenError, 403),
-    (ActionError, 500),
-)
-ANY_ROUTE = (400, 401, 403, 408, 413)  # its path, key, host, page and body
-RETRY_AFTER_S = 1
 TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been read
-BUG = "the server failed on this request; its log says how"
-JSON = b"application/json"
 KEY = "rlservo.key"  # the key that opened a request, in its scope
-
-Headers = tuple[tuple[bytes, bytes], ...]
 Body = bytes | bytearray
 Handle = Callable[[Scope, Body, float], Awaitable[tuple[bytes, Headers, Decision]]]
 CheckHeaders = Callable[[list[tuple[bytes, bytes]]], None]
@@ -124,9 +87,6 @@ class Endpoint:
         self._core.log.failed(
             self._protocol, name, version, error.code, error.message, request_id=request_id(scope), seconds=seconds
         )
-
-
-JSON_HEADERS: Headers = ((b"content-type", JSON),)
 
 
 class BareRoute(APIRoute):
@@ -310,54 +270,9 @@ async def json_only(request: Request) -> None:
     check_media_type(request.scope["headers"], JSON)
 
 
-def too_large(limit: int) -> TooLargeError:
-    return TooLargeError(f"the request body is larger than {limit} bytes", {"max_body_bytes": limit})
-
-
 def session_of(scope: Scope) -> str | None:
     """Return the session that the header `x-session-id` names; Ray Serve's own routing knows it, too."""
     for name, value in scope["headers"]:
         if name == b"x-session-id":
             return str(value.decode("latin-1"))
     return None
-
-
-# Errors: the one table above, and one body for all.
-
-
-def status_of(error: RlservoError) -> int:
-    """Return the HTTP status of an error."""
-    return next((status for kind, status in STATUS if isinstance(error, kind)), 500)
-
-
-def error_answer(error: RlservoError) -> tuple[int, bytes, Headers]:
-    """Return (status, body, headers) and log what is our own fault."""
-    status = status_of(error)
-    headers = JSON_HEADERS
-    if status == 503:
-        headers += ((b"retry-after", str(RETRY_AFTER_S).encode()),)
-    elif status == 401:
-        headers += ((b"www-authenticate", b"Bearer"),)
-    elif status >= 500:
-        logger.error("%s", error.message)
-    return status, encode_error(error), headers
-
-
-def encode_error(error: RlservoError) -> bytes:
-    """Return the body of an error; the inside of the server stays inside."""
-    if status_of(error) == 500 and not isinstance(error, ActionError):
-        return encode_bug()
-    document: dict[str, Any] = {"error": error.message, "code": error.code}
-    if error.details:
-        document["details"] = error.details
-    return json_messages.encode_json(document)
-
-
-def encode_bug() -> bytes:
-    """Return the body of an error that is none of ours to explain to a client."""
-    return json_messages.encode_json({"error": BUG, "code": "internal"})
-
-
-def error_models(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return FastAPI's `responses` for these error statuses, and for those that every route may answer with."""
-    return {status: {"model": json_messages.ErrorReply} for status in sorted({*ANY_ROUTE, *statuses})}

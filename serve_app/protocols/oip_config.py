@@ -15,10 +15,11 @@ import orjson
 from fastapi import FastAPI
 from fastapi.responses import Response
 
-from rlservo.export.contract.bundle import ONNX_FILE, REWARD, TensorSpec
+from rlservo.export.contract.bundle import ONNX_FILE
+from rlservo.export.contract.contract import REWARD, TensorSpec
 from rlservo.export.contract.errors import RequestError
-from rlservo.serve_app.protocols import oip_infer
-from rlservo.serve_app.protocols.http_endpoint import error_models
+from rlservo.serve_app.protocols import oip_infer, oip_models
+from rlservo.serve_app.protocols.http_errors import error_models
 from rlservo.serve_app.protocols.oip_tensors import datatype_of
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Access, grant
@@ -41,7 +42,7 @@ def model_config(core: Core, name: str, version: str | None) -> dict[str, Any]:
     offered = oip_infer.output_names(contract)
     config: dict[str, Any] = {
         "name": name,
-        "platform": oip_infer.PLATFORM,
+        "platform": oip_models.PLATFORM,
         "backend": BACKEND,
         "max_batch_size": min(core.settings.max_batch, LARGEST_INT32),
         "input": [_input(tensor) for tensor in (*contract.inputs, *last_action)],

@@ -31,14 +31,16 @@ from rlservo.export.contract.errors import (
     RlservoError,
     TooLargeError,
 )
-from rlservo.serve_app.protocols import oip_config, oip_infer
+from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
 from rlservo.serve_app.protocols import oip_messages as messages
-from rlservo.serve_app.protocols.http_endpoint import BUG, RETRY_AFTER_S, status_of
+from rlservo.serve_app.protocols.http_errors import BUG, RETRY_AFTER_S, status_of
 from rlservo.serve_app.protocols.oip_tensors import DTYPES, MAX_AXES, datatype_of, from_bytes
-from rlservo.serve_app.ray_serve.grpc_ingress import Incoming
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_checks import presented_key
+
+Incoming = tuple[bytes, float | None]
+"""A request's bytes, and how many seconds its caller still waits for the answer (None: for ever)."""
 
 logger = logging.getLogger(__name__)
 
@@ -121,7 +123,7 @@ class Grpc:
         self._methods: dict[str, Callable[[Incoming], Any]] = {
             "ServerLive": lambda _request: messages.ServerLiveResponse(live=True),
             "ServerReady": lambda _request: messages.ServerReadyResponse(ready=core.ready),
-            "ServerMetadata": lambda _request: messages.ServerMetadataResponse(**oip_infer.server_metadata()),
+            "ServerMetadata": lambda _request: messages.ServerMetadataResponse(**oip_models.server_metadata()),
             "ModelReady": self._model_ready,
             "ModelMetadata": self._model_metadata,
             "ModelConfig": self._model_config,
@@ -212,7 +214,9 @@ class Grpc:
 
     def _model_metadata(self, request: Incoming) -> Any:
         asked = _parse(messages.ModelMetadataRequest, request[0])
-        return messages.ModelMetadataResponse(**oip_infer.model_metadata(self._core, asked.name, asked.version or None))
+        return messages.ModelMetadataResponse(
+            **oip_models.model_metadata(self._core, asked.name, asked.version or None)
+        )
 
     def _model_config(self, request: Incoming) -> Any:
         asked = _parse(messages.ModelConfigRequest, request[0])
@@ -226,7 +230,7 @@ class Grpc:
 
     def _index(self, request: Incoming) -> Any:
         asked = _parse(messages.RepositoryIndexRequest, request[0])
-        return messages.RepositoryIndexResponse(models=oip_infer.repository_index(self._core, ready=asked.ready))
+        return messages.RepositoryIndexResponse(models=oip_models.repository_index(self._core, ready=asked.ready))
 
     async def _infer(
         self, request: Incoming, request_id: str | None, session: str | None, waited: float | None = None

@@ -14,58 +14,35 @@ Specification: github.com/kserve/open-inference-protocol, and Triton's extension
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import orjson
-from fastapi import Depends, FastAPI, Request
-from fastapi.responses import Response
+from fastapi import Request
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.types import Scope
 
-import rlservo
-from rlservo.export.contract.bundle import REWARD, Contract, TensorSpec
+from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.serve_app.episodes.episodes import Episode
 from rlservo.serve_app.episodes.sessions import SessionId
 from rlservo.serve_app.protocols import json_messages
-from rlservo.serve_app.protocols.http_endpoint import (
-    JSON,
-    JSON_HEADERS,
-    BareRoute,
-    Body,
-    Endpoint,
-    Headers,
-    check_media_type,
-    error_models,
-    session_of,
-    too_large,
-)
+from rlservo.serve_app.protocols.http_endpoint import Body, check_media_type, session_of
+from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, too_large
 from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor
-from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.listing import states_of
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.state_names import BELONGS_TO
 
 LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
 BINARY = b"application/octet-stream"
-PLATFORM = "onnx_onnxv1"
 STATE_IN, STATE_OUT = "state_in.", "state_out."
 LAST_ACTION = "last_action"  # inputs like the outputs `action` and `action.<path>`
 STATE_POLICY = "state_policy"  # whose the states are
-EXTENSIONS = (
-    "binary_tensor_data",
-    "model_configuration",
-    "model_repository",
-    "parameters",
-    "sequence",
-    "statistics",
-)
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
 MODEL_NAME = "model_name"  # KServe's client says again what the path says
 # What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
@@ -76,7 +53,6 @@ TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
 IGNORED = frozenset({"priority", TIMEOUT, "headers", "content_type"})
 SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits one packet either way
 COMPRESSION_LEVEL = 1  # numbers of a robot hardly compress; a control loop waits for them
-STATES = {"ready": "READY", "loading": "LOADING", "failed": "UNAVAILABLE"}
 SUCH_AS = '{"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [...]}]}'
 
 
@@ -118,36 +94,7 @@ class InferReply(BaseModel):
     outputs: list[Tensor]
 
 
-class ServerMetadata(BaseModel):
-    name: str
-    version: str
-    extensions: list[str]
-
-
-class TensorMetadata(BaseModel):
-    name: str
-    datatype: str
-    shape: list[int] = Field(description="-1 is the batch.")
-
-
-class ModelMetadata(BaseModel):
-    name: str
-    versions: list[str]
-    platform: str
-    inputs: list[TensorMetadata]
-    outputs: list[TensorMetadata]
-
-
-class ModelState(BaseModel):
-    """A line of the repository index."""
-
-    name: str
-    version: str
-    state: str
-    reason: str
-
-
-class _Infer:
+class Infer:
     """Answers inference requests: JSON and raw tensors in, JSON and raw tensors out."""
 
     def __init__(self, core: Core) -> None:
@@ -486,7 +433,7 @@ def output_names(contract: Contract) -> list[str]:
 # Bytes: lengths and compression.
 
 
-def _check_headers(headers: list[tuple[bytes, bytes]]) -> None:
+def check_headers(headers: list[tuple[bytes, bytes]]) -> None:
     """Triton's client names no content type, others name JSON or octets: the length header is what tells them apart."""
     check_media_type(headers, JSON, BINARY, optional=True)
     for name, value in headers:
@@ -533,164 +480,3 @@ def _compress(content: bytes, headers: Headers, accepted: bytes) -> tuple[bytes,
 async def media_type(request: Request) -> None:
     """Raise MediaTypeError for what none of the protocol's clients sends: a dependency of routes that FastAPI runs."""
     check_media_type(request.scope["headers"], JSON, BINARY, optional=True)
-
-
-# What can be asked about the server and its models. FastAPI runs these: nobody asks a thousand times a second.
-
-
-def add_routes(app: FastAPI, core: Core, add_direct: Callable[[BareRoute], None]) -> None:
-    """Add /v2 to the application; `add_direct` adds what FastAPI only documents."""
-    infer = Endpoint("oip", _Infer(core), _check_headers, core)
-    _add_health(app, core)
-    _add_models(app, core)
-    for path, operation, summary in (
-        ("/v2/models/{name}/infer", "infer", "Infer with the default version"),
-        (
-            "/v2/models/{name}/versions/{version}/infer",
-            "infer_version",
-            "Infer with one version, or with what an alias leads to",
-        ),
-    ):
-        add_direct(
-            BareRoute(
-                path,
-                infer,
-                operation=operation,
-                tag="open inference protocol",
-                summary=summary,
-                reply=InferReply,
-                body={
-                    "application/json": {"schema": _request_schema()},
-                    "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
-                },
-                responses=error_models(400, 404, 408, 409, 410, 413, 415, 422, 500, 503),
-            )
-        )
-
-
-def _request_schema() -> dict[str, Any]:
-    """The request's schema; the tensor's is already among the document's, through the reply."""
-    schema = InferRequest.model_json_schema(ref_template="#/components/schemas/{model}")
-    schema.pop("$defs")
-    return schema
-
-
-def _add_health(app: FastAPI, core: Core) -> None:
-    @app.get(
-        "/v2/health/live",
-        tags=["health"],
-        summary="The process answers (Open Inference Protocol)",
-        responses=error_models(),
-    )
-    @grant(Access.open)
-    async def live() -> Response:
-        return _json({"live": True})
-
-    @app.get(
-        "/v2/health/ready", tags=["health"], summary="The policies are loaded and proven", responses=error_models(503)
-    )
-    @grant(Access.open)
-    async def ready() -> Response:
-        core.store()
-        return _json({"ready": True})
-
-
-def _add_models(app: FastAPI, core: Core) -> None:
-    tags: list[Any] = ["open inference protocol"]
-    errors = error_models(404, 503)
-
-    @app.get(
-        "/v2",
-        tags=tags,
-        summary="The server and the extensions it speaks",
-        response_model=ServerMetadata,
-        responses=error_models(),
-    )
-    @grant(Access.act)
-    async def server() -> Response:
-        return _json(server_metadata())
-
-    @app.get("/v2/models/{name}", tags=tags, summary="A model", response_model=ModelMetadata, responses=errors)
-    @grant(Access.act)
-    async def model(name: str) -> Response:
-        return _json(model_metadata(core, name, None))
-
-    @app.get(
-        "/v2/models/{name}/versions/{version}",
-        tags=tags,
-        summary="One version of a model",
-        response_model=ModelMetadata,
-        responses=errors,
-    )
-    @grant(Access.act)
-    async def model_version(name: str, version: str) -> Response:
-        return _json(model_metadata(core, name, version))
-
-    @app.get("/v2/models/{name}/ready", tags=tags, summary="The model is loaded and proven", responses=errors)
-    @grant(Access.act)
-    async def model_ready(name: str) -> Response:
-        return _json({"name": core.store().get(name).contract.name, "ready": True})
-
-    @app.get("/v2/models/{name}/versions/{version}/ready", tags=tags, summary="The version is loaded", responses=errors)
-    @grant(Access.act)
-    async def model_version_ready(name: str, version: str) -> Response:
-        return _json({"name": core.store().get(name, version).contract.name, "ready": True})
-
-    @app.post(
-        "/v2/repository/index",
-        tags=tags,
-        summary="Every version of every model",
-        dependencies=[Depends(media_type)],
-        response_model=list[ModelState],
-        responses=error_models(415, 503),
-    )
-    @grant(Access.act)
-    async def index(request: Request) -> Response:
-        body = await request.body()
-        ready = False
-        if body:
-            document, _ = json_messages.read_json(body, such_as='{"ready": true}')
-            ready = bool(flag(document, "ready"))
-        return _json(repository_index(core, ready=ready))
-
-
-# What can be asked, as the protocol's documents; gRPC's messages have the same fields.
-
-
-def server_metadata() -> dict[str, Any]:
-    """Return who this is, and the extensions it speaks."""
-    return {"name": "rlservo", "version": rlservo.__version__, "extensions": EXTENSIONS}
-
-
-def repository_index(core: Core, *, ready: bool = False) -> list[dict[str, str]]:
-    """Return every version of every model and how it stands; `ready` leaves the others out."""
-    core.store()
-    return [
-        {"name": name, "version": version, "state": STATES[state.state], "reason": state.reason}
-        for name, versions in states_of(core).items()
-        for version, state in versions.items()
-        if state.state == "ready" or not ready
-    ]
-
-
-def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]:
-    """Return a model's inputs and outputs; `version` None is the default."""
-    policy = core.store().get(name, version)
-    contract = policy.contract
-    versions = core.store().versions(name) if version is None else (contract.version,)
-    inputs = [*contract.inputs, *(last_action_inputs(contract) if policy.limited else ())]
-
-    def described(tensor: TensorSpec) -> dict[str, Any]:
-        return {"name": tensor.name, "datatype": datatype_of(tensor.dtype), "shape": tensor.shape}
-
-    return {
-        "name": name,
-        "versions": versions,
-        "platform": PLATFORM,
-        "inputs": [described(tensor) for tensor in inputs],
-        "outputs": [described(tensor) for tensor in contract.outputs if tensor.name in output_names(contract)],
-    }
-
-
-def _json(document: Any) -> Response:
-    return Response(orjson.dumps(document), media_type="application/json")

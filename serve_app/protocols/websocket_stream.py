@@ -29,11 +29,13 @@ from typing import Any
 from starlette.routing import WebSocketRoute
 from starlette.types import Message, Receive, Scope, Send
 
-from rlservo.export.contract.bundle import Contract, DictSpec
+from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RequestError, RlservoError, TooLargeError, UnknownPolicyError
+from rlservo.export.contract.spaces import DictSpec
 from rlservo.serve_app.episodes.sessions import Session
 from rlservo.serve_app.protocols import json_messages
-from rlservo.serve_app.protocols.http_endpoint import encode_bug, error_answer, request_id, session_of
+from rlservo.serve_app.protocols.http_endpoint import request_id, session_of
+from rlservo.serve_app.protocols.http_errors import encode_bug, error_answer
 from rlservo.serve_app.server.admission import IdleTimer
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core

@@ -23,20 +23,22 @@ from ray.serve.config import HTTPOptions, gRPCOptions
 from ray.serve.context import _get_global_client
 
 from rlservo.export.contract.errors import PartlyAppliedError, RlservoError
-from rlservo.serve_app.protocols.json_act import PolicyApp, create_app
+from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.oip_grpc import InferenceService
 from rlservo.serve_app.ray_serve import ingress
 from rlservo.serve_app.ray_serve.autoscaling import BUSY, Load
 from rlservo.serve_app.ray_serve.gcs_ledger import GcsLedger
 from rlservo.serve_app.server import listing
-from rlservo.serve_app.server.api_keys import check_exposure, is_loopback
+from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.loaded_policies import Library
 from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.versions.policy_store import load_policy
 from rlservo.serve_app.versions.replica_versions import Control, Following
-from rlservo.serve_app.versions.repository import Library, Repository
+from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.wire.loopback import is_loopback
 
 logger = logging.getLogger(__name__)
 

@@ -29,9 +29,6 @@ UNARY = (
 STREAMS = ("ModelStreamInfer",)
 LONGEST_S = 86400.0  # [s] gRPC says "no deadline" as one far away
 
-Incoming = tuple[bytes, float | None]
-"""A request's bytes, and how many seconds its caller still waits for the answer (None: for ever)."""
-
 
 def add_service(_servicer: Any, server: Any) -> None:
     """Register the service's methods at one of Serve's gRPC servers."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlservo.export.contract.bundle import REWARD
+from rlservo.export.contract.contract import REWARD
 from rlservo.export.contract.errors import RlservoError, UsageError
 from rlservo.serve_app.interface import ActingPolicy
 from rlservo.serve_app.rollout.environment import check_fit, control_rate_of, make_env

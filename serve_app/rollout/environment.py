@@ -8,16 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlservo.export.contract.bundle import (
-    BoxSpec,
-    Contract,
-    DictSpec,
-    MultiBinarySpec,
-    MultiDiscreteSpec,
-    SpaceSpec,
-    TupleSpec,
-)
+from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.spaces import BoxSpec, DictSpec, MultiBinarySpec, MultiDiscreteSpec, SpaceSpec, TupleSpec
 
 if TYPE_CHECKING:
     import gymnasium as gym

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from typing_extensions import Self
 
-from rlservo.export.contract.bundle import Contract, SpaceSpec, leaf_specs
+from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import (
     DeadlineError,
     RequestError,
@@ -28,6 +28,7 @@ from rlservo.export.contract.errors import (
     UsageError,
 )
 from rlservo.export.contract.nested import action_leaves, build_action
+from rlservo.export.contract.spaces import SpaceSpec, leaf_specs
 from rlservo.serve_app.interface import ActingPolicy, Observation
 
 logger = logging.getLogger(__name__)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.bundle import LeafSpec, iter_elements
 from rlservo.export.contract.errors import ActionError
+from rlservo.export.contract.spaces import LeafSpec, iter_elements
 
 OVERSHOOT = 1e-5  # relative to the bound: what float32 rounding in unsquash may leave outside the space; clipped
 SMALL_ACTION = 32  # elements up to which a Python loop checks bounds faster than numpy does

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from rlservo.export.contract.bundle import BoxSpec, Contract, iter_elements
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.spaces import BoxSpec, iter_elements
 
 FILTER = "mean_std_filter"
 EVERY = 16  # the arithmetic costs a few microseconds: too much for every step of a control loop

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.bundle import (
+from rlservo.export.contract.contract import Distribution
+from rlservo.export.contract.scores import parameter_count, split_parameters
+from rlservo.export.contract.spaces import (
     BoxSpec,
     DictSpec,
     DiscreteSpec,
-    Distribution,
     LeafSpec,
     MultiDiscreteSpec,
     SpaceSpec,
     TupleSpec,
     leaf_specs,
 )
-from rlservo.export.contract.scores import parameter_count, split_parameters
 
 # RLlib clamps the log of a squashed Gaussian's scale to this range: ray/rllib/utils/numpy.py, ray 2.60.
 MIN_LOG_STD = -5.0

@@ -12,8 +12,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.export.contract.bundle import REWARD, Contract, DiscreteSpec, StateSpec
+from rlservo.export.contract.contract import REWARD, Contract, StateSpec
 from rlservo.export.contract.errors import RequestError
+from rlservo.export.contract.spaces import DiscreteSpec
 
 State: TypeAlias = dict[str, NDArray[Any]]
 """Arrays `[batch, *shape]` by state name."""

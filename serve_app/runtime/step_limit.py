@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.bundle import BoxSpec, LeafSpec, iter_elements
 from rlservo.export.contract.errors import ActionError, RequestError, UsageError
+from rlservo.export.contract.spaces import BoxSpec, LeafSpec, iter_elements
 from rlservo.serve_app.runtime.options import PolicyOptions
 
 ROUNDING = 1e-6  # relative to the step: what float32 may add to a step that is allowed

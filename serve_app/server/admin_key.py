@@ -11,17 +11,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.server.api_keys import new_key
-
-LONGEST_KEY_FILE = 4096  # [bytes] far more than a key
-
-
-def key_file(port: int) -> Path:
-    """Return where the key of a server on this port is kept: below XDG_RUNTIME_DIR, else in the user's cache."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(runtime) if runtime else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return folder / "rlservo" / f"admin-{port}.key"
 
 
 @contextlib.contextmanager
@@ -53,15 +43,3 @@ def remove_key(file: Path, digest: str) -> None:
     with contextlib.suppress(OSError, UnicodeDecodeError):
         if digest_of(file.read_text(encoding="ascii").strip()) == digest:
             file.unlink()
-
-
-def read_key(file: Path) -> str:
-    """Return the key in a file. Raises UsageError."""
-    try:
-        with file.open(encoding="ascii") as stream:
-            key = stream.read(LONGEST_KEY_FILE).strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"the key file {file} cannot be read: {error}") from None
-    if not key or len(key.split()) != 1:
-        raise UsageError(f"the key file {file} should hold one key and nothing else")
-    return key

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import ipaddress
 import os
 import re
 import secrets
@@ -28,6 +27,7 @@ from typing_extensions import Self
 from rlservo.export.contract.errors import ForbiddenError, UnauthenticatedError, UsageError
 from rlservo.export.contract.regular_files import NotReadableError, blocks, open_regular
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.wire.loopback import is_loopback
 
 if TYPE_CHECKING:
     from rlservo.serve_app.server.api_key_file import CurrentKeys
@@ -185,16 +185,6 @@ def check_exposure(host: str, settings: ServerSettings) -> Keys:
             "RLSERVO_ALLOW_UNAUTHENTICATED=1"
         )
     return keys
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a server that listens on `host`."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:  # a name: wherever it points
-        return False
 
 
 def read_key_file(file: Path) -> bytes:

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from rlservo.export.contract.bundle import DictSpec, SpaceSpec, TupleSpec
 from rlservo.export.contract.errors import (
     DeadlineError,
     LateError,
@@ -23,6 +22,7 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UnknownPolicyError,
 )
+from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec
 from rlservo.serve_app.episodes.episodes import Episode, Episodes
 from rlservo.serve_app.episodes.sessions import Session, SessionId
 from rlservo.serve_app.runtime.policy import Policy

@@ -17,8 +17,9 @@ import socket
 from typing import TYPE_CHECKING
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError
-from rlservo.serve_app.server.api_keys import SCHEMES, is_loopback
+from rlservo.serve_app.server.api_keys import SCHEMES
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.wire.loopback import is_loopback
 
 if TYPE_CHECKING:
     from starlette.types import Scope

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from rlservo.export.contract.bundle import NAME_PATTERN, VERSION_PATTERN, version_key
+from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, version_key
 from rlservo.export.contract.errors import ConflictError, UnknownPolicyError, UnknownVersionError, UsageError
 
 PRODUCTION = "production"

@@ -14,17 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.contract.bundle import (
-    DEFAULT_LIMITS,
-    BundleLimits,
-    DictSpec,
-    SpaceSpec,
-    TupleSpec,
-    find_bundles,
-    leaf_specs,
-    read_contract,
-    version_key,
-)
+from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, find_bundles, read_contract
+from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import (
     BundleError,
     RequestError,
@@ -33,6 +24,7 @@ from rlservo.export.contract.errors import (
     UnknownVersionError,
     UsageError,
 )
+from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec, leaf_specs
 from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy

@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NoReturn, Protocol, TypeVar
 
-from rlservo.export.contract.bundle import Contract, version_key
+from rlservo.export.contract.contract import Contract, version_key
 from rlservo.export.contract.errors import (
     BundleError,
     PartlyAppliedError,
@@ -27,6 +27,7 @@ from rlservo.export.contract.errors import (
     UsageError,
 )
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
+from rlservo.serve_app.versions.loaded_policies import Library, Loaded
 from rlservo.serve_app.versions.plan import (
     FailedVersion,
     Plan,
@@ -39,7 +40,7 @@ from rlservo.serve_app.versions.plan import (
 )
 from rlservo.serve_app.versions.plan import load as add_version
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.repository import Key, Library, Loaded, raise_all
+from rlservo.serve_app.versions.repository import Key, raise_all
 
 logger = logging.getLogger(__name__)
 

@@ -7,43 +7,21 @@ Everything here blocks (hashing, onnxruntime, golden vectors), and may do so for
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from rlservo.export.contract.bundle import (
-    DEFAULT_LIMITS,
-    BundleLimits,
-    digest_of,
-    find_bundles,
-    read_contract,
-    version_key,
-)
+from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, digest_of, find_bundles, read_contract
+from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import (
     BundleError,
-    BundleTamperedError,
     RlservoError,
     UnknownPolicyError,
     UnknownVersionError,
     UsageError,
 )
-from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.plan import ServedConfig, now, plan_of
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.plan import ServedConfig
 
 Key = tuple[str, str]  # (name, version)
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """A policy that was proven on this machine."""
-
-    policy: Policy
-    digest: str
-    loaded_at: str
 
 
 class Repository:
@@ -126,83 +104,6 @@ class Repository:
         """Return (version, hash) of a bundle, as `find`."""
         found, folder = self.find(name, version)
         return found, digest_of(folder)
-
-
-def load_served(
-    paths: Iterable[str | Path], config: ServedConfig, settings: ServerSettings | None = None
-) -> PolicyStore:
-    """Load and prove what a server of these folders would start with.
-
-    Raises UsageError or BundleError, and UnavailableError where the file system hangs.
-    """
-    settings = settings or ServerSettings.from_environment(environment={})
-    calls, limits = BlockingCalls(), settings.bundle_limits
-    library = Library(Repository(paths, limits), partial(Policy.load, limits=limits))
-    available = calls.wait(
-        library.repository.available, config, timeout_s=settings.scan_timeout_s, what="looking through the folders"
-    )
-    plans = plan_of(config, available, None)
-    policies: list[Policy] = []
-    errors: list[RlservoError] = []
-    for name, plan in plans.items():
-        for version, digest in plan.versions.items():
-            what = f"loading policy '{name}' version {version}"
-            try:
-                loaded = calls.wait(library.load, name, version, digest, timeout_s=settings.load_timeout_s, what=what)
-                policies.append(loaded.policy)
-            except BundleError as error:
-                errors.append(error)
-    raise_all(errors)
-    return PolicyStore(policies, plans)
-
-
-class Library:
-    """The policies in memory, by name, version and hash."""
-
-    def __init__(self, repository: Repository, load: Callable[[Path], Policy] = Policy.load) -> None:
-        """`load` loads and proves one bundle; raises BundleError."""
-        self.repository = repository
-        self._load = load
-        self._loaded: dict[tuple[str, str, str], Loaded] = {}
-
-    def get(self, name: str, version: str, digest: str) -> Loaded | None:
-        """Return the policy if the bundle with that hash is in memory."""
-        return self._loaded.get((name, version, digest))
-
-    def load(self, name: str, version: str, digest: str) -> Loaded:
-        """Load and prove a bundle, unless it is in memory.
-
-        Raises what `Repository.find` and `Policy.load` raise, and BundleTamperedError when the folder holds another
-        bundle than the one that was accepted.
-        """
-        loaded = self.get(name, version, digest)
-        if loaded is not None:
-            return loaded
-        _, folder = self.repository.find(name, version)
-        if digest_of(folder) == digest:
-            try:
-                policy = self._load(folder)
-            except MemoryError:
-                raise BundleError(f"{folder} needs more memory than there is") from None
-            contract = policy.contract
-            # It was not exchanged meanwhile, neither now nor when its name was read and its hash accepted.
-            if (contract.name, contract.version, policy.digest) == (name, version, digest):
-                loaded = self._loaded[name, version, digest] = Loaded(policy, digest, now())
-                return loaded
-        raise BundleTamperedError(
-            f"{folder} is not the bundle that was accepted as version {version} of '{name}' (its hashes are others): "
-            "export changes under a new version, or load this one again"
-        )
-
-    def keep(self, served: Mapping[tuple[str, str, str], Loaded], proposed: Collection[tuple[str, str, str]]) -> None:
-        """Hold what is served, keep what is proposed, and let all others go; who computes with one is not disturbed.
-
-        In place: a thread may be adding one at this moment.
-        """
-        for key in list(self._loaded):
-            if key not in served and key not in proposed:
-                self._loaded.pop(key, None)
-        self._loaded.update(served)
 
 
 def raise_all(errors: Sequence[RlservoError]) -> None:

@@ -21,7 +21,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from rich.console import Console
 
 import soak as soak_module
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore

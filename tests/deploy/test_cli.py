@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from rlservo.deploy.cli import parse_env_arguments
+from rlservo.deploy.serve_commands import parse_env_arguments
 from rlservo.export.contract.errors import UsageError
 
 ROOT = Path(__file__).resolve().parents[2]

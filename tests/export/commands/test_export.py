@@ -15,7 +15,8 @@ import pytest
 from rlservo.export.commands.export import export_checkpoint
 from rlservo.export.commands.naming import default_name
 from rlservo.export.contract import bundle
-from rlservo.export.contract.bundle import DiscreteSpec, contract_json, load_bundle, write_contract
+from rlservo.export.contract.bundle import load_bundle, write_contract
+from rlservo.export.contract.contract import contract_json
 from rlservo.export.contract.errors import (
     BundleTamperedError,
     CheckpointError,
@@ -24,6 +25,7 @@ from rlservo.export.contract.errors import (
     UnsupportedError,
     UsageError,
 )
+from rlservo.export.contract.spaces import DiscreteSpec
 from rlservo.export.graph.onnx_file import run_onnx
 from rlservo.export.graph.torchscript_file import run_torchscript
 from rlservo.export.proof import parity

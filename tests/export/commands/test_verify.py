@@ -17,8 +17,9 @@ from rlservo.export.commands.export import export_checkpoint
 from rlservo.export.commands.prune import prune_checkpoint
 from rlservo.export.commands.report import contract_report
 from rlservo.export.commands.verify import verify_bundle
-from rlservo.export.contract.bundle import BoxSpec, Element, load_bundle, read_contract
+from rlservo.export.contract.bundle import load_bundle, read_contract
 from rlservo.export.contract.errors import BundleError, ParityError, UsageError
+from rlservo.export.contract.spaces import BoxSpec, Element
 from rlservo.export.recipe.recipe import Recipe
 
 

@@ -13,12 +13,13 @@ import pytest
 
 from rlservo.export.checkpoints.location import locate_checkpoint
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.contract.bundle import Parity
+from rlservo.export.contract.contract import Parity
 from rlservo.export.contract.errors import ParityError
 from rlservo.export.graph.onnx_file import run_onnx, write_onnx
 from rlservo.export.graph.policy_graph import PolicyGraph
-from rlservo.export.proof.parity import GraphLoop, Outputs, Runner, prove, record, record_moved
+from rlservo.export.proof.parity import GraphLoop, prove, record, record_moved
 from rlservo.export.recipe.recipe import ObservationFilter, Recipe, Transform
+from rlservo.export.recipe.runners import Outputs, Runner
 from rlservo.export.recipe.samples import BATCH_SIZES, draw_batches
 from rlservo.export.rllib.new_stack import Checkpoint, load_checkpoint
 

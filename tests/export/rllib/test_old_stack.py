@@ -25,13 +25,15 @@ from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.commands.export import ExportResult, export_checkpoint
 from rlservo.export.commands.prune import prune_checkpoint
 from rlservo.export.commands.verify import verify_bundle
-from rlservo.export.contract.bundle import Parity, load_bundle
+from rlservo.export.contract.bundle import load_bundle
+from rlservo.export.contract.contract import Parity
 from rlservo.export.contract.errors import CheckpointError, ParityError, RequestError, RlservoError, UnsupportedError
 from rlservo.export.graph.onnx_file import run_onnx, write_onnx
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.torchscript_file import run_torchscript
-from rlservo.export.proof.parity import GraphLoop, Loop, prove, record, record_moved
+from rlservo.export.proof.parity import GraphLoop, prove, record, record_moved
 from rlservo.export.recipe.recipe import ObservationFilter, Preprocess, Recipe, StateLeaf
+from rlservo.export.recipe.runners import Loop
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.rllib.old_models import Registration, find_registrations
 from rlservo.export.rllib.old_stack import OldStackCheckpoint, load_old_stack

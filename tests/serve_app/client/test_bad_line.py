@@ -29,7 +29,7 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.rollout.fallback import StoppedError, WithFallback
 from rlservo.serve_app.runtime.policy import Policy

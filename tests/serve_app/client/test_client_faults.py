@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.export.contract.bundle import BoxSpec, Contract, Parity, Provenance, TensorSpec
+from rlservo.export.contract.contract import Contract, Parity, Provenance, TensorSpec
 from rlservo.export.contract.errors import (
     ActionError,
     DeadlineError,
@@ -25,6 +25,7 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
     UsageError,
 )
+from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.ray_serve.processes import free_ports
 

@@ -25,7 +25,7 @@ from rlservo.export.contract.errors import (
     UsageError,
 )
 from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings

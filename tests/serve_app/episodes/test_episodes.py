@@ -19,10 +19,10 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed
 
-from rlservo.export.contract.bundle import leaf_specs
 from rlservo.export.contract.nested import action_leaves
+from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore

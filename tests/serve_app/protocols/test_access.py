@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from rlservo.serve_app.protocols.json_act import PolicyApp, create_app
+from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.server.api_keys import ACCESS, Access, access_of, grant, new_key
 from rlservo.serve_app.server.request_log import FIELDS
 from rlservo.serve_app.server.settings import ServerSettings

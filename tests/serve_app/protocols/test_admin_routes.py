@@ -31,13 +31,15 @@ from rlservo.export.contract.errors import (
     UsageError,
 )
 from rlservo.serve_app.client.admin_client import AdminClient, find_key
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.admin_key import key_file, operator_key, read_key
+from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.loaded_policies import Library
 from rlservo.serve_app.versions.replica_versions import Control
-from rlservo.serve_app.versions.repository import Library, Repository
+from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.wire.admin_key_file import key_file, read_key
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
 Serve = Callable[[Any], AbstractContextManager[int]]

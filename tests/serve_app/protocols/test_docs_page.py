@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.docs_page import PAGE
-from rlservo.serve_app.protocols.json_act import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 

@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 import uvicorn
 
-from rlservo.export.contract.bundle import Contract
+from rlservo.export.contract.contract import Contract
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.docs_page import PAGE
-from rlservo.serve_app.protocols.json_act import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from rlservo.serve_app.protocols import oip_messages as messages
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_config import model_config, statistics
 from rlservo.serve_app.protocols.oip_grpc import _numbered
 from rlservo.serve_app.runtime.options import PolicyOptions

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from uvicorn.protocols.utils import ClientDisconnected
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from rlservo.export.contract.bundle import Contract
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.export.contract.contract import Contract
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 

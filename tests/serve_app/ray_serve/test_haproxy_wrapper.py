@@ -20,8 +20,9 @@ from pathlib import Path
 
 import pytest
 
-from rlservo.serve_app.ray_serve import haproxy_wrapper, launcher
-from rlservo.serve_app.ray_serve.launcher import ray_environment
+from rlservo.serve_app.ray_serve import environment as environment_module
+from rlservo.serve_app.ray_serve import haproxy_wrapper
+from rlservo.serve_app.ray_serve.environment import ray_environment
 from rlservo.serve_app.ray_serve.processes import free_ports, is_free
 from rlservo.serve_app.server.settings import ServerSettings
 
@@ -525,7 +526,7 @@ def test_a_server_whose_replicas_ports_are_in_use_gets_others(tmp_path: Path) ->
 def test_servers_on_ports_next_to_each_other_have_replicas_on_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(launcher, "_is_unused", lambda number: True)  # other tests' servers may run
+    monkeypatch.setattr(environment_module, "_is_unused", lambda number: True)  # other tests' servers may run
     taken: set[int] = set()
     for port in range(8000, 8021):
         environment = ray_environment(tmp_path, haproxy=None, mark="test", port=port)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from starlette.types import Message, Receive, Scope, Send
 
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve import ingress as ingress_module
 from rlservo.serve_app.ray_serve.ingress import NO_WATCH, REQUEST_ID, Door, Ingress
 from rlservo.serve_app.server.api_keys import new_key

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from typing_extensions import Self
 
-from rlservo.export.contract.bundle import BoxSpec, Contract, DiscreteSpec, Parity, Provenance, TensorSpec
+from rlservo.export.contract.contract import Contract, Parity, Provenance, TensorSpec
 from rlservo.export.contract.errors import UnavailableError, UsageError
+from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec
 from rlservo.serve_app.rollout.control_loop import rollout, success_of
 from rlservo.serve_app.rollout.report import latency_of, render_report, wilson_interval
 
@@ -427,7 +428,7 @@ import sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 import numpy as np
 from test_control_loop import WrittenPolicy, contract_of
-from rlservo.export.contract.bundle import BoxSpec
+from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.rollout.control_loop import rollout
 obs = BoxSpec(shape=(27,), dtype="float32", low=None, high=None)
 action = BoxSpec(shape=(5,), dtype="float32", low=-1.0, high=1.0)

@@ -27,7 +27,7 @@ from onnx import helper, numpy_helper
 
 from rlservo.export.contract import bundle as bundle_files
 from rlservo.export.contract import regular_files
-from rlservo.export.contract.bundle import BoxSpec, BundleLimits, load_bundle, read_contract
+from rlservo.export.contract.bundle import BundleLimits, load_bundle, read_contract
 from rlservo.export.contract.errors import (
     BundleError,
     BundleTamperedError,
@@ -37,16 +37,19 @@ from rlservo.export.contract.errors import (
     UnavailableError,
 )
 from rlservo.export.contract.regular_files import open_regular
+from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.client.admin_client import AdminClient
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions import plan
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
+from rlservo.serve_app.versions.loaded_policies import Library
 from rlservo.serve_app.versions.plan import Plan, PolicyPlan, ServedConfig
 from rlservo.serve_app.versions.replica_versions import Control, Following
-from rlservo.serve_app.versions.repository import Library, Repository, load_served
+from rlservo.serve_app.versions.repository import Repository
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 

@@ -12,9 +12,10 @@ import httpx
 import numpy as np
 import pytest
 
-from rlservo.export.contract.bundle import BoxSpec, read_contract
+from rlservo.export.contract.bundle import read_contract
 from rlservo.export.contract.errors import ActionError, ObservationError, UsageError
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.export.contract.spaces import BoxSpec
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings

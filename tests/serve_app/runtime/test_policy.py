@@ -15,15 +15,8 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from rlservo.export.contract.bundle import (
-    Contract,
-    Distribution,
-    StateSpec,
-    load_bundle,
-    read_contract,
-    write_contract,
-    write_golden,
-)
+from rlservo.export.contract.bundle import load_bundle, read_contract, write_contract, write_golden
+from rlservo.export.contract.contract import Contract, Distribution, StateSpec
 from rlservo.export.contract.errors import (
     ActionError,
     BundleError,

@@ -19,8 +19,8 @@ import websockets.sync.client
 from websockets.exceptions import ConnectionClosed
 
 from rlservo.export.contract.errors import OverloadedError
-from rlservo.serve_app.protocols.json_act import create_app
-from rlservo.serve_app.ray_serve.launcher import ray_environment
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.ray_serve.environment import ray_environment
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.settings import ServerSettings

@@ -21,7 +21,7 @@ import websockets.sync.client
 from websockets.exceptions import ConnectionClosed
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve.launcher import serve_policies
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.server import api_key_file, api_keys

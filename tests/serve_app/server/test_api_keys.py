@@ -17,12 +17,13 @@ import websockets.sync.client
 from websockets.exceptions import InvalidStatus
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.protocols.json_act import create_app
-from rlservo.serve_app.server.api_keys import Keys, Role, check_exposure, is_loopback, new_key
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.server.api_keys import Keys, Role, check_exposure, new_key
 from rlservo.serve_app.server.request_checks import Hosts
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.wire.loopback import is_loopback
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 

@@ -19,8 +19,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from rlservo.export.contract import bundle as bundle_files
-from rlservo.export.contract.bundle import BakedStep, BoxSpec
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.export.contract.contract import BakedStep
+from rlservo.export.contract.spaces import BoxSpec
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.drift import EVERY, Drift
 from rlservo.serve_app.server.request_log import LOGGER, configure
 from rlservo.serve_app.server.settings import ServerSettings

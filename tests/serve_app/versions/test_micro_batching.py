@@ -22,10 +22,11 @@ import pytest
 import websockets.asyncio.client
 from numpy.typing import NDArray
 
-from rlservo.export.contract.bundle import BoxSpec, load_bundle, write_contract, write_golden
+from rlservo.export.contract.bundle import load_bundle, write_contract, write_golden
 from rlservo.export.contract.errors import ActionError, BundleError, DeadlineError, UsageError
+from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.protocols import oip_messages as messages
-from rlservo.serve_app.protocols.json_act import create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_grpc import Grpc
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy

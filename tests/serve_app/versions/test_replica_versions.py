@@ -21,9 +21,10 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions import plan
+from rlservo.serve_app.versions.loaded_policies import Library
 from rlservo.serve_app.versions.plan import Canary
 from rlservo.serve_app.versions.replica_versions import Change, Control, Following
-from rlservo.serve_app.versions.repository import Library, Repository
+from rlservo.serve_app.versions.repository import Repository
 
 OBS = np.zeros(27, np.float32) + 0.1
 

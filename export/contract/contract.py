@@ -1,0 +1,168 @@
+"""Contract of a policy bundle: inputs, outputs, baked-in steps, provenance and proof, as pydantic models."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, field_validator
+
+from rlservo.export.contract.errors import BundleError
+from rlservo.export.contract.spaces import FrozenModel, Shape, Size, SpaceSpec
+
+REWARD = "reward"  # the graph's input for what the last action brought, of a policy that was trained to see it
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
+Tolerance: TypeAlias = Annotated[float, Field(ge=0.0, le=1e-2)]
+"""Beyond it a difference is no rounding, whatever a contract says."""
+
+
+class TensorSpec(FrozenModel):
+    """A named input or output of the graph. The first axis is the batch, -1."""
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+
+    @field_validator("shape")
+    @classmethod
+    def _has_a_batch_axis(cls, shape: tuple[int, ...]) -> tuple[int, ...]:
+        if not shape or shape[0] != -1 or any(size < 1 for size in shape[1:]):
+            raise ValueError(f"expected -1 for the batch, then positive sizes, got {list(shape)}")
+        return shape
+
+
+class StateSpec(FrozenModel):
+    """A policy's memory: graph input `state_in.<name>`, output `state_out.<name>`; `initial` starts an episode."""
+
+    name: str
+    dtype: str
+    shape: Shape = Field(description="Without the batch axis")
+    initial: float | tuple[float, ...] = Field(0.0, description="One number, or one per element in row-major order")
+    kind: Literal["recurrent", "frames", "previous_actions", "previous_rewards"] = Field(
+        "recurrent",
+        description="'previous_actions' holds the last actions' one-hot codes, oldest first: whoever acts otherwise "
+        "than the graph's own `action` (exploring) writes that action's code into the end of it",
+    )
+
+    def initial_value(self, batch: int) -> NDArray[Any]:
+        """Return the state at an episode's start, `[batch, *shape]`."""
+        one = np.asarray(self.initial, self.dtype)
+        one = one.reshape(self.shape) if one.ndim else np.full(self.shape, one)
+        return np.repeat(one[None], batch, axis=0)
+
+
+class Distribution(FrozenModel):
+    """How `action_dist_inputs` become an exploring action; the deterministic one is the graph's own `action`."""
+
+    kind: Literal["diag_gaussian", "squashed_gaussian", "categorical", "multi_categorical", "multi"] = Field(
+        description="'multi' has one part for each leaf of a nested action space, in the order of the graph's outputs: "
+        "diag_gaussian for a box, categorical or multi_categorical for the others"
+    )
+    transform: Literal["none", "unsquash", "clip"] = Field(
+        description="What RLlib does to a sample before env.step: 'unsquash' maps [-1, 1] to the bounds and clips, "
+        "'clip' only clips, 'none' sends it as it is (discrete actions: adds the space's start). Box leaves that are "
+        "not bounded on all sides are never unsquashed"
+    )
+
+
+class BakedStep(FrozenModel):
+    """One processing step inside the graph, in the order it is applied."""
+
+    step: str = Field(description="For example 'mean_std_filter', 'one_hot', 'network', 'mode', 'unsquash', 'clip'")
+    detail: str = Field("", description="A sentence for people")
+    values: dict[str, Any] = Field(default_factory=dict, description="For example count, mean and std of a filter")
+
+
+class Provenance(FrozenModel):
+    """Where the policy came from."""
+
+    algorithm: str
+    api_stack: Literal["new", "old"]
+    module_id: str
+    agents: tuple[str, ...] = Field(default=(), description="For which agents of a multi-agent environment")
+    module_class: str
+    checkpoint_sha256: str = Field(description="Hash over the checkpoint files that were read")
+    training_iterations: int | None = None
+    env_steps: int | None = None
+    env_id: str | None = None
+    env_config: dict[str, Any] = Field(default_factory=dict)
+    ray_version: str
+    torch_version: str
+    rlservo_version: str
+    exported_at: str = Field(description="UTC, ISO 8601")
+
+
+class FormatParity(FrozenModel):
+    """The largest differences between one written format and RLlib's own pipeline."""
+
+    max_abs: float = Field(ge=0.0)
+    max_rel: float = Field(ge=0.0, description="Relative to the scale that the gate measures with")
+
+
+class Parity(FrozenModel):
+    """How the export was proven equal to what RLlib itself would send to env.step."""
+
+    reference: str
+    samples: int = Field(ge=0)
+    batch_sizes: tuple[Size, ...]
+    rtol: Tolerance
+    atol: Tolerance
+    rule: str = Field(default="", description="How the two tolerances are applied")
+    formats: dict[str, FormatParity]
+
+
+class Evaluation(FrozenModel):
+    """One closed-loop run of exported policy and checkpoint on the same seeds."""
+
+    env_id: str
+    episodes: Size
+    first_seed: int
+    return_bundle: float
+    return_checkpoint: float
+    success_rate_bundle: float | None
+    success_rate_checkpoint: float | None
+    evaluated_at: str
+
+
+class Contract(FrozenModel):
+    """`contract.json`: everything a client, a server or a person needs to know of a policy."""
+
+    schema_version: Literal[1] = 1
+    name: str = Field(pattern=NAME_PATTERN)
+    version: str = Field(pattern=VERSION_PATTERN)
+    description: str = ""
+    observation_space: SpaceSpec
+    action_space: SpaceSpec
+    inputs: tuple[TensorSpec, ...]
+    outputs: tuple[TensorSpec, ...]
+    state: tuple[StateSpec, ...] = ()
+    distribution: Distribution | None
+    baked_in: tuple[BakedStep, ...]
+    control_rate_hz: float | None = Field(None, gt=0.0, description="The rate the environment asks for actions at")
+    provenance: Provenance
+    parity: Parity
+    evaluations: tuple[Evaluation, ...] = ()
+
+
+def version_key(version: str) -> tuple[int, ...]:
+    """Return a sort key: '3' counts as 3.0.0."""
+    parts = tuple(int(part) for part in version.split("."))
+    return parts + (0,) * (3 - len(parts))
+
+
+def embedded_contract(text: str, where: Path) -> Contract:
+    """Parse the copy of the contract that the graph's metadata hold under CONTRACT_KEY."""
+    try:
+        return Contract.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise BundleError(f"{where}: the contract inside it is malformed: {first['msg']}") from error
+
+
+def contract_json(contract: Contract) -> str:
+    """Return the contract as the indented JSON that goes into the bundle and the ONNX metadata."""
+    return json.dumps(contract.model_dump(mode="json"), indent=2)

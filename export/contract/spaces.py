@@ -1,0 +1,171 @@
+"""Observation and action spaces as the contract writes them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+Size: TypeAlias = Annotated[int, Field(ge=1)]
+Shape: TypeAlias = tuple[Size, ...]
+
+
+class FrozenModel(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Element(FrozenModel):
+    """One number of an observation or an action, as a roboticist would call it."""
+
+    name: str
+    unit: str = Field("", description="SI unit such as 'rad', 'm/s'; '1' when dimensionless, '' when unknown")
+
+
+class BoxSpec(FrozenModel):
+    """A Gymnasium Box.
+
+    Bounds are one number for all elements or one per element in row-major order; null is unbounded.
+    """
+
+    kind: Literal["box"] = "box"
+    shape: Shape
+    dtype: str
+    low: float | tuple[float | None, ...] | None
+    high: float | tuple[float | None, ...] | None
+    elements: tuple[Element, ...] = Field((), description="Empty, or one per element in row-major order")
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (low, high), each of the space's shape, with infinities where unbounded."""
+
+        def fill(bound: float | tuple[float | None, ...] | None, infinity: float) -> NDArray[np.float64]:
+            if isinstance(bound, tuple):
+                flat = np.array([infinity if b is None else b for b in bound], dtype=np.float64)
+                return flat.reshape(self.shape)
+            return np.full(self.shape, infinity if bound is None else bound, dtype=np.float64)
+
+        return fill(self.low, -math.inf), fill(self.high, math.inf)
+
+
+class DiscreteSpec(FrozenModel):
+    """A Gymnasium Discrete: the integers start .. start + n - 1."""
+
+    kind: Literal["discrete"] = "discrete"
+    n: int = Field(ge=1)
+    start: int = 0
+    dtype: str = "int64"
+    elements: tuple[Element, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return ()
+
+    @property
+    def size(self) -> int:
+        return 1
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (low, high), both inclusive and of shape ()."""
+        return np.array(self.start, np.float64), np.array(self.start + self.n - 1, np.float64)
+
+
+class MultiDiscreteSpec(FrozenModel):
+    """A Gymnasium MultiDiscrete: element i is one of `nvec[i]` integers from `start[i]` on, in row-major order."""
+
+    kind: Literal["multi_discrete"] = "multi_discrete"
+    shape: Shape
+    nvec: tuple[Size, ...]
+    start: tuple[int, ...]
+    dtype: str = "int64"
+    elements: tuple[Element, ...] = ()
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (low, high), both inclusive and of the space's shape."""
+        low = np.array(self.start, np.float64).reshape(self.shape)
+        return low, low + np.array(self.nvec, np.float64).reshape(self.shape) - 1
+
+
+class MultiBinarySpec(FrozenModel):
+    """A Gymnasium MultiBinary: every element is 0 or 1."""
+
+    kind: Literal["multi_binary"] = "multi_binary"
+    shape: Shape
+    dtype: str = "int8"
+    elements: tuple[Element, ...] = ()
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (low, high), both inclusive and of the space's shape."""
+        return np.zeros(self.shape), np.ones(self.shape)
+
+
+class _NestedSpec(FrozenModel):
+    """What the contract's Dict and Tuple share."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """A nested space is no array."""
+        return ()
+
+    @property
+    def size(self) -> int:
+        """The elements of all leaves."""
+        assert isinstance(self, DictSpec | TupleSpec)
+        return sum(leaf.size for leaf in leaf_specs(self, "").values())
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """Only leaves name elements."""
+        return ()
+
+
+class DictSpec(_NestedSpec):
+    """A Gymnasium Dict; its leaves are tensors of their own, called `obs.<key>` or `action.<key>`."""
+
+    kind: Literal["dict"] = "dict"
+    spaces: dict[str, SpaceSpec]
+
+
+class TupleSpec(_NestedSpec):
+    """A Gymnasium Tuple; its leaves are tensors of their own, called `obs.<index>` or `action.<index>`."""
+
+    kind: Literal["tuple"] = "tuple"
+    spaces: tuple[SpaceSpec, ...]
+
+
+LeafSpec: TypeAlias = BoxSpec | DiscreteSpec | MultiDiscreteSpec | MultiBinarySpec
+SpaceSpec = Annotated[
+    BoxSpec | DiscreteSpec | MultiDiscreteSpec | MultiBinarySpec | DictSpec | TupleSpec, Field(discriminator="kind")
+]
+
+
+def leaf_specs(space: SpaceSpec, name: str) -> dict[str, LeafSpec]:
+    """Return every leaf of a space by tensor name, `name` or `name.<path>`: Dict keys sorted, as RLlib has them."""
+    if isinstance(space, DictSpec):
+        inside = {key: space.spaces[key] for key in sorted(space.spaces)}
+    elif isinstance(space, TupleSpec):
+        inside = {str(index): child for index, child in enumerate(space.spaces)}
+    else:
+        return {name: space}
+    return {path: leaf for key, child in inside.items() for path, leaf in leaf_specs(child, f"{name}.{key}").items()}
+
+
+def iter_elements(space: LeafSpec) -> Iterator[tuple[int, str]]:
+    """Yield (index, label) for error messages: the element's name where known, else its index."""
+    for index in range(space.size):
+        named = index < len(space.elements)
+        yield index, f"{index} ({space.elements[index].name})" if named else str(index)

@@ -1,0 +1,46 @@
+"""Explain why an exported graph differs from RLlib's own numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rlservo.export.proof.parity import ATOL, RTOL, Recorded
+from rlservo.export.recipe.runners import Runner
+
+ALONE = 4  # samples that are also shown to RLlib one at a time
+
+
+def why_different(reference: Runner, recorded: Sequence[Recorded], frozen: Sequence[str]) -> str:
+    """Return a clause that says why a graph may differ from RLlib's own numbers; '' if nothing is found."""
+    if sample := _depends_on_batch(reference, recorded):
+        return (
+            f"RLlib's own action for sample {sample[0]} is another when it is alone: the network's result depends on "
+            "the other observations of the batch, which cannot be exported"
+        )
+    if frozen:
+        return (
+            f"tracing froze what the network does outside torch at {', '.join(frozen[:3])}: use torch's own operations "
+            "there (torch.where for an 'if')"
+        )
+    return ""
+
+
+def _depends_on_batch(reference: Runner, recorded: Sequence[Recorded]) -> list[int]:
+    """Return a sample whose action is another without the rest of its batch, if there is one."""
+    for one in recorded:
+        if one.batch.restart is not None or len(one.batch) < ALONE:
+            continue
+        for row in range(ALONE):
+            alone = reference({name: values[row : row + 1].copy() for name, values in one.batch.inputs.items()})
+            for name, expected in one.outputs.items():
+                if not np.allclose(
+                    np.nan_to_num(alone[name][0].astype(np.float64)),
+                    np.nan_to_num(expected[row].astype(np.float64)),
+                    rtol=100 * RTOL,
+                    atol=100 * ATOL,
+                ):
+                    return [row]
+        break
+    return []

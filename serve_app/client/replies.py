@@ -1,0 +1,157 @@
+"""Observations as JSON can carry them, and replies checked: sender, step, state and action fit the contract."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import ActionError, ObservationError, SessionLostError, UnavailableError
+from rlservo.export.contract.nested import build_action
+from rlservo.export.contract.spaces import DictSpec, LeafSpec, SpaceSpec, TupleSpec, leaf_specs
+from rlservo.serve_app.interface import Observation
+from rlservo.serve_app.wire.state_names import MARK
+
+
+def check_sender(url: str, reply: Any, number: int, contract: Contract) -> None:
+    """Refuse an answer to another request or from another policy: it must not move this robot."""
+    if not isinstance(reply, dict):
+        raise UnavailableError(f"{url} answered with {type(reply).__name__}, expected an object")
+    if reply.get("seq") != number:
+        raise UnavailableError(
+            f"{url} answered request {reply.get('seq')!r}, expected {number}: the action was dropped",
+            {"expected": number, "actual": reply.get("seq")},
+        )
+    sender = (reply.get("policy"), reply.get("version"))
+    if sender != (contract.name, contract.version):
+        raise UnavailableError(
+            f"{url} answered for policy {sender[0]!r} version {sender[1]!r}, expected "
+            f"{contract.name!r} version {contract.version!r}: the action was dropped"
+        )
+
+
+def check_step(reply: Mapping[str, Any], steps: int) -> int:
+    """Return how many steps the server's memory has come; raise SessionLostError unless it comes from this episode.
+
+    It may be ahead: a step whose answer came too late, or was refused here, has moved it on all the same.
+    """
+    step = reply.get("session_step")
+    if type(step) is not int or step <= steps or (steps == 0 and step != 1):
+        raise SessionLostError(
+            f"the server's memory is at step {step!r} of an episode, expected one after {steps}: it is not this "
+            "episode's; call reset() to begin one"
+        )
+    return step
+
+
+def carried(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
+    """Return the state for the next request; raise UnavailableError where the server gave none."""
+    state = reply.get("state")
+    if state is None and not contract.state:
+        return {}  # what had to be carried has not to be any more
+    names = {name for name in state if not name.startswith(MARK)} if isinstance(state, dict) else None
+    if not isinstance(state, dict) or names != {spec.name for spec in contract.state}:
+        raise UnavailableError(f"the server's answer for {contract.name!r} lacks the state: the action was dropped")
+    return state
+
+
+def sendable(obs: Observation, contract: Contract) -> tuple[Any, tuple[int, ...]]:
+    """Return (what goes into the JSON, the batch axis as () or (B,)); the server checks shapes and names."""
+    space = contract.observation_space
+    if isinstance(space, DictSpec | TupleSpec):
+        return _sendable_part(obs, space, "obs")
+    if isinstance(obs, Mapping):
+        named = {str(name): _finite(value, f"element {name!r}") for name, value in obs.items()}
+        return named, next((value.shape[:1] for value in named.values()), ())
+    array = _finite(obs, "")
+    batch = array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
+    return array, batch
+
+
+def _sendable_part(obs: Any, space: SpaceSpec, path: str) -> tuple[Any, tuple[int, ...]]:
+    """Return (a nested observation's JSON form, the batch axis of its leaves); the server checks that it fits."""
+    if isinstance(space, DictSpec | TupleSpec):
+        inside = space.spaces.items() if isinstance(space, DictSpec) else enumerate(space.spaces)
+        try:
+            parts = {key: _sendable_part(obs[key], child, f"{path}.{key}") for key, child in inside}
+        except (KeyError, IndexError, TypeError) as error:
+            raise ObservationError(f"the observation does not have the parts of {path}: {error!r}") from error
+        plain = {key: part for key, (part, _) in parts.items()}
+        batch = next((axis for _, axis in parts.values()), ())
+        return (plain if isinstance(space, DictSpec) else list(plain.values())), batch
+    array = _finite(obs, f"part {path}")
+    return array, array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
+
+
+def _finite(value: ArrayLike, where: str) -> NDArray[Any]:
+    """Return `value` as a contiguous array of finite numbers, or raise ObservationError naming the element."""
+    try:
+        array = np.ascontiguousarray(value).reshape(np.shape(value))  # ascontiguousarray makes a scalar an array of 1
+    except ValueError as error:
+        raise ObservationError(f"the observation is ragged: expected numbers in one shape ({error})") from error
+    if array.dtype.kind not in "fiub":
+        got = type(value).__name__ if array.dtype.kind == "O" else array.dtype.name
+        raise ObservationError(f"the observation{where and f', {where},'} holds {got}, expected numbers")
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)  # orjson takes the machine's own byte order only
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        first = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        which = where or f"element {first[0] if len(first) == 1 else first}"
+        raise ObservationError(
+            f"the observation's {which} is {array[first]}: expected a finite number", {"element": list(first)}
+        )
+    return array
+
+
+def restored(action: Any, batch: tuple[int, ...], contract: Contract) -> Any:
+    """Return the JSON action in the space's form, arrays of its dtype and shape, or raise ActionError."""
+    return build_action(
+        contract.action_space,
+        {
+            name: _restored_leaf(_part(action, name, contract), batch, name, leaf, contract)
+            for name, leaf in leaf_specs(contract.action_space, "action").items()
+        },
+    )
+
+
+def is_action(action: Any, batch: tuple[int, ...], contract: Contract) -> bool:
+    """Whether this is an action of the policy for so many observations."""
+    try:
+        restored(action, batch, contract)
+    except ActionError:
+        return False
+    return True
+
+
+def _part(action: Any, name: str, contract: Contract) -> Any:
+    """Return the leaf `action.<path>` of a nested JSON action, or raise ActionError."""
+    part = action
+    for step in name.split(".")[1:]:
+        if isinstance(part, dict) and step in part:
+            part = part[step]
+        elif isinstance(part, list | tuple) and step.isdigit() and int(step) < len(part):
+            part = part[int(step)]
+        else:
+            raise ActionError(f"the server's action for {contract.name!r} lacks the part {name!r}")
+    return part
+
+
+def _restored_leaf(action: Any, batch: tuple[int, ...], name: str, space: LeafSpec, contract: Contract) -> NDArray[Any]:
+    expected = (*batch, *space.shape)
+    what = f"action for {contract.name!r}" if name == "action" else f"{name} for {contract.name!r}"
+    try:
+        array = np.asarray(action)
+    except ValueError:
+        array = np.asarray(None)
+    if array.dtype.kind not in "fiu" and array.size:
+        raise ActionError(f"the server's {what} is {str(action)[:80]}, expected numbers")
+    if array.shape != expected:
+        raise ActionError(f"the server's {what} has shape {array.shape}, expected {expected}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ActionError(f"the server's {what} has an element that is not finite")
+    typed = array.astype(space.dtype)
+    if typed.dtype.kind in "iu" and not np.array_equal(typed, array):
+        raise ActionError(f"the server's {what} is {str(action)[:80]}, expected {space.dtype}")
+    return typed

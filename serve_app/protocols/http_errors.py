@@ -1,0 +1,93 @@
+"""HTTP status and body of each error, the same for every HTTP protocol."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from rlservo.export.contract.errors import (
+    ActionError,
+    ConflictError,
+    DeadlineError,
+    ForbiddenError,
+    MediaTypeError,
+    ObservationError,
+    RequestError,
+    RlservoError,
+    SessionError,
+    SessionLostError,
+    TooLargeError,
+    UnauthenticatedError,
+    UnavailableError,
+    UnknownPolicyError,
+)
+from rlservo.serve_app.protocols import json_messages
+
+logger = logging.getLogger(__name__)
+
+STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; whatever does not fit is our fault: 500
+    (ObservationError, 422),
+    (UnknownPolicyError, 404),
+    (MediaTypeError, 415),
+    (TooLargeError, 413),
+    (RequestError, 400),
+    (DeadlineError, 408),
+    (ConflictError, 409),
+    (SessionLostError, 410),
+    (SessionError, 409),
+    (UnavailableError, 503),
+    (UnauthenticatedError, 401),
+    (ForbiddenError, 403),
+    (ActionError, 500),
+)
+ANY_ROUTE = (400, 401, 403, 408, 413)  # its path, key, host, page and body
+RETRY_AFTER_S = 1
+BUG = "the server failed on this request; its log says how"
+JSON = b"application/json"
+Headers = tuple[tuple[bytes, bytes], ...]
+JSON_HEADERS: Headers = ((b"content-type", JSON),)
+
+
+def too_large(limit: int) -> TooLargeError:
+    return TooLargeError(f"the request body is larger than {limit} bytes", {"max_body_bytes": limit})
+
+
+# Errors: the one table above, and one body for all.
+
+
+def status_of(error: RlservoError) -> int:
+    """Return the HTTP status of an error."""
+    return next((status for kind, status in STATUS if isinstance(error, kind)), 500)
+
+
+def error_answer(error: RlservoError) -> tuple[int, bytes, Headers]:
+    """Return (status, body, headers) and log what is our own fault."""
+    status = status_of(error)
+    headers = JSON_HEADERS
+    if status == 503:
+        headers += ((b"retry-after", str(RETRY_AFTER_S).encode()),)
+    elif status == 401:
+        headers += ((b"www-authenticate", b"Bearer"),)
+    elif status >= 500:
+        logger.error("%s", error.message)
+    return status, encode_error(error), headers
+
+
+def encode_error(error: RlservoError) -> bytes:
+    """Return the body of an error; the inside of the server stays inside."""
+    if status_of(error) == 500 and not isinstance(error, ActionError):
+        return encode_bug()
+    document: dict[str, Any] = {"error": error.message, "code": error.code}
+    if error.details:
+        document["details"] = error.details
+    return json_messages.encode_json(document)
+
+
+def encode_bug() -> bytes:
+    """Return the body of an error that is none of ours to explain to a client."""
+    return json_messages.encode_json({"error": BUG, "code": "internal"})
+
+
+def error_models(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return FastAPI's `responses` for these error statuses, and for those that every route may answer with."""
+    return {status: {"model": json_messages.ErrorReply} for status in sorted({*ANY_ROUTE, *statuses})}

@@ -1,0 +1,29 @@
+"""File with the admin key of a server on this machine: its place follows from the port, so both sides find it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from rlservo.export.contract.errors import UsageError
+
+LONGEST_KEY_FILE = 4096  # [bytes] far more than a key
+
+
+def key_file(port: int) -> Path:
+    """Return where the key of a server on this port is kept: below XDG_RUNTIME_DIR, else in the user's cache."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    folder = Path(runtime) if runtime else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return folder / "rlservo" / f"admin-{port}.key"
+
+
+def read_key(file: Path) -> str:
+    """Return the key in a file. Raises UsageError."""
+    try:
+        with file.open(encoding="ascii") as stream:
+            key = stream.read(LONGEST_KEY_FILE).strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"the key file {file} cannot be read: {error}") from None
+    if not key or len(key.split()) != 1:
+        raise UsageError(f"the key file {file} should hold one key and nothing else")
+    return key
