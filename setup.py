@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: one .pth file at the top of site-packages (what for: envs/discovery.py)."""
+"""Build steps beyond pyproject.toml: one .pth file at the top of site-packages (see envs/discovery.py)."""
 
 from __future__ import annotations
 

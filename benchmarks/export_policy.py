@@ -1,4 +1,4 @@
-"""What an export costs, and what `Policy.act` adds to the bare onnxruntime session.
+"""Measure the cost of an export, and what `Policy.act` adds to the bare onnxruntime session.
 
     python benchmarks/export_policy.py [--rounds 15]
 

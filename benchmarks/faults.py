@@ -1,4 +1,4 @@
-"""What clients see when parts of a running server die or are replaced under load, one row of a table per fault.
+"""Count what clients see when parts of a running server die or are replaced under load.
 
     python benchmarks/faults.py [--on serve|cluster] [FAULT ...]
 

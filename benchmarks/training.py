@@ -1,4 +1,4 @@
-"""How fast training goes, and where its time goes: env runners x environments each, the learner included.
+"""Measure training speed by env runners x environments each, and where its time goes.
 
     python benchmarks/training.py            # 1 and 2 runners, 1, 4 and 16 environments, UR5; ten minutes or so
     python benchmarks/training.py --quick    # the same with small batches, at most 3 minutes

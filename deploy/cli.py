@@ -1,4 +1,4 @@
-"""The command line `rlservo`: composes the folders, owns nothing. Each command's work is done where it belongs.
+"""The command line `rlservo`: registers the commands and maps errors to exit codes.
 
 Heavy libraries are imported by the command that needs them, so that `rlservo inspect` works on a robot without Ray.
 """

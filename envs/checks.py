@@ -1,4 +1,4 @@
-"""What the environments refuse, in sentences that name the element.
+"""Checks of actions, resets and options: each refusal is a sentence that names the element.
 
 robo-gym raises a bare InvalidActionError or InvalidStateError; these say which element was wrong and by how much.
 """

@@ -1,1 +1,1 @@
-"""From an RLlib checkpoint to a policy bundle, proven equal."""
+"""Exporter: an RLlib checkpoint becomes a policy bundle, proven equal to RLlib's own actions."""

@@ -1,1 +1,1 @@
-"""Running exported policies: in process (`policy`), as a server (`app`), and from a client (`client`)."""
+"""Policies at work: in process (`runtime`), from a client (`client`), in a control loop, on a server."""

@@ -1,6 +1,6 @@
-"""What everything that acts looks like: the in-process `Policy` and the HTTP `PolicyClient` are the same to a loop.
+"""Interface of everything that acts: a control loop sees `Policy` and `PolicyClient` alike.
 
-This is an interface only. It knows nothing of onnxruntime, of HTTP or of environments.
+This is an interface only.
 """
 
 from __future__ import annotations

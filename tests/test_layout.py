@@ -1,8 +1,10 @@
-"""Who may import whom, read off the source: DESIGN.md's picture stays true because this test fails when it is not."""
+"""Imports between folders, read off the source, run one way; heavy libraries have their named place."""
 
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -10,107 +12,180 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("envs", "export", "serve_app", "deploy")
 
-# The one file (or folder) that may import a heavy library, by top-level module.
-ONLY_IN = {
-    "ray.rllib": (
-        "export/rllib/new_stack.py",
-        "export/rllib/new_pipelines.py",
-        "export/rllib/old_stack.py",
-        "export/rllib/old_models.py",
-        "examples/",
-    ),
-    "ray.serve": (
-        "serve_app/ray_serve/app.py",
-        "serve_app/ray_serve/loopback_ports.py",
-        "serve_app/ray_serve/closed_endpoints.py",
-    ),
-    "ray.experimental": ("serve_app/ray_serve/gcs_ledger.py",),
-    "fastapi": (
-        "serve_app/protocols/json_act.py",
-        "serve_app/protocols/http_endpoint.py",
-        "serve_app/protocols/oip_infer.py",
-        "serve_app/protocols/oip_config.py",
-        "serve_app/protocols/docs_page.py",
-        "serve_app/protocols/admin_routes.py",
-        "serve_app/ray_serve/app.py",
-    ),
+# What a folder may import beside itself. Each stands below those that name it, so no two can import each other.
+MAY_IMPORT: dict[str, set[str]] = {
+    "export/contract": set(),
+    "export/checkpoints": {"export/contract"},
+    "export/recipe": {"export/contract"},
+    "export/rllib": {"export/contract", "export/checkpoints", "export/recipe"},
+    "export/graph": {"export/contract", "export/recipe"},
+    "export/proof": {"export/contract", "export/recipe"},
+    "export/commands": {
+        "export/contract", "export/checkpoints", "export/recipe", "export/rllib", "export/graph", "export/proof",
+    },
+    "serve_app/interface.py": {"export/contract"},
+    "serve_app/runtime": {"export/contract", "serve_app/interface.py"},
+    "serve_app/wire": {"export/contract"},
+    "serve_app/client": {"export/contract", "serve_app/interface.py", "serve_app/wire"},
+    "serve_app/rollout": {"export/contract", "serve_app/interface.py"},
+    "serve_app/versions": {"export/contract", "serve_app/interface.py", "serve_app/runtime"},
+    "serve_app/episodes": {"export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/wire"},
+    "serve_app/server": {
+        "export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/episodes", "serve_app/wire",
+    },
+    "serve_app/protocols": {
+        "export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/episodes", "serve_app/server",
+        "serve_app/wire",
+    },
+    "serve_app/ray_serve": {
+        "export/contract", "serve_app/versions", "serve_app/server", "serve_app/protocols", "serve_app/wire",
+    },
+    "envs": set(),
+    "deploy": {"envs", "export", "serve_app"},
+    "export/__init__.py": set(),
+    "serve_app/__init__.py": set(),
+}  # fmt: skip
+
+# The folders (or files) that may import a library, by the library's dotted name. The longest name that fits counts.
+ONLY_IN: dict[str, tuple[str, ...]] = {
+    "ray": ("export/rllib/", "serve_app/ray_serve/"),
+    "ray.rllib": ("export/rllib/",),
+    "ray.tune": ("export/rllib/",),
+    "uvicorn": ("serve_app/ray_serve/",),
+    "fastapi": ("serve_app/protocols/",),
+    "torch": ("export/graph/", "export/proof/", "export/rllib/"),
     "mujoco": ("envs/",),
-    "grpc": (
-        "envs/robot_server/",
-        "serve_app/protocols/oip_grpc.py",
-        "serve_app/ray_serve/grpc_ingress.py",
-        "serve_app/ray_serve/closed_endpoints.py",
-    ),
-    "google.protobuf": ("envs/robot_server/", "serve_app/protocols/oip_grpc.py", "serve_app/protocols/oip_messages.py"),
-    "torch": ("export/",),
+    "grpc": ("envs/robot_server/", "serve_app/protocols/", "serve_app/ray_serve/"),
+    "google.protobuf": ("envs/robot_server/", "serve_app/protocols/oip_messages.py", "serve_app/protocols/oip_grpc.py"),
+    "httpx": ("serve_app/client/http_transport.py",),
+    "httpcore": ("serve_app/client/deadline_backend.py",),
+    "websockets": ("serve_app/client/websocket_connection.py",),
     "pickle": ("export/checkpoints/unpickle.py",),
-}
+    "onnxruntime": ("export/contract/onnx_session.py", "serve_app/runtime/"),
+    "asyncio": (
+        "serve_app/versions/", "serve_app/episodes/", "serve_app/server/", "serve_app/protocols/",
+        "serve_app/ray_serve/",
+    ),
+}  # fmt: skip
 
 
 def modules() -> list[Path]:
     return sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 
-def imports_of(path: Path) -> set[str]:
-    """Every dotted name that the file imports, wherever in it."""
+@cache
+def imports_of(path: Path) -> frozenset[str]:
+    """Every dotted name that the file imports, in functions and under TYPE_CHECKING as well."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+    return frozenset(names)
 
 
-def reaches(names: set[str], target: str) -> bool:
+def file_of(module: str) -> Path | None:
+    """Return the file of a module of ours, by its dotted name."""
+    path = ROOT / Path(*module.split(".")[1:])
+    for file in (path.with_suffix(".py"), path / "__init__.py"):
+        if module.startswith("rlservo.") and file.is_file():
+            return file
+    return None
+
+
+def part_of(path: Path) -> str:
+    """Return the part of the house that a file belongs to: a folder of `MAY_IMPORT`, or the file itself."""
+    names = path.relative_to(ROOT).parts
+    return names[0] if names[0] in MAY_IMPORT else "/".join(names[:2])
+
+
+def ours(path: Path) -> Iterator[tuple[str, Path]]:
+    """Yield (dotted name, file) of what a file imports from us; a folder's own `__init__` only where it is meant."""
+    names = imports_of(path)
+    for name in sorted(names):
+        file = file_of(name)
+        if file is None or (file.name == "__init__.py" and any(other.startswith(f"{name}.") for other in names)):
+            continue
+        yield name, file
+
+
+def reaches(names: frozenset[str] | set[str], target: str) -> bool:
     return any(name == target or name.startswith(f"{target}.") for name in names)
 
 
 @pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(ROOT)))
-def test_module_imports_only_what_the_design_allows(path: Path) -> None:
-    names = imports_of(path)
-    folder = path.relative_to(ROOT).parts[0]
-    allowed = {
-        "envs": {"rlservo.envs"},
-        "export": {"rlservo.export"},
-        "serve_app": {
-            "rlservo.serve_app",
-            "rlservo.export.contract.errors",
-            "rlservo.export.contract.regular_files",
-            "rlservo.export.contract.bundle",
-            "rlservo.export.contract.scores",
-            "rlservo.export.contract.onnx_session",
-        },
-        "deploy": {f"rlservo.{name}" for name in FOLDERS},
-    }[folder]
-    ours = {name for name in names if reaches({name}, "rlservo")}
-    for name in ours:
-        assert any(reaches({name}, permitted) or reaches({permitted}, name) for permitted in allowed), (
-            f"{path.relative_to(ROOT)} imports {name}"
-        )
-    assert not any(reaches(names, bare) for bare in (*FOLDERS, "examples", "tests", "benchmarks"))
+def test_file_imports_only_folders_below_its_own(path: Path) -> None:
+    part = part_of(path)
+    assert part in MAY_IMPORT, f"{path.relative_to(ROOT)} is in no folder that MAY_IMPORT knows"
+    for name, file in ours(path):
+        allowed = {part, *MAY_IMPORT[part]}
+        there = part_of(file)
+        assert there in allowed or there.split("/")[0] in allowed, f"{path.relative_to(ROOT)} imports {name}"
+    assert not any(reaches(imports_of(path), bare) for bare in (*FOLDERS, "examples", "tests", "benchmarks", "shared"))
+
+
+def test_folders_stand_one_above_the_other() -> None:
+    """No circle: what a folder may import stands before it in the table."""
+    below: set[str] = set()
+    for part, allowed in MAY_IMPORT.items():
+        assert all(name in below or any(known.startswith(f"{name}/") for known in below) for name in allowed), part
+        below.add(part)
+
+
+def test_every_arrow_of_the_table_is_needed() -> None:
+    used: dict[str, set[str]] = {part: set() for part in MAY_IMPORT}
+    for path in modules():
+        for _, file in ours(path):
+            used[part_of(path)] |= {part_of(file), part_of(file).split("/")[0]}
+    unused = {part: allowed - used[part] for part, allowed in MAY_IMPORT.items() if allowed - used[part]}
+    assert not unused
+
+
+def test_modules_do_not_import_each_other_in_a_circle() -> None:
+    """At import time; what a function imports later, or a type checker alone, makes no circle."""
+    arrows: dict[Path, set[Path]] = {}
+    for path in modules():
+        names: set[str] = set()
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+        found = {file_of(name) for name in names}
+        arrows[path] = {file for file in found if file is not None and file.name != "__init__.py"}
+    while leaves := [path for path, targets in arrows.items() if not targets]:
+        for leaf in leaves:
+            del arrows[leaf]
+        for targets in arrows.values():
+            targets.difference_update(leaves)
+    assert not arrows, f"a circle through {sorted(str(path.relative_to(ROOT)) for path in arrows)}"
 
 
 @pytest.mark.parametrize("library", list(ONLY_IN))
-def test_heavy_library_has_its_named_place(library: str) -> None:
+def test_library_has_its_named_place(library: str) -> None:
+    deeper = [other for other in ONLY_IN if other.startswith(f"{library}.")]
     for path in modules():
         relative = str(path.relative_to(ROOT))
-        if reaches(imports_of(path), library):
+        names = {name for name in imports_of(path) if not any(reaches({name}, other) for other in deeper)}
+        if reaches(names, library):
             assert any(relative.startswith(place) for place in ONLY_IN[library]), f"{relative} imports {library}"
 
 
-def test_client_imports_no_server_code() -> None:
-    seen: set[str] = set()
-    queue = ["rlservo.serve_app.client.policy_client"]
+def reached_from(start: Path) -> set[str]:
+    """Return the parts that a folder's files reach, whatever is between."""
+    seen: set[Path] = set()
+    queue = sorted(start.rglob("*.py"))
     while queue:
-        name = queue.pop()
-        path = ROOT / Path(*name.split(".")[1:]).with_suffix(".py")
-        if name in seen or not path.is_file():
-            continue
-        seen.add(name)
-        queue += [n for n in imports_of(path) if n.startswith("rlservo.")]
-    assert "rlservo.serve_app.client.policy_client" in seen
-    assert not seen & {f"rlservo.serve_app.{name}" for name in ("http", "app", "store", "launcher", "policy")}
+        path = queue.pop()
+        if path not in seen:
+            seen.add(path)
+            queue += [file for _, file in ours(path)]
+    return {part_of(path) for path in seen}
+
+
+@pytest.mark.parametrize("folder", ["client", "rollout"])
+def test_client_and_rollout_reach_neither_runtime_nor_server(folder: str) -> None:
+    allowed = {f"serve_app/{folder}", "serve_app/interface.py", "serve_app/wire", "export/contract"}
+    assert reached_from(ROOT / "serve_app" / folder) <= allowed
 
 
 def test_every_package_folder_is_in_the_project_file() -> None:
@@ -119,3 +194,8 @@ def test_every_package_folder_is_in_the_project_file() -> None:
         folder = path.relative_to(ROOT).parent
         package = "rlservo" if folder == Path("deploy/package") else "rlservo." + ".".join(folder.parts)
         assert f'"{package}"' in project, f"{package} is missing from [tool.setuptools] packages"
+
+
+def test_every_folder_says_what_lives_in_it() -> None:
+    for folder in sorted({path.parent for path in modules()}):
+        assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), f"{folder} has no docstring"

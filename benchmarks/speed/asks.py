@@ -1,4 +1,4 @@
-"""What a served policy is asked over every protocol, each ask checking its own answer: soak.py and faults.py share it.
+"""Requests to a served policy over every protocol, each checking its own answer, for soak.py and faults.py.
 
 An `Asker` is one client: a connection that is made when it is needed and dropped when anything went wrong on it. It
 never asks twice by itself. `WrongError` is another answer than the policy's in process: worse than none.

@@ -1,4 +1,4 @@
-"""Who is compared: every server, how it is started, and the one policy and observation they are all asked about."""
+"""Servers that are compared: how each is started, and the one policy they are all asked about."""
 
 from __future__ import annotations
 

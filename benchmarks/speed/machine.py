@@ -1,4 +1,4 @@
-"""What the machine says of processes: who belongs to a server, what it has used of the CPU, what memory it holds.
+"""Processes of a server as the machine sees them: who belongs to it, CPU time, memory.
 
 Reads /proc (Linux).
 """

@@ -1,4 +1,4 @@
-"""What the samples say: medians, ratios within rounds, the targets, and the same as tables, JSON and a chart."""
+"""Summaries of the samples: medians, ratios within rounds, targets, as tables, JSON and a chart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole path in one command: export two checkpoints, serve them, drive two robots, show what happened.
+"""`rlservo demo`: export two checkpoints, serve them, drive two robots, show what happened.
 
 Exporting and serving run as the very commands a user would type, in processes of their own; the loop runs here.
 """

@@ -1,4 +1,4 @@
-"""The demo's picture: each robot at the start, midway and at the end of an episode, and all episodes as curves."""
+"""Picture of the demo: each robot at the start, midway and at the end, and all episodes as curves."""
 
 from __future__ import annotations
 

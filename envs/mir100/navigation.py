@@ -1,4 +1,4 @@
-"""What the MiR100's tasks share: drive to a target, scored by the distance gained and the power spent.
+"""Base of the MiR100's tasks: drive to a target, scored by the distance gained and the power spent.
 
 A task adds where things start, what ends an episode badly, and which lasers it looks at. Source of every figure here:
 jr-robotics/robo-gym 2.0.1, envs/mir100.

@@ -1,4 +1,4 @@
-"""How many clients are connected to a port of ours, as the kernel counts them. gRPC does not tell."""
+"""Count the clients connected to one of our ports, as the kernel sees them. gRPC does not tell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a robot server serves: a robot that can be put somewhere, commanded for one cycle, and looked at.
+"""Interface of a robot behind a robot server: put it somewhere, command it for one cycle, look at it.
 
 It knows nothing of gRPC, protobuf or time on the wall.
 """

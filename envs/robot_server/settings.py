@@ -1,4 +1,4 @@
-"""What a robot server can be started with, checked before anything is started.
+"""Settings of a robot server, checked before anything is started.
 
 The names are those of robo-gym's launch files; see launch_line.py for the lines that carry them.
 """

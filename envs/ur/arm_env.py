@@ -1,4 +1,4 @@
-"""What the arm's tasks share: joints that may be fixed, a start pose, one command a cycle.
+"""Base of the arm's tasks: joints that may be fixed, a start pose, one command a cycle.
 
 A task adds what its action means, what it observes and how a step is judged. Source of every figure here:
 jr-robotics/robo-gym 2.0.1, envs/ur/ur_base_env.py.

@@ -1,4 +1,4 @@
-"""How objects move: robo-gym's object functions, each turned into the positions of one round trip, 100 a second.
+"""Paths of moving objects: robo-gym's object functions as positions of one round trip, 100 a second.
 
 Functions, parameter names and figures: jr-robotics/robo-gym-robot-servers, simulation_objects/scripts/
 objects_controller.py. It knows nothing of MuJoCo; positions are in whatever frame the parameters are.

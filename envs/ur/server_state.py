@@ -1,4 +1,4 @@
-"""What robo-gym's robot server tells of the arm: `state_dict` and `state`, by rs_mode.
+"""State of the arm as robo-gym's robot server reports it: `state_dict` and `state`, by rs_mode.
 
 Names, order and modes: jr-robotics/robo-gym-robot-servers, ur_robot_server. The list has its joints in ROS order, the
 names make the dictionary's order irrelevant.

@@ -1,4 +1,4 @@
-"""How the scripts' `--help` tells of defaults."""
+"""Format the scripts' `--help` so that defaults are shown."""
 
 from __future__ import annotations
 

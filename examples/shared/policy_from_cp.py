@@ -1,4 +1,4 @@
-"""A policy checkpoint's path in, episodes out: what `policy_from_cp_ur.py` and `policy_from_cp_mir.py` share.
+"""Run episodes with the policy of a checkpoint: the library of `policy_from_cp_ur.py` and `_mir.py`.
 
 The policy acts from the checkpoint, through RLlib's own connector pipelines (filter, scaling and clipping included,
 which `Policy.compute_single_action` leaves out), or with `--bundle` from its export. Nothing but the environment is

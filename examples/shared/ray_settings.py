@@ -1,4 +1,4 @@
-"""What must be in the environment before Ray is imported, for every process of a cluster that is started from here.
+"""Environment variables that every Ray process started from here needs, set before Ray is imported.
 
 Ray reads these when it is first imported, so whatever imports Ray imports this first.
 """

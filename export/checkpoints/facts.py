@@ -1,4 +1,4 @@
-"""What a checkpoint says of itself: algorithm, environment, progress.
+"""Facts that a checkpoint records about itself: algorithm, environment, progress.
 
 None of it changes what the policy does, so none of it may stop an export: what cannot be read is left out, with a
 notice. A pruned checkpoint holds these facts as JSON; a full one holds them in RLlib's configuration pickles, which

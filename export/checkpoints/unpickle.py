@@ -1,6 +1,6 @@
 """Open a checkpoint's pickles, and say in one sentence why one cannot be opened.
 
-Loading a pickle runs the code it names; callers say so first. This file knows nothing of what is in them.
+Loading a pickle runs the code it names; callers say so first.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the numbers of an observation and an action are called: asked of the environment's class, never of an instance.
+"""Names and units of observation and action elements, read from the environment's class.
 
 An environment tells by a classmethod `describe(**env_config)` that returns
 `{"observation": [{"name", "unit"}, ...], "action": [...], "control_rate_hz": 10.0}`. Names help people and change

@@ -1,4 +1,4 @@
-"""Turn a checkpoint into a policy bundle: restore, build the graph, write it, prove it, and only then give it its name.
+"""`rlservo export`: restore a checkpoint, build the graph, prove it, and only then name the bundle.
 
 Everything is written into a temporary folder beside the target, which is renamed at the end or removed: a bundle is
 there whole or not at all.

@@ -1,4 +1,4 @@
-"""What a bundle is called and where it goes: `<out>/<name>/<version>/`."""
+"""Name and folder of a bundle: `<out>/<name>/<version>/`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Copy out of a checkpoint only what an export needs: small enough to commit, and without anybody's paths.
+"""`rlservo prune`: copy out of a checkpoint only what an export needs, without anybody's paths.
 
 RLlib's own configuration pickles hold the training script's location and more, so they stay behind; what they say of
 algorithm, environment and progress goes into one JSON file.

@@ -8,9 +8,9 @@ A bundle is a folder `<name>/<version>/` holding
     golden.npz      recorded inputs and outputs, replayed at every load
     SHA256SUMS      a hash of each of the files above (`sha256sum -c SHA256SUMS` checks them too)
 
-This module reads and writes those files. It needs numpy and pydantic; it knows nothing of torch, ray, gymnasium,
-onnx or onnxruntime, and never unpickles. A bundle may come from anybody who can write into a folder: only regular files
-are read, sizes are bounded before anything is read, and what is used of a file is what its hash was checked on.
+This module reads and writes those files. It needs numpy and pydantic, and never unpickles. A bundle may come from
+anybody who can write into a folder: only regular files are read, sizes are bounded before anything is read, and what is
+used of a file is what its hash was checked on.
 """
 
 from __future__ import annotations

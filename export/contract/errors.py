@@ -1,7 +1,7 @@
 """Every error a user of rlservo can meet, in one tree.
 
-It knows nothing of HTTP or of the command line: one table in `serve_app/protocols/json_act.py` maps these to status
-codes, and one handler in `deploy/cli.py` maps them to exit codes.
+One table in `serve_app/protocols/http_errors.py` maps these to status codes, and one handler in `deploy/cli.py` maps
+them to exit codes.
 
     RlservoError                  error
     ├── CheckpointError           checkpoint-unreadable    not a checkpoint, damaged, or its code cannot be imported

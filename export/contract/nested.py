@@ -1,8 +1,7 @@
-"""Nested observations and actions: between what a caller holds and the graph's tensors `obs.<path>`, `action.<path>`.
+"""Nested actions: between the space's own form (dicts and tuples) and the tensors `action.<path>`.
 
 A Dict is a map with exactly its keys, a Tuple a list of exactly its length. A batch has a batch axis on every leaf, as
-Gymnasium's vector environments give it; for a Dict, a list of single observations is a batch, too. It knows numpy and
-the contract's spaces only.
+Gymnasium's vector environments give it; for a Dict, a list of single observations is a batch, too.
 """
 
 from __future__ import annotations

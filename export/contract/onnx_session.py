@@ -1,7 +1,4 @@
-"""Open a graph in onnxruntime, alike for the exporter's gate and for whatever acts with it later.
-
-It needs onnxruntime only; it knows nothing of policies, torch or ray.
-"""
+"""Open a graph in onnxruntime, with the same settings for the exporter's gate and for serving."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Where an action's numbers lie in `action_dist_inputs` or `q_values`, for whoever samples or compares choices.
-
-It knows numpy and the contract's spaces only.
-"""
+"""Layout of `action_dist_inputs` and `q_values`: which numbers belong to which part of an action."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """RLlib's env-to-module connectors as torch modules: what happens to an observation before the network sees it.
 
 Each takes the observation so far, a tree of tensors `[batch, ...]`, and the policy's memory by name, in which a
-stateful one replaces its own entry. It knows torch and the recipe's steps; nothing of RLlib.
+stateful one replaces its own entry.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Of torch's two exporters the TorchScript-based one comes first: for these graphs it takes 0.2 s where the
 torch.export-based one takes 3 s, and the result is as small and as fast. Where it lacks an operation (DQN's nanmean)
-the other takes over. Opset 17 or 18 with IR version 8 is read by every onnxruntime from 1.14 on. It knows nothing of
-RLlib and does not judge the numbers.
+the other takes over. Opset 17 or 18 with IR version 8 is read by every onnxruntime from 1.14 on. It does not judge the
+numbers.
 """
 
 from __future__ import annotations

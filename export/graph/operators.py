@@ -1,4 +1,4 @@
-"""Torch operators whose ONNX form is missing or wrong, as compositions of operators whose form is exact.
+"""Torch operators whose ONNX form is missing or wrong, as compositions of exact ones.
 
 torch's exporters leave out `hypot`, `searchsorted` and `copysign`, divide by zero in `atan2`, lose the remainder of
 large angles in `%`, and write double-precision `atan` for a kernel that onnxruntime does not have. While

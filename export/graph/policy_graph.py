@@ -1,6 +1,6 @@
-"""The whole policy as one torch graph: a raw observation in, an action ready for `env.step` out.
+"""Policy as one torch graph: a raw observation in, an action ready for `env.step` out.
 
-It puts a `Recipe` around a network. It knows torch and numbers; nothing of RLlib, of files or of formats.
+It puts a `Recipe` around a network.
 
 Every node costs a third of a microsecond in onnxruntime, the network itself nine, so constants are folded as far as
 single precision allows.

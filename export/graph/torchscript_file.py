@@ -1,7 +1,7 @@
 """Write a policy graph as TorchScript, and run such a file.
 
 TorchScript is what C++ programs with libtorch and ROS nodes load; torch itself calls it deprecated in favour of
-torch.export. It knows nothing of RLlib and does not judge the numbers.
+torch.export. It does not judge the numbers.
 """
 
 from __future__ import annotations

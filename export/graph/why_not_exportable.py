@@ -1,7 +1,4 @@
-"""When a graph cannot be written or differs from RLlib, look for the reason a person can act on.
-
-It knows torch's tracing and functions from observations to outputs; nothing of RLlib.
-"""
+"""Explain why a network cannot be exported faithfully: operators, and numbers that tracing froze."""
 
 from __future__ import annotations
 

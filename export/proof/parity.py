@@ -1,4 +1,4 @@
-"""The gate: an exported policy gives RLlib's own numbers, or it is not written.
+"""Parity gate: an exported policy gives RLlib's own numbers, or it is not written.
 
 It compares functions from observations to named outputs and does not know what is behind them. A policy with a memory
 is compared over whole sequences, each side fed with its own state.

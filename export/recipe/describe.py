@@ -1,4 +1,4 @@
-"""Describe for people and programs what a graph has baked in, in the order it is applied."""
+"""Describe, for people and programs, the steps baked into a graph, in the order they are applied."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""What RLlib does around the network, in plain numbers: the observation steps before it and the action rule after it.
+"""Recipe of a policy: the observation steps before the network and the action rule after it, as numbers.
 
 `new_stack.py` fills a `Recipe` in from RLlib's saved connector pipelines and `policy_graph.py` turns it into a graph.
-This file knows neither of them: numpy and Gymnasium spaces only.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The observations an export is proven on: likely ones, wide ones, and extremes that make every clip engage.
+"""Sample observations for the proof: likely ones, wide ones, and extremes that make every clip engage.
 
 A policy with a memory is shown sequences, in which episodes end and begin at different steps in different rows. It
 draws numbers from a recipe's observation space and filter; it runs nothing.

@@ -1,7 +1,7 @@
 """Nested observations, actions and states as named leaves: `obs`, or `obs.<path>` for Dict and Tuple spaces.
 
 A tree is a leaf, a dict of trees or a tuple of trees. Dict keys come in sorted order, as dm-tree has them and RLlib
-therefore flattens them, whatever order the space was written in. It knows Gymnasium's spaces and nothing of RLlib.
+therefore flattens them, whatever order the space was written in.
 """
 
 from __future__ import annotations

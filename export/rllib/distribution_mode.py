@@ -1,4 +1,4 @@
-"""Find out, by asking, how a distribution's deterministic action comes out of its parameters. It knows no RLlib.
+"""Find the rule by which a distribution's deterministic action comes out of its parameters.
 
 Where it is none of the known rules, the distribution itself goes into the graph (mode "given"), if it gives the same
 action twice.

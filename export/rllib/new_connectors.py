@@ -1,8 +1,8 @@
-"""Read off RLlib's connector pipelines what they do to an observation and to an action.
+"""Read off RLlib's new-stack connector pipelines what they do to an observation and to an action.
 
 A piece that is not known is refused by its class name, because leaving it out would change the policy. The pieces are
-known by name and by coming from RLlib itself; this file imports nothing of RLlib. A piece of the user's own is taken
-where it offers `torch_forward`, a function of torch tensors `[batch, ...]` that does the same as the piece.
+known by name and by coming from RLlib itself. A piece of the user's own is taken where it offers `torch_forward`, a
+function of torch tensors `[batch, ...]` that does the same as the piece.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""RLlib's own way from an observation to an action on the new API stack, for one agent, alone or among several.
+"""Run RLlib's own connector pipelines of the new API stack for one agent, alone or among several.
 
 Where an environment has several agents, an episode is begun in which only the one whose policy is exported acts: an
 agent's action depends on its own observations alone, because a module that looks at others' is refused. It imports

@@ -1,4 +1,4 @@
-"""Restore a policy of RLlib's new API stack, and run it as RLlib itself would. It imports ray.rllib, as old_stack.py.
+"""Restore a policy of RLlib's new API stack, and run it as RLlib itself would.
 
 Restoring starts nothing: no `ray.init`, no environment, no worker. The module and both connector pipelines come from
 their own folders in the checkpoint; `new_connectors.py` reads off them what they do. `Checkpoint.reference` is the

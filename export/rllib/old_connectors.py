@@ -1,7 +1,7 @@
 """Read off the old API stack's agent and action connectors what they do to an observation and to an action.
 
 They live in the policy's state. A piece that is not known is refused by its name, because leaving it out would change
-the policy. Like `new_connectors.py` this file knows the pieces by name and imports nothing of RLlib.
+the policy. As in `new_connectors.py` the pieces are known by name.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Restore a policy of RLlib's old API stack, and run it as RLlib itself would. It imports ray.rllib, as new_stack.py.
+"""Restore a policy of RLlib's old API stack, and run it as RLlib itself would.
 
 Restoring starts nothing: no `ray.init`, no environment, no worker. `OldStackCheckpoint.reference` is the truth an
 export is compared with: the policy's own agent connectors, `compute_actions_from_input_dict` and action connectors, as

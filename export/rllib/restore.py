@@ -1,4 +1,4 @@
-"""Restore a checkpoint of either API stack, and the form both take: what the rest of the exporter works with."""
+"""Restore a checkpoint of either API stack into the form that the exporter works with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands of `/v1/admin` as methods: what `rlservo policy` calls. It knows nothing of what the server does."""
+"""`AdminClient`: the commands of `/v1/admin` as methods, for `rlservo policy`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Connections that keep a deadline over all their reads and writes, for httpcore.
+"""Network backend for httpcore that keeps one deadline over all reads and writes of a connection.
 
 httpcore's time-outs are for each read: a server that sends a byte now and then is waited for without end. A control
-loop's deadline is for the whole answer. It knows sockets as httpcore wraps them, and nothing of HTTP.
+loop's deadline is for the whole answer.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""One HTTP conversation with a policy server: JSON out, JSON in, a time budget, bounded retries, our own errors.
+"""HTTP calls to a policy server: JSON both ways, one time budget, bounded retries, our own errors.
 
-Used by `client`. It knows nothing of policies, observations or contracts; httpx is imported here and nowhere else.
 A call takes `timeout_s` at most, retries and waits included, however slowly the server's bytes trickle in, and an
 answer that was not complete by then is never returned.
 """

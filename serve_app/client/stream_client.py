@@ -1,7 +1,7 @@
-"""A policy that runs on a server, over one WebSocket: `StreamClient` is to a loop what `PolicyClient` is.
+"""`StreamClient`: a policy on a server over one WebSocket, used like `PolicyClient`.
 
-A stream saves the HTTP around each request. It is made again by itself when it breaks, and whatever comes late is
-told by its number and never used. It knows the server's stream as `websocket_stream.py` speaks it.
+A stream saves the HTTP around each request. It is made again by itself when it breaks, and whatever comes late is told
+by its number and never used.
 """
 
 from __future__ import annotations

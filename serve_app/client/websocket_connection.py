@@ -1,8 +1,7 @@
-"""One WebSocket conversation with a policy server: binary frames out, frames in, each within a deadline.
+"""WebSocket connection to a policy server: binary frames, each sent and read within a deadline.
 
-Used by `stream_client`. The protocol is the package `websockets`' own, without its input and output: here is a plain
-socket whose every operation ends at the deadline it is given, whatever arrives meanwhile: nothing, half a frame, bytes
-one at a time. It knows nothing of policies.
+The protocol is the package `websockets`' own, without its input and output: here is a plain socket whose every
+operation ends at the deadline it is given, whatever arrives meanwhile: nothing, half a frame, bytes one at a time.
 """
 
 from __future__ import annotations

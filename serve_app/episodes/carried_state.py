@@ -1,8 +1,8 @@
-"""A memory that a client carries: what it holds beside the numbers, so that it is fed to nobody else's network.
+"""Recurrent state carried by the client, tagged with its policy version so that no other accepts it.
 
 A reply's state names the graph that it belongs to, and, where the step from one action to the next is limited, holds
 the last action. Both stand under names that no recurrent state has, so a client that sends back what it got needs to
-know neither. It knows nothing of protocols.
+know neither.
 """
 
 from __future__ import annotations

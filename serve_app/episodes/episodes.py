@@ -1,9 +1,8 @@
-"""Decisions that depend on what came before: where a request's memory comes from, and where it goes.
+"""Actions that depend on earlier ones: find a request's recurrent state, decide, keep the next state.
 
 It comes with the request and returns with the reply (`state`), or stays here: under a session's id, or with a stream.
 One of them must be said: a recurrent policy that silently began anew with every request would act wrongly and look
-right. A memory goes to the version that it is of, and to no other. Whatever is refused leaves it where it was. It knows
-nothing of protocols.
+right. A memory goes to the version that it is of, and to no other. Whatever is refused leaves it where it was.
 """
 
 from __future__ import annotations

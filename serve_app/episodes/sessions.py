@@ -1,9 +1,9 @@
-"""Memories of running episodes, kept on the server: bounded in number, evicted when idle, never begun by accident.
+"""Sessions: recurrent state of running episodes on the server, bounded in number, evicted when idle.
 
 A session is begun explicitly and belongs to this process. Whoever asks for one that is not here gets an error, because
-a memory begun anew in the middle of an episode would give wrong actions without a word. What is bounded is episodes
-(a batch is so many side by side), in sessions and on streams together. A session of a policy that remembers nothing
-only keeps its version, takes no place, and makes room for a newer one. It knows nothing of protocols.
+a memory begun anew in the middle of an episode would give wrong actions without a word. What is bounded is episodes (a
+batch is so many side by side), in sessions and on streams together. A session of a policy that remembers nothing only
+keeps its version, takes no place, and makes room for a newer one.
 """
 
 from __future__ import annotations

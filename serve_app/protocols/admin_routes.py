@@ -1,4 +1,4 @@
-"""Administration over HTTP: load, unload, aliases, rollback, canary, shadow, on every replica at once.
+"""Administration over HTTP: load, unload, alias, rollback, canary, shadow, on every replica at once.
 
 Every command answers when all replicas serve the change, or says which do not and why. `api_keys.Guard` lets nobody in
 without an admin key. The Open Inference Protocol's `load` and `unload` are two of these under other names.

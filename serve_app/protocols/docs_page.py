@@ -1,7 +1,7 @@
-"""The interactive API documentation at /docs, whole from this machine: a robot's network has no CDN.
+"""Interactive API documentation at /docs, served whole from this machine: no CDN.
 
 Swagger UI comes from the package `swagger-ui-bundle` (4.15), which draws OpenAPI 3.0 and not 3.1, so the document is
-served as 3.0. It knows nothing of policies.
+served as 3.0.
 """
 
 from __future__ import annotations

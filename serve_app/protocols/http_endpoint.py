@@ -1,4 +1,4 @@
-"""What the HTTP protocols share: a body within its limits, one answer for each error, and a route without machinery.
+"""HTTP endpoint of the hot path: read a body within its limits, call a handler, write the reply.
 
 `Endpoint` is the hot path: a plain ASGI callable, because FastAPI's dependency and response machinery costs more than
 the policy does. Everything runs in the event loop: a decision takes microseconds, a hop to a thread takes more. It

@@ -1,7 +1,6 @@
-"""The JSON protocol under /v1, and health, as a FastAPI application over the `Core`; the other protocols join it here.
+"""JSON protocol: actions under /v1/policies/NAME/act, and the listings beside them.
 
-`ActHandler` is the hot path, on an `Endpoint` that FastAPI documents but does not run. This file knows nothing of ray;
-`app.py` puts the application into a replica.
+`ActHandler` is the hot path, on an `Endpoint` that FastAPI documents but does not run.
 """
 
 from __future__ import annotations

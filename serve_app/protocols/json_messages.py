@@ -1,8 +1,7 @@
-"""What travels as JSON under /v1: the act request and reply, errors, and listings.
+"""Messages of the JSON protocol: act request and reply, errors, listings.
 
 The pydantic models describe the wire in the OpenAPI document. Act requests themselves are read by `read_request`, by
 hand: it costs a microsecond where a model costs ten, and its sentences name what a robot's programmer got wrong.
-It knows nothing of HTTP and nothing of policies.
 """
 
 from __future__ import annotations

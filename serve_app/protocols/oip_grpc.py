@@ -1,4 +1,4 @@
-"""The Open Inference Protocol over gRPC: the methods of `GRPCInferenceService`, which Ray Serve's gRPC ingress calls.
+"""Open Inference Protocol over gRPC: the methods of `GRPCInferenceService`, called by Serve's ingress.
 
 The same policies, options and errors as over HTTP (`oip_infer.py`); an error's HTTP status becomes the gRPC status
 here, its code goes into the trailing metadata. Messages are `oip_messages.py`'s; tensors come raw or typed and go as

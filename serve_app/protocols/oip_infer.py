@@ -1,4 +1,4 @@
-"""The Open Inference Protocol v2 over HTTP, with binary tensors: what Triton's and KServe's clients speak.
+"""Open Inference Protocol v2 over HTTP: inference, with binary tensors, as Triton's clients speak it.
 
 A policy is a model with the contract's inputs (`obs`, or `obs.<path>` for each leaf of a nested space,
 `state_in.<name>` and `reward`; `last_action` or `last_action.<path>`, where its step is limited) and outputs (`action`
@@ -6,7 +6,6 @@ or `action.<path>`, `state_out.<name>`); every call is for a batch, as the proto
 `explore`, `seed`, `seq`, `deadline_ms` and `timestamp` mean what they mean in the JSON protocol; `sequence_id`,
 `sequence_start` and `sequence_end` are its sessions, and `state_policy`, which the reply gives beside the states, is
 its `@policy`.
-It knows HTTP's headers and the protocol's documents; tensors are `oip_tensors.py`'s, decisions the core's.
 
 Specification: github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
 """

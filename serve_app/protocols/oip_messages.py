@@ -1,4 +1,4 @@
-"""The Open Inference Protocol's gRPC messages, built when this module is imported: no generated code.
+"""Protobuf messages of the Open Inference Protocol, built at import: no generated code.
 
 Generated code is tied to the protobuf it was made with, and would claim the names `inference.*` in the process-wide
 descriptor pool, where KServe's and Triton's own packages register theirs. These live in a pool of their own.

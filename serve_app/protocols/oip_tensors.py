@@ -1,7 +1,7 @@
-"""Tensors as the Open Inference Protocol writes them: as JSON numbers, or as raw little-endian bytes after the JSON.
+"""Tensors of the Open Inference Protocol: JSON numbers, or raw little-endian bytes after the JSON.
 
-The binary form is the protocol's "binary tensor data" extension. It knows numpy and the format; nothing of HTTP or of
-policies. Specification: github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
+The binary form is the protocol's "binary tensor data" extension. Specification:
+github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
 """
 
 from __future__ import annotations

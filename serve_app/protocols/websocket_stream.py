@@ -1,4 +1,4 @@
-"""A WebSocket per robot: the openpi policy server's protocol, which its clients speak unchanged.
+"""WebSocket per robot: the openpi policy server's protocol, which its clients speak unchanged.
 
 On connecting the server sends one msgpack map, the metadata; then request and response alternate as binary frames. A
 request is `{"obs": ...}` with the JSON protocol's options, or the observation map itself, from element name to value.
@@ -9,8 +9,7 @@ with `?errors=keep` gets the text frame alone, with the request's `seq`, and goe
 A recurrent policy's memory is the connection's: at its start when the connection opens and after `reset`, gone with the
 connection. A client that would rather carry it sends `state`, as over JSON.
 
-It knows WebSockets as ASGI shows them; decisions are the core's. Source of the protocol:
-github.com/Physical-Intelligence/openpi, websocket_policy_server.py.
+Source of the protocol: github.com/Physical-Intelligence/openpi, websocket_policy_server.py.
 """
 
 from __future__ import annotations

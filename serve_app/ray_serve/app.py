@@ -1,4 +1,4 @@
-"""The policy server as a Ray Serve application. The one file that imports ray.serve.
+"""Ray Serve application: one deployment that holds every policy.
 
 One deployment holds every policy: a policy is kilobytes and microseconds, a hop to another actor is milliseconds. From
 a checkout: `serve run deploy/serve.yaml`, or `serve run rlservo.serve_app.ray_serve.app:build policies=DIR`. `rlservo

@@ -1,4 +1,4 @@
-"""How many replicas there should be: as many as keep the processor of each within reason.
+"""Autoscaling by processor time: as many replicas as keep each one's load within reason.
 
 Ray Serve counts requests that are being worked on. A policy's request is over before anybody counts it, so a replica at
 its limit looks idle, while one with a hundred silent streams looks busy; hence this measure instead. In serve.yaml:

@@ -1,4 +1,4 @@
-"""The launcher's child: a private Ray cluster with the policy server in it, for as long as its standard input is open.
+"""Child process of the launcher: a private Ray cluster with the server, until its stdin ends.
 
 `launcher.py` starts it as `python -m rlservo.serve_app.ray_serve.cluster_process PLAN`, with the environment Ray's
 processes are to inherit. It reports on the file descriptor the plan names, one JSON object per line, and shuts

@@ -1,4 +1,4 @@
-"""What Ray Serve's gRPC servers are told about the Open Inference Protocol: method names, and how bytes get through.
+"""Registration of the Open Inference Protocol with Ray Serve's gRPC servers: methods, and raw bytes.
 
 `grpc_options.grpc_servicer_functions: [rlservo.serve_app.ray_serve.grpc_ingress:add_service]` names it to Serve, whose
 proxies and replicas import it: it needs nothing but grpcio. `oip_grpc.py` has the methods.

@@ -1,4 +1,4 @@
-"""What stands before HAProxy's binary when Ray Serve starts it: it mends the configuration, and it bridges a death.
+"""Wrapper that Ray runs as the HAProxy binary: patches its configuration, restarts it when killed.
 
 Ray (2.60) starts HAProxy from an actor, anew for every change of replicas (`haproxy.py`, `haproxy_templates.py` there):
 

@@ -1,4 +1,4 @@
-"""What stands before Ray Serve's own request handling in a replica: the door, which answers what a policy is asked.
+"""Middleware before Ray Serve's request handling: passes requests for actions straight to the application.
 
 Serve spends more on a request than a policy does: contexts, tasks, a request object, statistics, a line for its log. A
 request for actions needs none of it. How much a replica takes on is decided by `admission.py`, who may ask by

@@ -1,11 +1,11 @@
-"""One write for a reply's head and body, and under load one moment for the replies of a turn of the event loop.
+"""Coalesce socket writes: a reply's head and body together, under load all replies of one loop turn.
 
 uvicorn writes the two one after the other, so the proxy, and then the client, may wake up and read twice for a reply of
 300 bytes. When many ask at the same time, a reply that is written wakes the proxy while the next one is computed, and
 it sleeps again: written one after the other at the end of the turn, they are one wake-up. A single caller does not wait
 for that: replies are held back only when the turn before had several.
 
-It knows uvicorn's own object for a request (0.54); where it finds another, replies are written as before.
+It relies on uvicorn's own object for a request (0.54); where it finds another, replies are written as before.
 """
 
 from __future__ import annotations

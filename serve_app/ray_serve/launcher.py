@@ -2,7 +2,7 @@
 
 The cluster runs in a child process (`cluster_process.py`) and in a folder of its own, so that no other Ray on the
 machine, no RAY_* variable and no earlier token reaches it. The child ends when this process does, whatever ends it;
-this process ends whatever is left when the child is gone. It knows nothing of ray and prints nothing.
+this process ends whatever is left when the child is gone. It prints nothing.
 """
 
 from __future__ import annotations

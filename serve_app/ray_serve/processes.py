@@ -1,9 +1,9 @@
-"""What a launcher must know of the machine: free ports, who holds one, and how to leave no process behind.
+"""Ports and processes of a launch: find free ports, tell who holds one, end every marked process.
 
 Every process of a launch inherits one environment variable with the launch's own mark, and the session of the launch's
 first process, so that whatever is left of it can be found and ended whatever became of its parents. It takes both:
 Ray's workers write their title over the memory that held their environment, and whoever wants to may leave a session.
-Reads /proc (Linux). It knows nothing of ray or policies.
+Reads /proc (Linux).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Drives a Gymnasium environment with a policy, closed loop, and reports how it went and how long answers took.
+"""Control loop: drive a Gymnasium environment with a policy, report success, return and latency.
 
-The policy is anything that acts: in process or over HTTP. gymnasium is imported when a rollout starts. It knows nothing
-of particular robots: success is what the environment's `info` says at an episode's end.
+The policy is anything that acts: in process or over HTTP. gymnasium is imported when a rollout starts. Success is what
+the environment's `info` says at an episode's end.
 """
 
 from __future__ import annotations

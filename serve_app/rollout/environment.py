@@ -1,4 +1,4 @@
-"""Makes the environment of a rollout and checks that the policy fits it. gymnasium is imported in the functions."""
+"""Make the environment of a rollout and check that the policy fits it."""
 
 from __future__ import annotations
 

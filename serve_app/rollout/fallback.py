@@ -1,4 +1,4 @@
-"""What a robot does while its policy does not answer: `WithFallback` turns silence into a chosen action, and says so.
+"""Fallback actions for a late or unreachable policy server.
 
 It wraps anything that acts. A control loop that raised because a packet got lost would leave the robot with its last
 command and nobody at the wheel. Which command is the safe one depends on the robot: holding a position setpoint stops

@@ -1,4 +1,4 @@
-"""What a closed-loop run came to: its numbers, as JSON and as a table. Knows nothing of environments or policies."""
+"""Report of a rollout: success, return, latency, deadline misses, as JSON and as a table."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Writes an environment's `rgb_array` frames to an mp4 file.
-
-It knows nothing of policies or loops. imageio and its ffmpeg are imported when the first frame is written.
-"""
+"""Write an environment's `rgb_array` frames to an mp4 file."""
 
 from __future__ import annotations
 

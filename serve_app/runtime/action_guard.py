@@ -1,7 +1,4 @@
-"""Let only finite actions of the action space pass: the last look before an action leaves for a robot.
-
-It knows numpy and one leaf of the contract's action space; nothing of graphs.
-"""
+"""Last check of an action before it leaves for a robot: finite, and inside the action space."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""How far the observations a policy sees have moved from those it was trained on.
+"""Drift of the observations a policy gets from those it was trained on.
 
 The exporter bakes RLlib's running filter into the graph and writes its mean and standard deviation into the contract;
 nothing more is needed. One observation in `EVERY` is looked at (in a batch, its first rows), and running means with a
 limited memory are kept of z = (obs - mean) / std: a policy at home shows a shift near 0 and a spread near 1 for every
-element. No observation is kept. It knows numpy and the contract; nothing of metrics.
+element. No observation is kept.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Exploring actions: a sample of the policy's action distribution, drawn in numpy, as RLlib would draw it in torch.
+"""Exploring actions: samples of the policy's action distribution, drawn in numpy as RLlib draws them.
 
 The graph gives the distribution's parameters (`action_dist_inputs`); this file knows the distributions RLlib's own
-algorithms use and what RLlib does to a sample before `env.step`. It knows nothing of graphs or files.
+algorithms use and what RLlib does to a sample before `env.step`.
 """
 
 from __future__ import annotations

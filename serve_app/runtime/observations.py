@@ -1,8 +1,8 @@
-"""From whatever a caller sends to the array a policy's graph reads, or one sentence that says why not.
+"""Observations of callers as arrays for the graph, checked: shape, dtype, finite numbers, names.
 
 An observation arrives as an array, as nested lists out of JSON, or as a map from element name to value, alone or as a
 batch. `ObservationReader` turns each into `[batch, ...]` of the graph's dtype. Strict where a robot could be hurt:
-shape, dtype, non-finite numbers and names are errors, never guesses. It knows numpy and the contract's space only.
+shape, dtype, non-finite numbers and names are errors, never guesses.
 
 What happens to a Box observation outside the space's bounds is the policy's options' affair: RLlib's own pipeline
 computes an action for it, too.

@@ -1,7 +1,6 @@
-"""What may be chosen about one policy beyond its contract: how strict to be at its edges.
+"""Per-policy runtime options: out-of-bounds observations, action step limit, micro-batching.
 
 One small model, so that whoever configures policies (the server's settings, a deployment's file) can hold it by name.
-It knows nothing of servers.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Run one exported policy in this process: an observation in, an action ready for `env.step` out.
+"""Exported policy in this process: an observation in, an action ready for `env.step` out.
 
-This is the file where an observation becomes an action, in `Policy.act`. It needs numpy and onnxruntime; it knows
-nothing of the web, ray, torch or gymnasium. The server is a thin edge over it (`policy_store.py`, `json_act.py`).
+This is the file where an observation becomes an action, in `Policy.act`.
 """
 
 from __future__ import annotations

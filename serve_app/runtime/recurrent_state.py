@@ -1,7 +1,6 @@
-"""What a policy carries from step to step, as the graph's tensors: recurrent state, frames, previous actions, reward.
+"""Recurrent state as the graph's tensors: network state, frames, previous actions, reward.
 
-Where it is kept is the caller's affair: `Policy` keeps one, a server's clients may send theirs along. It knows numpy
-and the contract only.
+Where it is kept is the caller's affair: `Policy` keeps one, a server's clients may send theirs along.
 """
 
 from __future__ import annotations

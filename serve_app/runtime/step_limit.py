@@ -1,7 +1,7 @@
-"""Keeps an action near the one before it: a limit per element on how far a command may jump in one step.
+"""Limit on how far each element of an action may move in one step.
 
-A network may answer a small change of its observation with a large change of its action; a gearbox may not. It knows
-numpy and the contract's action space; who remembers the last action is the caller's affair.
+A network may answer a small change of its observation with a large change of its action; a gearbox may not. Who
+remembers the last action is the caller's affair.
 """
 
 from __future__ import annotations

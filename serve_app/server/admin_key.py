@@ -1,4 +1,4 @@
-"""The key by which `rlservo serve` lets its operator administer it: a file for this user alone, gone with the server.
+"""Admin key that `rlservo serve` makes for its user: a file for this user alone, gone with the server.
 
 The file's place follows from the port, so that `rlservo policy` on the same machine finds it by itself.
 """

@@ -1,10 +1,9 @@
-"""How much a replica takes on: whom it turns away at once, so that those it accepts are answered in time.
+"""Admission control: turn requests away at once when a replica cannot answer them in time.
 
 A decision runs in the event loop from its first line to its last (or pauses for the rest of its turn:
 `micro_batching.py`). So requests do not wait for each other in a queue of ours: they wait as tasks that the loop has
 made and not yet run. All that arrived while the loop was busy run in one turn of it, a *burst*. Its length is the
 queue, its beginning when each of them had arrived at the latest. That is known for the price of one callback per burst.
-It knows nothing of HTTP or of policies.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The API keys as their file has them now: read again while the server runs, on every replica by itself.
+"""File of API keys, read again while the server runs, by every replica for itself.
 
 The file is read twice a second in a thread of its own: a stat or read of a file system that hangs must not stop those
 who act. Its whole content is compared, so it does not matter how it was changed: written in place, renamed over,

@@ -1,11 +1,11 @@
-"""Who may ask: API keys, kept as hashes, and the check of each request against them.
+"""API keys, kept as hashes, and the check of each request against them.
 
 A key is 256 random bits, so its plain SHA-256 is all that needs keeping: there is no dictionary to try. A line of the
 key file, or an entry of RLSERVO_API_KEYS (separated by commas), is
 
     <label> <act|admin> sha256:<64 hexadecimal digits>
 
-`rlservo key LABEL` makes a key and its line. It knows nothing of HTTP or of policies.
+`rlservo key LABEL` makes a key and its line.
 """
 
 from __future__ import annotations

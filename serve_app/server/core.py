@@ -1,8 +1,7 @@
-"""What every protocol asks: which policies there are, and one decision within its limits.
+"""One decision within its limits, for every protocol: policies loaded, deadline, batch size, episode.
 
 The protocols (`json_act.py`, `oip_infer.py`, `websocket_stream.py`) read bytes and write bytes; what lies between is
-here, once: whether the policies are loaded, the deadline, the batch limit. It knows nothing of HTTP, WebSockets or
-JSON.
+here, once: whether the policies are loaded, the deadline, the batch limit.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Metrics of what is there at the moment somebody asks: the queue, the sessions, and the drift of observations.
+"""Prometheus gauges sampled at scrape time: queue, sessions, micro-batches, observation drift.
 
-`Metrics.sources` takes functions such as these; shadows add their own. It knows the core and Prometheus'
-families.
+`Metrics.sources` takes functions such as these; shadows add their own.
 """
 
 from __future__ import annotations

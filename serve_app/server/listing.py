@@ -1,4 +1,4 @@
-"""What `GET /v1/policies` and the Open Inference Protocol's index tell: what runs here, since when, and what does not.
+"""Listing of policies and versions: what runs here, since when, and what failed to load.
 
 The models describe the wire. The documents are this replica's own; `/v1/admin/policies` gathers all of them.
 """

@@ -1,4 +1,4 @@
-"""How long a request had waited before this process read it: in a proxy, in the kernel, in a process that stood still.
+"""Age of a request when this process reads it: time in a proxy, in the kernel, in a process that stood still.
 
 Two measures. HAProxy stamps what it passes on with the time it came, which is exact where both read the same clock: on
 one machine. And a clock in the event loop tells when the loop stood still (a stopped process, a long computation, a

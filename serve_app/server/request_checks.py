@@ -3,8 +3,7 @@
 A browser lets any page send requests to any address that it reaches, the robot's own computer included, and lets it
 read the answers where the page's name leads to that address ("DNS rebinding"). So a request says which host it is for,
 and that must be one of this server's; and what may change something must not come from a page of another origin.
-Robots, their clients and proxies send neither an `Origin` nor a `Sec-Fetch-Site`. It knows HTTP's headers and ASGI's
-scope; nothing of keys, routes or policies.
+Robots, their clients and proxies send neither an `Origin` nor a `Sec-Fetch-Site`.
 
 Sources: Fetch Standard, section 3.1 (Origin); W3C Fetch Metadata Request Headers; RFC 9110, section 7.2 (Host).
 """

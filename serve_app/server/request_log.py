@@ -1,7 +1,7 @@
-"""A line of JSON per event, with the request's id, and without what the robot saw.
+"""Request log: a line of JSON per event, with the request's id and without observations.
 
 Requests that fail are always written, with their code; `log_requests` adds those that succeed, `log_values` the
-sentences of errors, which name values of observations. It knows logging; nothing of HTTP or of policies.
+sentences of errors, which name values of observations.
 """
 
 from __future__ import annotations

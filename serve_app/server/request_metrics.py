@@ -1,8 +1,8 @@
-"""What can be seen from outside: counts and histograms of the requests this replica answered, for Prometheus.
+"""Prometheus counters and histograms of the requests that this replica answered.
 
 Recording is a few additions in plain lists, from the one thread that answers: prometheus_client's own counters lock and
 would cost several times as much per request. They become its families when somebody asks. Names follow Prometheus'
-conventions (base units, `_total`). It knows nothing of HTTP.
+conventions (base units, `_total`).
 """
 
 from __future__ import annotations

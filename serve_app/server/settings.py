@@ -1,4 +1,4 @@
-"""The server's settings: one class, one environment prefix, a sentence under each field.
+"""Settings of the server: one class, one environment prefix, a sentence under each field.
 
 `RLSERVO_MAX_BODY_BYTES=1000000 rlservo serve ...` sets one. Nothing here is read at import.
 """

@@ -1,8 +1,8 @@
-"""What should be served: versions, aliases, canary and shadow of each policy, and the changes an operator may make.
+"""Plan of what a server serves: versions, aliases, canary and shadow of each policy, and its changes.
 
 `ServedConfig` is what a person writes (Serve's `user_config`); a `Plan` is what came of it and of every change since:
 whole, numbered, the same for every replica. A version in a plan carries the hash of the bundle that was accepted, so
-that no replica serves another one under its name. It knows nothing of files, ray or HTTP.
+that no replica serves another one under its name.
 
 Every policy of a plan has the alias `production`, which is what clients get that ask for no version; where nobody said
 so it is written down when the policy is first served. So a version that is loaded later is never in use by itself, and

@@ -1,7 +1,6 @@
-"""The policies a server holds: names, versions, aliases, and the one call every protocol makes, `PolicyStore.act`.
+"""Policies that a server holds: names, versions, aliases, and the one call of every protocol, `act`.
 
 A store does not change: what should be served otherwise is another store, and whoever began with one ends with it.
-It knows nothing of HTTP, gRPC or WebSockets; each of those is a thin file over it.
 """
 
 from __future__ import annotations

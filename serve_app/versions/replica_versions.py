@@ -1,9 +1,9 @@
-"""One replica's part in what is served: prove a change, write it down for all, follow what others wrote.
+"""Version changes of one replica: prove a change, write it down for all, follow the others' changes.
 
 The plans stand in a ledger that all replicas share; whoever makes a change proves it first, appends it under the next
 number, and tells the others. A replica swaps one store for the next and keeps the old one where it cannot follow.
 Whatever touches the bundles happens in threads, with a time-out, and nothing is locked meanwhile: requests and other
-changes go on, also where a file system hangs. It knows nothing of ray or HTTP.
+changes go on, also where a file system hangs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The bundles on disk and the policies in memory: find by name and version, load, prove, keep.
+"""Bundles on disk: find them by name and version, tell them apart by their hashes.
 
 A name or version that a request brings is only ever compared with what the folders hold; no path is made of it.
 Everything here blocks (hashing, onnxruntime, golden vectors), and may do so for ever where a file system hangs:

@@ -1,8 +1,8 @@
-"""A candidate computes along: after the reply, in a thread of its own, and only the difference is kept.
+"""Shadow versions: a candidate computes after the reply, and only its difference is kept.
 
 Nothing waits for it: what comes while too much is waiting is left out and counted. Exploring actions are not compared,
 since they differ by chance. The difference is the largest of |candidate - default| over an action's elements, in the
-action's own units; for discrete actions it is 0 or the distance of their numbers. It knows nothing of HTTP.
+action's own units; for discrete actions it is 0 or the distance of their numbers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""msgpack with numpy arrays, as openpi's clients and servers exchange them. Nothing here can run code.
+"""Encode numpy arrays in msgpack as openpi's clients and servers do. Nothing here can run code.
 
 An array is `{b"__ndarray__": True, b"data": bytes, b"dtype": dtype.str, b"shape": shape}`, a numpy scalar
 `{b"__npgeneric__": True, b"data": item, b"dtype": dtype.str}`; the marker keys are bytes, so that no name of an

@@ -1,4 +1,4 @@
-"""Names in a carried recurrent state that are no array of the policy's graph: client and server both read them."""
+"""Names in a carried recurrent state that are no array of the policy's graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the trainer does with environments at the edge, and on a cluster that loses a node. All real trainings."""
+"""The trainer with environments at the edge, and on a cluster that loses a node. All real trainings."""
 
 from __future__ import annotations
 

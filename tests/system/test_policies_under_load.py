@@ -1,4 +1,4 @@
-"""What changes under load costs nobody a request: real Ray Serve, two replicas, clients that never stop asking.
+"""Changes under load cost nobody a request: real Ray Serve, two replicas, clients that never stop asking.
 
 One cluster for the whole file, started as an operator does: the shipped configuration, `serve deploy`, an admin key.
 """

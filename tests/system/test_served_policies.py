@@ -1,4 +1,4 @@
-"""What the project promises of its shipped policies: served over HTTP, with seeds that training never saw."""
+"""Shipped policies over HTTP do what the project promises, with seeds that training never saw."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person may point at, and what they are told when it is not a checkpoint."""
+"""Paths that a person may point at, and the message when one is not a checkpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the client does when the other side misbehaves: a real socket, a server that follows a script."""
+"""The client when the other side misbehaves: a real socket, a server that follows a script."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands before HAProxy: the mended configuration, and the bridge over a killed proxy. Real HAProxy, no Ray."""
+"""The HAProxy wrapper: patched configuration, restart of a killed proxy. Real HAProxy, no Ray."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one policy may be told about its edges: observations out of bounds, and steps of the action."""
+"""Per-policy options: observations out of bounds, and steps of the action."""
 
 from __future__ import annotations
 

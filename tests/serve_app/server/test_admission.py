@@ -1,4 +1,4 @@
-"""What a replica does with more than it takes on: some are turned away at once, and the others notice nothing."""
+"""A replica with more requests than it takes on: some are turned away at once, the others notice nothing."""
 
 from __future__ import annotations
 

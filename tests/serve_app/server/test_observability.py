@@ -1,4 +1,4 @@
-"""What operators see: drift, the queue, a JSON log that keeps what the robot saw to itself, and a dashboard."""
+"""Drift, the queue, a JSON log without observations, and the dashboard, as operators see them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where settings come from and what a wrong one says."""
+"""Sources of settings, and the message of a wrong one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What may be asked for, and what each change of it does; no files, no server."""
+"""Every change of a plan: what may be asked for and what it does; no files, no server."""
 
 from __future__ import annotations
 

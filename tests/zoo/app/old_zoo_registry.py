@@ -1,4 +1,4 @@
-"""Where this user registers models and distributions by name, as RLlib's old documentation shows it."""
+"""Models and distributions registered by name, as RLlib's old documentation shows it."""
 
 from __future__ import annotations
 
