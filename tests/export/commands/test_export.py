@@ -186,7 +186,7 @@ def test_an_interrupt_leaves_nothing(
         assert any(folder.name.startswith(".export-") for folder in (tmp_path / "out" / "pendulum").iterdir())
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(parity, "prove", interrupted)
+    monkeypatch.setattr("rlservo.export.commands.export.prove", interrupted)
     with pytest.raises(KeyboardInterrupt):
         export_checkpoint(zoo / "pendulum", tmp_path / "out", notify=notices.append)
     assert not (tmp_path / "out").exists()
