@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import uvicorn
 from uvicorn.protocols.http import auto
+from uvicorn.server import ServerState
 
 from rlservo.serve_app import connections
 from rlservo.serve_app.connections import TimedProtocol
@@ -259,7 +260,7 @@ def test_a_stream_with_requests_ahead_lets_others_have_their_turns() -> None:
     async def run() -> list[str]:
         config = uvicorn.Config(app, lifespan="off")
         config.load()
-        protocol = connections.BoundedStream(config, uvicorn.server.ServerState(), {}, asyncio.get_running_loop())
+        protocol = connections.BoundedStream(config, ServerState(), {}, asyncio.get_running_loop())
         protocol.transport = Transport()
         order: list[str] = []
         for _ in range(3):

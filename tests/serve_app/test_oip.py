@@ -214,11 +214,12 @@ def test_over_grpc_it_is_refused_too() -> None:
     from rlservo.serve_app import oip_grpc
     from rlservo.serve_app import oip_messages as messages
 
+    grpc: Any = oip_grpc
     for raw in ([b""], []):
         asked = messages.ModelInferRequest(raw_input_contents=raw)
         asked.inputs.add(name="obs", datatype="FP32", shape=[0, *[2**31 - 1] * 5])
         with pytest.raises(RequestError, match="'shape' must be"):
-            oip_grpc._inputs(asked)
+            grpc._inputs(asked)
 
 
 def test_a_body_that_unpacks_to_too_much_is_refused(ask: Ask) -> None:
