@@ -26,7 +26,6 @@ import pytest
 from onnx import helper, numpy_helper
 
 from rlservo.export.contract import bundle as bundle_files
-from rlservo.export.contract import regular_files
 from rlservo.export.contract.bundle import BundleLimits, load_bundle, read_contract
 from rlservo.export.contract.errors import (
     BundleError,
@@ -276,7 +275,7 @@ class Stalled:
         self.file = file
         self.reached, self.go_on = threading.Event(), threading.Event()
         self.waiting = 0
-        monkeypatch.setattr(regular_files, "open_regular", self)
+        monkeypatch.setattr(bundle_files, "open_regular", self)
 
     def __call__(self, file: Path, max_bytes: int | None = None) -> Any:
         if file == self.file:

@@ -24,7 +24,7 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve.launcher import serve_policies
 from rlservo.serve_app.ray_serve.processes import free_ports
-from rlservo.serve_app.server import api_key_file, api_keys
+from rlservo.serve_app.server import api_key_file
 from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.settings import ServerSettings
@@ -202,7 +202,7 @@ def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
 
     monkeypatch.setattr(api_key_file, "STALE_S", 0.1)
     app = create_app(lambda: store, ServerSettings(api_keys_file=str(file)))
-    monkeypatch.setattr(api_keys, "read_key_file", hang)
+    monkeypatch.setattr(api_key_file, "read_key_file", hang)
     try:
         with served(app) as port:
             assert hanging.wait(10)
