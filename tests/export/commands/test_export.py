@@ -12,7 +12,6 @@ import onnx
 import onnxruntime
 import pytest
 
-from rlservo.export.commands import export as export_module
 from rlservo.export.commands.export import export_checkpoint
 from rlservo.export.commands.naming import default_name
 from rlservo.export.contract import bundle
@@ -187,7 +186,7 @@ def test_an_interrupt_leaves_nothing(
         assert any(folder.name.startswith(".export-") for folder in (tmp_path / "out" / "pendulum").iterdir())
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(export_module, "prove", interrupted)
+    monkeypatch.setattr("rlservo.export.commands.export.prove", interrupted)
     with pytest.raises(KeyboardInterrupt):
         export_checkpoint(zoo / "pendulum", tmp_path / "out", notify=notices.append)
     assert not (tmp_path / "out").exists()

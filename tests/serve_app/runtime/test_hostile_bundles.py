@@ -275,7 +275,7 @@ class Stalled:
         self.file = file
         self.reached, self.go_on = threading.Event(), threading.Event()
         self.waiting = 0
-        monkeypatch.setattr(bundle_files, "open_regular", self)
+        monkeypatch.setattr("rlservo.export.contract.bundle.open_regular", self)
 
     def __call__(self, file: Path, max_bytes: int | None = None) -> Any:
         if file == self.file:
