@@ -34,7 +34,7 @@ from rlservo.export.contract.errors import (
 from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
 from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.http_errors import BUG, RETRY_AFTER_S, status_of
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, MAX_AXES, datatype_of, from_bytes
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of, from_bytes, is_shape
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_checks import presented_key
@@ -342,7 +342,7 @@ def _inputs(asked: Any) -> dict[str, NDArray[Any]]:
             raise RequestError(
                 f"input '{label}': datatype must be one of {', '.join(DTYPES)}, got '{tensor.datatype[:64]}'"
             )
-        if len(shape) > MAX_AXES or not all(0 <= n < 2**31 for n in shape):
+        if not is_shape(shape):
             raise RequestError(f"input '{label}': 'shape' must be sizes such as [1, 27]")
         if tensor.parameters and "shared_memory_region" in tensor.parameters:
             raise RequestError(f"input '{label}' is in shared memory, which this server does not read: send the data")

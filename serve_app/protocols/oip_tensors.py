@@ -7,7 +7,7 @@ github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,15 @@ DTYPES: dict[str, np.dtype[Any]] = {
 }
 NAMES = {dtype.newbyteorder("="): name for name, dtype in DTYPES.items()}
 MAX_AXES = 32  # numpy itself stops at 64
+MOST_NUMBERS = 2**59  # numpy counts an array's bytes in 63 bits
 TENSOR_FIELDS = frozenset({"name", "shape", "datatype", "parameters", "data"})
+
+
+def is_shape(shape: Sequence[Any]) -> bool:
+    """Whether numpy can make an array of this shape: an empty one, too, must not be too large in its other axes."""
+    if len(shape) > MAX_AXES or not all(type(n) is int and 0 <= n < 2**31 for n in shape):
+        return False
+    return math.prod(n for n in shape if n) < MOST_NUMBERS
 
 
 def datatype_of(dtype: str) -> str:
@@ -54,7 +62,7 @@ def read_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDArr
     unknown = sorted(document.keys() - TENSOR_FIELDS)
     if unknown:
         raise RequestError(f"input '{label}' has the unknown field '{unknown[0][:64]}': known are name, shape, ...")
-    if type(shape) is not list or len(shape) > MAX_AXES or not all(type(n) is int and 0 <= n < 2**31 for n in shape):
+    if type(shape) is not list or not is_shape(shape):
         raise RequestError(f"input '{label}': 'shape' must be a list of sizes such as [1, 27]")
     if datatype == "BYTES":
         raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")

@@ -231,10 +231,12 @@ def _bound_time(text: str, error_file: Path, limits: Limits) -> str:
     timeout server-fin {FIN_TIMEOUT_S}s
     errorfile 408 {error_file.with_name(LATE_FILE)}"""
     text = replace_once(text, r"^defaults$", rf"\g<0>\n{more}", "the section of defaults")
-    # Not for gRPC, whose streams are requests that go on. A connection on which nothing came gets no 408.
+    # Not for gRPC, whose streams are requests that go on. A connection on which nothing came gets no 408. HTTP/2 has a
+    # port of its own: here a connection of it would be a hundred requests, and count as one.
     handshake = "{ method GET } { req.hdr(upgrade) -i -m str websocket }"
     no_body = "!{ req.hdr(transfer-encoding) -m found } !{ req.hdr(content-length) -m int gt 0 }"
-    more = f"""    option http-buffer-request
+    more = f"""    option disable-h2-upgrade
+    option http-buffer-request
     option http-ignore-probes
     http-request del-header upgrade unless {handshake} {no_body}"""
     text = _into_frontend(text, "http", more)

@@ -7,7 +7,11 @@ uvicorn (0.54) bounds one phase of a connection, the idle time after a reply. Fo
 - for a client that does not read its reply, also after the connection has been closed;
 - for nothing: `Upgrade: websocket` with a body is handed to the WebSocket protocol without that body.
 
-`install` puts a subclass in place of the class that uvicorn chooses, in each of Serve's processes that serves HTTP
+Of a WebSocket it takes whatever comes: 16 KB that unpack to 16 MB, again and again; as many frames at once as fit a
+read, which the application then answers one after the other while the event loop stands still; pings whose answers
+nobody reads.
+
+`install` puts subclasses in place of the classes that uvicorn chooses, in each of Serve's processes that serves HTTP
 (`ingress.py`). One timer a connection looks at its phases; a request costs two assignments. In front of the replicas
 HAProxy has time-outs of its own (`haproxy_wrapper.py`).
 """
@@ -21,9 +25,11 @@ from typing import TYPE_CHECKING, Any
 import uvicorn
 from uvicorn.protocols.http import auto
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 if TYPE_CHECKING:
-    from starlette.types import Receive, Scope, Send
+    from starlette.types import Message, Receive, Scope, Send
+    from websockets.frames import Frame
 
 HEAD_S = 5.0
 """[s] for a request's head, from the connection's begin or the head's first byte on."""
@@ -35,8 +41,15 @@ UNREAD_S = 10.0
 """[s] that sent bytes may wait for a client that does not read."""
 LOOK_S = 1.0
 """[s] between two looks at a connection."""
+PIECE_BYTES = 16384
+"""Of a WebSocket, between two looks at how much has come: uvloop reads 256 KB at once, which are 40,000 frames."""
+MOST_AHEAD = 64
+"""Requests of a stream that wait for those before them: request and answer alternate, a late answer lets some wait."""
+MOST_EMPTY, SMALL_BYTES = 1000, 512
+"""Frames of a WebSocket in a second that complete no message: pings, pongs, small fragments."""
 
 LATE = b'{"error":"the request did not arrive in time","code":"deadline-passed"}'
+TOO_MUCH = 1008  # the close code "policy violation"
 LATE_REPLY = (
     b"HTTP/1.1 408 Request Timeout\r\ncontent-type: application/json\r\nconnection: close\r\n"
     b"content-length: %d\r\n\r\n%s" % (len(LATE), LATE)
@@ -47,6 +60,7 @@ NO_UPGRADE = (
 )
 # What the subclass overrides or reads of uvicorn's private parts.
 PRIVATE = ("_should_upgrade", "_start_asgi_task", "_unset_keepalive_if_required", "handle_websocket_upgrade")
+PRIVATE_OF_STREAMS = ("handle_cont", "handle_ping", "handle_pong")
 
 
 class TimedProtocol(HttpToolsProtocol):
@@ -74,6 +88,9 @@ class TimedProtocol(HttpToolsProtocol):
     def handle_websocket_upgrade(self) -> None:
         """Leave the connection to the WebSocket protocol, which sends pings."""
         self._stop()
+        self.ws_protocol_class = BoundedStream
+        # A robot's numbers hardly compress, and what unpacks to a thousand times its size is nobody's observation.
+        self.config.ws_per_message_deflate = False
         super().handle_websocket_upgrade()
 
     def on_message_begin(self) -> None:
@@ -137,6 +154,64 @@ class TimedProtocol(HttpToolsProtocol):
             self._timer = None
 
 
+class BoundedStream(WebSocketsSansIOProtocol):
+    """A WebSocket that ends when its client sends more than it can be answered, and lets others have their turns."""
+
+    _since = float("-inf")  # when the second began in which `_empty` counts
+    _empty = 0
+
+    def data_received(self, data: bytes) -> None:
+        """Read what has come, piece by piece, until it is too much."""
+        for start in range(0, len(data), PIECE_BYTES):
+            if self.transport.is_closing():
+                return
+            super().data_received(data[start : start + PIECE_BYTES])
+            if self.queue.qsize() > MOST_AHEAD:
+                self._end(f"more than {MOST_AHEAD} requests wait: await answers")
+            elif self._empty > MOST_EMPTY:
+                self._end(f"more than {MOST_EMPTY} pings or fragments in a second")
+
+    def handle_ping(self) -> None:
+        """Answer it."""
+        self._count()
+        super().handle_ping()
+
+    def handle_pong(self, event: Frame) -> None:
+        """Take note of it."""
+        self._count()
+        super().handle_pong(event)
+
+    def handle_cont(self, event: Frame) -> None:
+        """Take a message's next fragment."""
+        if not event.fin and len(event.data) < SMALL_BYTES:
+            self._count()
+        super().handle_cont(event)
+
+    async def receive(self) -> Message:  # type: ignore[override]
+        """Return the next message; others have their turn before one that has come already."""
+        if not self.queue.empty():
+            await asyncio.sleep(0)
+        return await super().receive()  # type: ignore[return-value]
+
+    def _count(self) -> None:
+        now = self.loop.time()
+        if now - self._since > 1.0:
+            self._since, self._empty = now, 0
+        self._empty += 1
+
+    def _end(self, reason: str) -> None:
+        if self.transport.is_closing():
+            return
+        while not self.queue.empty():
+            self.queue.get_nowait()
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": TOO_MUCH, "reason": reason})
+        self.stop_keepalive()
+        self.conn.fail(TOO_MUCH, reason)
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.close_sent = self.disconnected = True  # what the application still sends is for nobody
+        self.transport.close()
+
+
 def _has_body(scope: Any) -> bool:
     """Whether a request that asks for an upgrade is anything else than a handshake."""
     if scope["method"] != "GET":
@@ -157,8 +232,11 @@ def install() -> None:
     """Let uvicorn's servers of this process use it. Raises RuntimeError where uvicorn has become another."""
     if auto.AutoHTTPProtocol is TimedProtocol:
         return
-    missing = [name for name in PRIVATE if not hasattr(HttpToolsProtocol, name)]
+    classes: dict[type, tuple[str, ...]] = {HttpToolsProtocol: PRIVATE, WebSocketsSansIOProtocol: PRIVATE_OF_STREAMS}
+    missing = [
+        f"{kind.__name__} has no {name}" for kind, names in classes.items() for name in names if not hasattr(kind, name)
+    ]
     if auto.AutoHTTPProtocol is not HttpToolsProtocol or missing:
-        what = f"its HttpToolsProtocol has no {missing[0]}" if missing else "httptools is missing"
+        what = f"its {missing[0]}" if missing else "httptools is missing"
         raise RuntimeError(f"uvicorn {uvicorn.__version__} cannot be given time-outs for its connections: {what}")
     auto.AutoHTTPProtocol = TimedProtocol

@@ -101,10 +101,10 @@ class RequestChecks:
                 if host is not None:
                     raise RequestError("the request has two Host headers: send one")
                 host = value
-            elif name == b"origin":
-                origin = value
+            elif name == b"origin":  # of several, which no browser sends, none is anybody's
+                origin = value if origin is None else b"several origins"
             elif name == b"sec-fetch-site":
-                site = value
+                site = value if site is None else b"several"
             elif name == b"authorization":
                 if key is None:
                     key = _bearer(value)
@@ -165,7 +165,8 @@ def _bearer(value: bytes) -> bytes | None:
 def _check_page(origin: bytes | None, site: bytes | None, host: bytes | None) -> None:
     if site is not None and site.strip().lower() not in OWN_SITES:
         raise ForbiddenError("a web page of another site may ask nothing of this server")
-    if origin is not None and origin.lower() not in {scheme + (host or b"").lower() for scheme in PAGE_SCHEMES}:
+    own = () if host is None else {scheme + host.lower() for scheme in PAGE_SCHEMES}
+    if origin is not None and origin.lower() not in own:
         raise ForbiddenError(
             f"a web page of {origin[:100].decode('latin-1')} may ask nothing of this server: only its own may"
         )

@@ -202,6 +202,26 @@ def test_bodies_may_be_compressed_both_ways(ask: Ask, name: str, pack: Callable[
     assert refused[0] == 200 and "content-encoding" not in refused[1]
 
 
+@pytest.mark.parametrize("more", [{"data": []}, {"parameters": {"binary_data_size": 0}}])
+def test_an_empty_tensor_that_numpy_cannot_make_is_refused(ask: Ask, more: dict[str, Any]) -> None:
+    given = {"name": "obs", "datatype": "FP32", "shape": [0, *[2**31 - 1] * 5], **more}
+    status, reply = infer(ask, json.dumps({"inputs": [given]}).encode())
+    assert status == 400 and "'shape' must be" in reply["error"]
+
+
+def test_over_grpc_it_is_refused_too() -> None:
+    from rlservo.export.errors import RequestError
+    from rlservo.serve_app import oip_grpc
+    from rlservo.serve_app import oip_messages as messages
+
+    grpc: Any = oip_grpc
+    for raw in ([b""], []):
+        asked = messages.ModelInferRequest(raw_input_contents=raw)
+        asked.inputs.add(name="obs", datatype="FP32", shape=[0, *[2**31 - 1] * 5])
+        with pytest.raises(RequestError, match="'shape' must be"):
+            grpc._inputs(asked)
+
+
 def test_a_body_that_unpacks_to_too_much_is_refused(ask: Ask) -> None:
     bomb = gzip.compress(b"[" + b"0," * 5_000_000 + b"0]")
     assert len(bomb) < 20_000

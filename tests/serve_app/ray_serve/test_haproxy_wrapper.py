@@ -499,6 +499,15 @@ def test_an_upgrade_with_a_body_is_an_ordinary_request(node: Node, protocol: str
     assert time.monotonic() - started < 5
 
 
+def test_a_connection_to_the_http_port_is_no_hundred_requests_of_http2(node: Node) -> None:
+    node.proxy(FULL)
+    until(lambda: node.ask()[0] == 200)
+    preface = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])
+    with opened(node.port, "127.0.0.1", preface) as connection:
+        connection.settimeout(10)
+        assert connection.recv(65536).split()[1] == b"400"
+
+
 def test_the_cluster_gets_the_variables_that_the_launcher_sets(tmp_path: Path) -> None:
     """deploy/serve.yaml tells operators to export what `rlservo serve` does by itself."""
     text = (Path(__file__).resolve().parents[3] / "deploy" / "serve.yaml").read_text()

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import uvicorn
 from uvicorn.protocols.http import auto
+from uvicorn.server import ServerState
 
 from rlservo.serve_app.ray_serve import http_connections
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
@@ -184,3 +185,95 @@ def test_a_uvicorn_without_what_it_changes_is_refused_by_name(monkeypatch: pytes
         http_connections.install()
     assert auto.AutoHTTPProtocol is not TimedProtocol
     assert asyncio.iscoroutinefunction(app)
+
+
+# Streams: what comes faster than it can be answered.
+
+
+def masked(opcode: int, payload: bytes, *, first: int = 0x80) -> bytes:
+    """A client's frame; `first` is FIN and the reserved bits."""
+    size = bytes([0x80 | len(payload)]) if len(payload) < 126 else b"\xfe" + len(payload).to_bytes(2, "big")
+    return bytes([first | opcode]) + size + bytes(4) + payload
+
+
+@pytest.fixture
+def stream(port: int) -> Iterator[socket.socket]:
+    """A WebSocket after its handshake, which offers compression."""
+    with socket.create_connection(("127.0.0.1", port), timeout=SOON_S) as connection:
+        offer = "sec-websocket-extensions: permessage-deflate\r\n"
+        connection.sendall(f"GET / HTTP/1.1\r\nhost: x\r\n{HANDSHAKE}{offer}\r\n".encode())
+        answer = b""
+        while b"\r\n\r\n" not in answer:
+            answer += connection.recv(1)
+        assert answer.startswith(b"HTTP/1.1 101")
+        assert b"extensions" not in answer.lower()
+        yield connection
+
+
+def closing_code(connection: socket.socket) -> int:
+    """The code of the close frame that is the last to come."""
+    answer = rest(connection)
+    found = answer.rfind(b"\x88")
+    return int.from_bytes(answer[found + 2 : found + 4], "big")
+
+
+def test_a_stream_takes_nothing_compressed(stream: socket.socket) -> None:
+    import zlib
+
+    packer = zlib.compressobj(9, zlib.DEFLATED, -12)
+    bomb = packer.compress(bytes(1 << 20)) + packer.flush(zlib.Z_SYNC_FLUSH)
+    stream.sendall(masked(2, bomb[:-4], first=0xC0))
+    assert closing_code(stream) == 1002  # a reserved bit: nothing was agreed on
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        pytest.param(masked(9, b"x") * 5000, id="pings"),
+        pytest.param(masked(10, b"") * 5000, id="pongs"),
+        pytest.param(masked(2, b"", first=0) + masked(0, b"", first=0) * 5000, id="empty fragments"),
+        pytest.param(masked(2, b"x") * 5000, id="messages"),
+    ],
+)
+def test_a_stream_that_floods_ends(stream: socket.socket, port: int, frames: bytes) -> None:
+    with contextlib.suppress(OSError):  # it may end while this is being sent
+        stream.sendall(frames)
+    with contextlib.suppress(ConnectionResetError):  # what was not read destroys the close frame
+        assert closing_code(stream) == 1008
+    assert until_closed(port, b"GET / HTTP/1.1\r\nconnection: close\r\n\r\n").startswith(b"HTTP/1.1 200")
+
+
+def test_a_stream_some_requests_ahead_gets_all_answers(stream: socket.socket) -> None:
+    stream.sendall(masked(2, b"x") * 60 + masked(9, b"y") * 900)
+    answer = b""
+    while len(answer) < 960 * 3:
+        answer += stream.recv(65536)
+    assert answer.count(b"\x82\x01x") == 60
+    assert answer.count(b"\x8a\x01y") == 900
+
+
+def test_a_stream_with_requests_ahead_lets_others_have_their_turns() -> None:
+    class Transport(asyncio.Transport):
+        def pause_reading(self) -> None: ...
+        def resume_reading(self) -> None: ...
+
+    async def run() -> list[str]:
+        config = uvicorn.Config(app, lifespan="off")
+        config.load()
+        protocol = connections.BoundedStream(config, ServerState(), {}, asyncio.get_running_loop())
+        protocol.transport = Transport()
+        order: list[str] = []
+        for _ in range(3):
+            protocol.queue.put_nowait({"type": "websocket.receive", "bytes": b""})
+
+        async def other() -> None:
+            order.append("other")
+
+        task = asyncio.ensure_future(other())
+        for _ in range(3):
+            await protocol.receive()
+            order.append("message")
+        await task
+        return order
+
+    assert asyncio.run(run())[0] == "other"

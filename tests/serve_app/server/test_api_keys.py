@@ -16,10 +16,10 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import InvalidStatus
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.errors import ForbiddenError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.api_keys import Keys, Role, check_exposure, new_key
-from rlservo.serve_app.server.request_checks import Hosts
+from rlservo.serve_app.server.request_checks import Hosts, RequestChecks
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.replica_versions import Control
@@ -185,6 +185,27 @@ def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served
             with pytest.raises(InvalidStatus) as caught:
                 stream(port, origin=origin)
             assert caught.value.response.status_code == 403
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        {b"origin": [b"http://evil.example", b"http://x"]},
+        {b"origin": [b"http://x", b"http://x"]},
+        {b"sec-fetch-site": [b"cross-site", b"none"]},
+    ],
+)
+def test_a_page_that_says_twice_where_it_is_from_is_refused(page: dict[bytes, list[bytes]]) -> None:
+    checks = RequestChecks(Hosts("127.0.0.1", ServerSettings(allowed_hosts="x"), keyed=False))
+    said = [(name, value) for name, values in page.items() for value in values]
+    with pytest.raises(ForbiddenError):
+        checks.read({"type": "http", "method": "POST", "headers": [(b"host", b"x"), *said]})
+
+
+def test_a_page_has_no_origin_where_the_request_has_no_host() -> None:
+    checks = RequestChecks(Hosts("127.0.0.1", ServerSettings(), keyed=False))
+    with pytest.raises(ForbiddenError):
+        checks.read({"type": "http", "method": "POST", "headers": [(b"origin", b"http://")]})
 
 
 def asked_as(host: str, listening_on: str, *, keyed: bool = False, allowed: str = "") -> bool:
