@@ -40,7 +40,7 @@ def is_shape(shape: Sequence[Any]) -> bool:
     """Whether numpy can make an array of this shape: an empty one, too, must not be too large in its other axes."""
     if len(shape) > MAX_AXES or not all(type(n) is int and 0 <= n < 2**31 for n in shape):
         return False
-    return math.prod(n for n in shape if n) < MOST_NUMBERS
+    return bool(math.prod(n for n in shape if n) < MOST_NUMBERS)
 
 
 def datatype_of(dtype: str) -> str:

@@ -260,7 +260,7 @@ def test_a_stream_with_requests_ahead_lets_others_have_their_turns() -> None:
     async def run() -> list[str]:
         config = uvicorn.Config(app, lifespan="off")
         config.load()
-        protocol = connections.BoundedStream(config, ServerState(), {}, asyncio.get_running_loop())
+        protocol = http_connections.BoundedStream(config, ServerState(), {}, asyncio.get_running_loop())
         protocol.transport = Transport()
         order: list[str] = []
         for _ in range(3):
