@@ -26,8 +26,8 @@ from typing_extensions import Self
 from rlservo.deploy.demo.picture import Robot, RobotRun, Trace, draw_picture, film
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
-from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.rollout.control_loop import rollout
 

@@ -51,8 +51,7 @@ frontend http_frontend
 """
 EMPTY = """    default_backend default_backend
 backend default_backend
-    http-request return status 404 content-type text/plain lf-string "Path '%[path]' not found. Ping
-    http://.../-/routes."
+    http-request return status 404 content-type text/plain lf-string "Path '%[path]' not found. Ping http://.../-/routes."
 """
 FULL = """    default_backend http-rlservo
 backend http-rlservo
