@@ -20,8 +20,8 @@ def scripts() -> Any:
     """The scripts as modules."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(EXAMPLES))
-        names = ("resources", "training_inference", "training_inference_ur")
-        yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
+        names = ("shared.resources", "shared.training_inference", "training_inference_ur")
+        yield SimpleNamespace(**{name.rpartition(".")[2]: importlib.import_module(name) for name in names})
 
 
 @pytest.mark.parametrize("algorithm", ["PPO", "APPO", "IMPALA", "SAC"])
