@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from numpy.typing import NDArray
-from torch.jit._trace import TracerWarning
+from torch.jit import TracerWarning
 
 from rlservo.export.contract.errors import UnsupportedError, first_line
 from rlservo.export.graph.policy_graph import PolicyGraph

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.jit._trace import TracerWarning
+from torch.jit import TracerWarning
 
 from rlservo.export.contract.errors import first_line
 from rlservo.export.recipe.runners import Inputs
