@@ -22,9 +22,10 @@ import grpc
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.errors import UnauthenticatedError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.ray_serve.ingress import PROCESS
 from rlservo.serve_app.ray_serve.launcher import serve_policies
 from rlservo.serve_app.ray_serve.processes import LOG_BYTES, MARK, cut_log, free_ports
 from rlservo.serve_app.runtime.policy import Policy
@@ -125,7 +126,11 @@ def serving(policies: Path, *, with_grpc: bool, with_key: bool, **settings: Any)
     try:
         while not ready.wait(0.1):
             assert thread.is_alive(), failures
-        (folder,) = [made for made in _folders() - before if _is_of(made, port)]
+        deadline = time.monotonic() + 20  # Serve writes the file anew whenever a replica comes
+        while not (own := [made for made in _folders() - before if _is_of(made, port)]):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        (folder,) = own
         yield Server(port, grpc_port if with_grpc else None, folder, key, processes_of(folder))
     finally:
         stop.set()
@@ -388,25 +393,20 @@ def test_after_serves_own_handling_actions_and_streams_are_the_policys_own(after
             np.testing.assert_array_equal(client.act(obs), policy.act(obs))
 
 
-def test_after_serves_own_handling_it_is_serve_that_numbers_requests(after_serve: Server, server: Server) -> None:
-    """The setting does what it says: the ids of requests that go ahead of Serve are ours, and no UUIDs."""
-
-    def request_id(port: int, key: str) -> str:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-        with contextlib.closing(connection):
-            headers = {"content-type": "application/json", "authorization": f"Bearer {key}"}
-            connection.request("POST", "/v1/policies/ur5/act", BODY, headers)
-            return connection.getresponse().headers["x-request-id"]
-
-    assert str(uuid.UUID(request_id(after_serve.port, after_serve.key)))
+def test_after_serves_own_handling_it_is_serve_that_numbers_requests(after_serve: Server) -> None:
+    """The setting does what it says: Serve's ids are UUIDs, those of requests that go ahead of it are ours."""
     with pytest.raises(ValueError):
-        uuid.UUID(request_id(server.port, server.key))
+        uuid.UUID(f"{PROCESS.decode()}-1")
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", after_serve.port, timeout=20)) as connection:
+        headers = {"content-type": "application/json", "authorization": f"Bearer {after_serve.key}"}
+        connection.request("POST", "/v1/policies/ur5/act", BODY, headers)
+        assert uuid.UUID(connection.getresponse().headers["x-request-id"])
 
 
 def test_after_serves_own_handling_keys_are_asked_for(after_serve: Server) -> None:
     assert act(after_serve.port, "") == act(after_serve.port, f"{after_serve.key}x") == 401
     with (
-        pytest.raises(UsageError, match="key"),
+        pytest.raises(UnauthenticatedError, match="key"),
         StreamClient(f"http://127.0.0.1:{after_serve.port}", "ur5", deadline_ms=20_000) as client,
     ):
         client.act(np.zeros(27, np.float32))
