@@ -101,7 +101,6 @@ def serving(policies: Path, *, with_grpc: bool, with_key: bool, **settings: Any)
     key, line = new_key("tests")
     ready, stop = threading.Event(), threading.Event()
     failures: list[BaseException] = []
-    before = _folders()
 
     def serve() -> None:
         try:
@@ -126,11 +125,7 @@ def serving(policies: Path, *, with_grpc: bool, with_key: bool, **settings: Any)
     try:
         while not ready.wait(0.1):
             assert thread.is_alive(), failures
-        deadline = time.monotonic() + 20  # Serve writes the file anew whenever a replica comes
-        while not (own := [made for made in _folders() - before if _is_of(made, port)]):
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
-        (folder,) = own
+        folder = _folder_of(port)
         yield Server(port, grpc_port if with_grpc else None, folder, key, processes_of(folder))
     finally:
         stop.set()
@@ -138,12 +133,16 @@ def serving(policies: Path, *, with_grpc: bool, with_key: bool, **settings: Any)
     assert failures == []
 
 
-def _folders() -> set[Path]:
-    return {folder for parent in {tempfile.gettempdir(), "/tmp"} for folder in Path(parent).glob("rlservo-*")}
-
-
-def _is_of(folder: Path, port: int) -> bool:
-    return any(f":{port}" in file.read_text() for file in folder.glob("*/haproxy.cfg"))
+def _folder_of(port: int) -> Path:
+    """Return the folder of the server on a port, as its cluster's process was told."""
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdigit() else []
+            if b"rlservo.serve_app.ray_serve.cluster_process" in words:
+                plan = json.loads(words[words.index(b"rlservo.serve_app.ray_serve.cluster_process") + 1])
+                if plan["port"] == port:
+                    return Path(plan["folder"])
+    raise AssertionError(f"no server runs on port {port}")
 
 
 @pytest.fixture(scope="module")
