@@ -21,11 +21,10 @@ import sys
 import numpy as np
 import rlservo
 from rlservo.deploy.cli import main
-from rlservo.errors import UnavailableError
 action = rlservo.Policy.load(sys.argv[1]).act(np.zeros(27, np.float32))
 try:
     rlservo.PolicyClient("http://127.0.0.1:9", "ur5", timeout_s=5, retries=0).act(np.zeros(27, np.float32))
-except UnavailableError:
+except rlservo.errors.UnavailableError:
     print("refused")
 rlservo.StreamClient, rlservo.AdminClient, rlservo.WithFallback, rlservo.rollout
 print("acted", action.shape)

@@ -8,7 +8,6 @@ import json
 import queue
 import re
 import socket
-import tempfile
 import threading
 import time
 import uuid
