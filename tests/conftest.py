@@ -21,7 +21,7 @@ pytest_plugins = ["bundles", "servers"]
 ROBO_GYM = ["robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1"]
 # What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and
 # pip would settle that with an old robo-gym-server-modules that has no pin and does not work.
-CLIENT = ["httpx>=0.27", "pydantic>=2.6"]
+CLIENT = ["httpcore>=1.0.6", "pydantic>=2.6"]
 
 
 @pytest.fixture(scope="session")

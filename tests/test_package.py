@@ -76,6 +76,6 @@ def test_first_action_needs_no_event_loop_and_no_server(tmp_path: Path) -> None:
     """
     spent, *modules = python(program, tmp_path / "ur5").split()
     print(f"from numpy and onnxruntime to the first action: {spent} s of CPU time")
-    unwanted = {"asyncio", "fastapi", "gymnasium", "httpx", "multiprocessing", "ray", "rich", "ssl", "starlette",
-                "torch", "typer", "websockets"}  # fmt: skip
+    unwanted = {"asyncio", "fastapi", "gymnasium", "httpcore", "httpx", "multiprocessing", "ray", "rich", "ssl",
+                "starlette", "torch", "typer", "websockets"}  # fmt: skip
     assert "pydantic" in modules and not unwanted & set(modules)

@@ -13,11 +13,10 @@ from typing import Any
 
 import torch
 from numpy.typing import NDArray
-from torch.jit._trace import TracerWarning
 
 from rlservo.export.contract.errors import UnsupportedError, first_line
 from rlservo.export.graph.policy_graph import PolicyGraph
-from rlservo.export.graph.why_not_exportable import frozen_by_tracing, raised_at
+from rlservo.export.graph.why_not_exportable import TracerWarning, frozen_by_tracing, raised_at
 from rlservo.export.recipe.runners import Inputs, Runner
 
 

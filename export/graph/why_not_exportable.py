@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.jit._trace import TracerWarning
 
 from rlservo.export.contract.errors import first_line
 from rlservo.export.recipe.runners import Inputs
@@ -29,6 +28,10 @@ INSTEAD = {
 }
 """What to write instead of operators that no exporter takes, by a pattern of ATen's names."""
 OTHERWISE = "compose it of arithmetic, comparisons, torch.where, torch.cat and sums along an axis"
+
+
+# torch.jit has the name, but does not list it as its own; in a torch without it, every warning says where.
+TracerWarning: type[Warning] = getattr(torch.jit, "TracerWarning", Warning)
 
 
 def frozen_by_tracing(caught: Sequence[warnings.WarningMessage]) -> list[str]:

@@ -17,10 +17,11 @@ from typing import Any
 from ray.rllib.models.catalog import ModelCatalog
 from ray.rllib.models.torch.torch_action_dist import TorchDistributionWrapper
 from ray.rllib.models.torch.torch_modelv2 import TorchModelV2
-from ray.tune.registry import RLLIB_ACTION_DIST, RLLIB_MODEL, _global_registry
+from ray.tune.registry import RLLIB_ACTION_DIST, RLLIB_MODEL
 
 from rlservo.export.checkpoints.unpickle import explain, searched
 from rlservo.export.contract.errors import CheckpointError
+from rlservo.export.rllib import private_names
 
 REGISTER = "register_custom_model"
 SKIPPED = {"site-packages", "node_modules", "__pycache__", "build", "dist"}
@@ -62,9 +63,10 @@ def register_custom_parts(model_config: Mapping[str, Any], app_dir: Path) -> Non
 
     Raises CheckpointError when the code in `app_dir` does not say which class has that name, or it cannot be imported.
     """
+    registry = private_names.find("ray.tune.registry", "_global_registry")
     for part in PARTS:
         name = model_config.get(part.setting)
-        if isinstance(name, str) and not _global_registry.contains(part.category, name):
+        if isinstance(name, str) and not registry.contains(part.category, name):
             part.register(name, _find_class(part, name, app_dir))
 
 

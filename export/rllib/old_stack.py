@@ -18,7 +18,6 @@ import torch
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from ray.rllib.algorithms.dqn.dqn_torch_model import DQNTorchModel
-from ray.rllib.evaluation.env_runner_v2 import _batch_inference_sample_batches
 from ray.rllib.models.torch.modules.noisy_layer import NoisyLayer
 from ray.rllib.models.torch.recurrent_net import LSTMWrapper
 from ray.rllib.models.torch.torch_action_dist import (
@@ -47,6 +46,7 @@ from rlservo.export.recipe.describe import surprises
 from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.recipe.runners import Inputs
 from rlservo.export.recipe.trees import build, named_leaves, space_leaves, tree_leaves
+from rlservo.export.rllib import private_names
 from rlservo.export.rllib.distribution_mode import find_mode
 from rlservo.export.rllib.gaussian_heads import replace_bias_layers
 from rlservo.export.rllib.new_connectors import check_spaces
@@ -125,8 +125,9 @@ class OldStackLoop:
             if not restart[row]:
                 told.update({SampleBatch.REWARDS: 0.0, SampleBatch.TERMINATEDS: False, SampleBatch.TRUNCATEDS: False})
             items.append(AgentConnectorDataType(env, AGENT, told))
+        join = private_names.find("ray.rllib.evaluation.env_runner_v2", "_batch_inference_sample_batches")
         processed = policy.agent_connectors(items)
-        batch = _batch_inference_sample_batches([item.data.sample_batch for item in processed])
+        batch = join([item.data.sample_batch for item in processed])
         seen = np.asarray(batch[SampleBatch.OBS])
         actions, states, fetches = policy.compute_actions_from_input_dict(
             batch, explore=False, timestep=policy.global_timestep

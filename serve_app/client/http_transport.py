@@ -7,11 +7,13 @@ answer that was not complete by then is never returned.
 from __future__ import annotations
 
 import json
+import os
 import random
+import ssl
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
-from urllib.parse import quote, urlsplit
+from urllib.parse import SplitResult, quote, unquote, urlsplit
 from urllib.request import getproxies, proxy_bypass
 
 import numpy as np
@@ -26,11 +28,11 @@ from rlservo.export.contract.errors import (
 )
 
 try:
-    import httpx
+    import httpcore
 except ModuleNotFoundError as missing:
-    raise UsageError("the HTTP client needs httpx: pip install 'rlservo[client]'") from missing
+    raise UsageError("the HTTP client needs httpcore: pip install 'rlservo[client]'") from missing
 
-from rlservo.serve_app.client.deadline_backend import DeadlineBackend  # needs httpx's httpcore
+from rlservo.serve_app.client.deadline_backend import DeadlineBackend
 
 try:  # three times faster than the standard library on an image; not a requirement of the client
     import orjson
@@ -40,7 +42,22 @@ except ModuleNotFoundError:
 FIRST_WAIT_S = 0.05  # before the second attempt; doubles each time
 LONGEST_WAIT_S = 2.0
 MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; keeps a wrong URL from filling the memory
+KEEP_S = 5.0  # [s] that an idle connection is kept
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
+PATH_CHARACTERS = "/%:@!$&'()*+,;=~"  # of a server's address, which stay as they are given
+PROXIES: dict[str, Callable[..., httpcore.ConnectionPool]] = {
+    "http": httpcore.HTTPProxy,
+    "https": httpcore.HTTPProxy,
+    "socks5": httpcore.SOCKSProxy,
+    "socks5h": httpcore.SOCKSProxy,
+}
+FAILURES = (
+    httpcore.NetworkError,
+    httpcore.ProtocolError,
+    httpcore.ProxyError,
+    httpcore.TimeoutException,
+    httpcore.UnsupportedProtocol,
+)
 
 
 class Transport:
@@ -58,19 +75,19 @@ class Transport:
             raise UsageError(f"retries must be 0 or more, got {retries}")
         self._timeout_s = timeout_s
         self._retries = retries
+        parts = urlsplit(self.url)
+        self._address = (parts.scheme.encode(), _host_of(parts), parts.port, quote(parts.path, safe=PATH_CHARACTERS))
         # The replies are a few hundred bytes: compressing them costs more than it saves.
-        self._headers = {"accept": "application/json", "accept-encoding": "identity", "user-agent": "rlservo-client"}
+        self._headers = [
+            (b"host", _host_header(parts)),
+            (b"accept", b"application/json"),
+            (b"accept-encoding", b"identity"),
+            (b"user-agent", b"rlservo-client"),
+        ]
         if api_key is not None:
-            self._headers["authorization"] = f"Api-Key {api_key}"
-        # httpx.Client's cookies, redirects and merging would cost a control loop 0.2 ms of 0.7 per request.
-        self._http = httpx.HTTPTransport(
-            verify=self.url.startswith("https"),  # reading the certificates takes 20 ms; http has no use for them
-            proxy=_proxy_of(self.url),
-            limits=httpx.Limits(max_connections=100),
-        )
+            self._headers.append((b"authorization", f"Api-Key {api_key}".encode()))
         self._backend = DeadlineBackend()
-        # httpx has no argument for it; httpcore, below it, has. Its own time-outs are for each read, not for all.
-        self._http._pool._network_backend = self._backend
+        self._pool = _connection_pool(self.url, self._backend)
         self._closed = False
 
     @property
@@ -89,7 +106,7 @@ class Transport:
     def close(self) -> None:
         """Close the connections. A call after that raises UsageError."""
         self._closed = True
-        self._http.close()
+        self._pool.close()
 
     def _call(
         self, method: str, path: tuple[str, ...], body: bytes | None, timeout_s: float | None, retries: int | None
@@ -102,11 +119,14 @@ class Transport:
         if self._closed:
             raise UsageError("the client is closed: make a new one")
         url = "/".join((self.url, *(quote(part, safe="") for part in path)))
+        scheme, host, port, prefix = self._address
+        target = "/".join((prefix, *(quote(part, safe="") for part in path))) or "/"
+        address = httpcore.URL(scheme=scheme, host=host, port=port, target=target)
         budget = self._timeout_s if timeout_s is None else timeout_s
         deadline = time.monotonic() + budget
         for attempt, wait in enumerate(_waits(self._retries if retries is None else retries)):
             try:
-                status, headers, content = self._once(method, url, body, deadline, budget)
+                status, headers, content = self._once(method, address, body, deadline, budget)
             except UnavailableError as error:
                 failure = error
                 # A server that closed an idle connection is probably there: ask again at once, the first time.
@@ -130,35 +150,39 @@ class Transport:
         raise AssertionError("the last wait is None")
 
     def _once(
-        self, method: str, url: str, body: bytes | None, deadline: float, budget: float
-    ) -> tuple[int, Mapping[str, str], bytes]:
+        self, method: str, url: httpcore.URL, body: bytes | None, deadline: float, budget: float
+    ) -> tuple[int, Sequence[tuple[bytes, bytes]], bytes]:
         """Return (status, headers, body) of one attempt."""
         remaining = deadline - time.monotonic()
         late = DeadlineError(f"{self.url} did not answer within {budget:g} s", {"timeout_s": budget})
         if remaining <= 0:
             raise late
-        headers = self._headers if body is None else {**self._headers, "content-type": "application/json"}
+        headers = self._headers
+        if body is not None:
+            headers = [*headers, (b"content-type", b"application/json"), (b"content-length", b"%d" % len(body))]
         timeout = dict.fromkeys(("connect", "read", "write", "pool"), remaining)
-        request = httpx.Request(method, url, headers=headers, content=body, extensions={"timeout": timeout})
+        request = httpcore.Request(method, url, headers=headers, content=body, extensions={"timeout": timeout})
         self._backend.deadline = deadline
         try:
-            response = self._http.handle_request(request)
+            response = self._pool.handle_request(request)
             try:
                 content = b""
-                for chunk in response.iter_raw():
+                for chunk in response.iter_stream():
                     content += chunk
                     if time.monotonic() > deadline:
                         raise late
                     if len(content) > MAX_REPLY_BYTES:
-                        raise TooLargeError(f"{url} answered more than {MAX_REPLY_BYTES >> 20} MiB: is it rlservo?")
+                        raise TooLargeError(
+                            f"{self.url} answered more than {MAX_REPLY_BYTES >> 20} MiB: is it rlservo?"
+                        )
             finally:
                 response.close()  # an unread rest closes the connection: a late answer cannot meet the next request
-        except (httpx.ReadTimeout, httpx.WriteTimeout) as error:
+        except (httpcore.ReadTimeout, httpcore.WriteTimeout) as error:
             raise late from error
-        except httpx.ConnectTimeout as error:
+        except httpcore.ConnectTimeout as error:
             raise UnavailableError(f"{self.url} cannot be reached within {budget:g} s", {"url": self.url}) from error
-        except httpx.TransportError as error:
-            dropped = isinstance(error, httpx.RemoteProtocolError | httpx.ReadError | httpx.WriteError)
+        except FAILURES as error:
+            dropped = isinstance(error, httpcore.RemoteProtocolError | httpcore.ReadError | httpcore.WriteError)
             what = "dropped the connection" if dropped else "cannot be reached"
             why = str(error) or type(error).__name__
             raise UnavailableError(f"{self.url} {what}: {why}", {"url": self.url, "dropped": dropped}) from error
@@ -166,7 +190,7 @@ class Transport:
             self._backend.deadline = None
         if time.monotonic() > deadline:
             raise late
-        return response.status_code, response.headers, content
+        return response.status, response.headers, content
 
     def _parse(self, content: bytes, url: str, status: int) -> Any:
         try:
@@ -230,10 +254,10 @@ def _waits(retries: int) -> Iterator[float | None]:
     yield None
 
 
-def _retry_after_s(headers: Mapping[str, str]) -> float | None:
+def _retry_after_s(headers: Sequence[tuple[bytes, bytes]]) -> float | None:
     """Return Retry-After in seconds; None when absent or a date, which no server of ours sends."""
     try:
-        seconds = float(headers.get("retry-after", ""))
+        seconds = float(next((value for name, value in headers if name.lower() == b"retry-after"), b""))
     except ValueError:
         return None
     return seconds if seconds >= 0 else None  # also refuses NaN
@@ -248,6 +272,46 @@ def error_of_status(status: int) -> type[RlservoError]:
     if status == 413:
         return TooLargeError
     return UnavailableError if status >= 500 or status < 400 else RequestError
+
+
+def _connection_pool(url: str, backend: DeadlineBackend) -> httpcore.ConnectionPool:
+    """Return the connections to a server, through the proxy that the environment asks for."""
+    # Reading the certificates takes 20 ms; http has no use for them.
+    certificates = _certificates() if url.startswith("https") else None
+    proxy = _proxy_of(url)
+    if proxy is None:
+        return httpcore.ConnectionPool(
+            certificates, max_connections=100, keepalive_expiry=KEEP_S, network_backend=backend
+        )
+    parts = urlsplit(proxy)
+    user = None if parts.username is None else (unquote(parts.username), unquote(parts.password or ""))
+    address = httpcore.URL(scheme=parts.scheme.encode(), host=_host_of(parts), port=parts.port, target=b"/")
+    if parts.scheme not in PROXIES:
+        raise UsageError(
+            f"a proxy of the environment begins with {parts.scheme!r}: expected for example 'http://proxy:3128'"
+        )
+    return PROXIES[parts.scheme](
+        address, user, ssl_context=certificates, max_connections=100, keepalive_expiry=KEEP_S, network_backend=backend
+    )
+
+
+def _certificates() -> ssl.SSLContext:
+    """Return what servers are checked against: what SSL_CERT_FILE or SSL_CERT_DIR says, else certifi's."""
+    file, folder = os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR")
+    if file or folder:
+        return ssl.create_default_context(cafile=file or None, capath=None if file else folder)
+    return httpcore.default_ssl_context()
+
+
+def _host_of(parts: SplitResult) -> bytes:
+    """Return a host as the wire has it."""
+    return (parts.hostname or "").encode("idna")
+
+
+def _host_header(parts: SplitResult) -> bytes:
+    host = _host_of(parts)
+    host = b"[%s]" % host if b":" in host else host
+    return host if parts.port is None else b"%s:%d" % (host, parts.port)
 
 
 def _proxy_of(url: str) -> str | None:
@@ -267,6 +331,7 @@ def _checked_url(url: str) -> str:
     parts = urlsplit(url)
     try:
         port_is_one = parts.port != 0
+        _host_of(parts)  # UnicodeError, a ValueError: a name that no wire can carry
     except ValueError:
         port_is_one = False
     if parts.scheme not in ("http", "https") or not parts.hostname or not port_is_one:

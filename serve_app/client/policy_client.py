@@ -1,8 +1,8 @@
 """`PolicyClient`: a policy on a server, used over HTTP like one in process.
 
-It needs numpy, pydantic and httpx. A robot's loop gets an action that belongs to the observation it just sent, in time,
-or an error: every request carries a running number `seq`, and an answer with another number, a late one or a malformed
-one is never used.
+It needs numpy, pydantic and httpcore. A robot's loop gets an action that belongs to the observation it just sent, in
+time, or an error: every request carries a running number `seq`, and an answer with another number, a late one or a
+malformed one is never used.
 """
 
 from __future__ import annotations

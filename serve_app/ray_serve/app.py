@@ -8,7 +8,6 @@ serve` comes here through `cluster_process.py`. A replica imports neither torch 
 # No `from __future__ import annotations` here: Serve reads the type of build's argument to know what to make of `args`.
 
 import asyncio
-import inspect
 import logging
 from functools import partial
 from pathlib import Path
@@ -20,12 +19,11 @@ from ray import serve
 from ray.exceptions import ActorDiedError, RayError
 from ray.serve import Application, Deployment
 from ray.serve.config import HTTPOptions, gRPCOptions
-from ray.serve.context import _get_global_client
 
 from rlservo.export.contract.errors import PartlyAppliedError, RlservoError
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.oip_grpc import InferenceService
-from rlservo.serve_app.ray_serve import ingress
+from rlservo.serve_app.ray_serve import ingress, ray_parts
 from rlservo.serve_app.ray_serve.autoscaling import BUSY, Load
 from rlservo.serve_app.ray_serve.gcs_ledger import GcsLedger
 from rlservo.serve_app.server import listing
@@ -47,10 +45,6 @@ DEPLOYMENT = "PolicyServer"
 SPARE = 64  # health, metrics, documentation
 GRPC_SERVICE = "rlservo.serve_app.ray_serve.grpc_ingress:add_service"
 FOLLOW_TIMEOUT_S = 45.0  # [s] for every replica to load and prove what a change brought
-# A rolling update starts the new replica before the old one stops; older Rays stop first.
-SURGE: dict[str, Any] = (
-    {"max_surge_percent": 100} if "max_surge_percent" in inspect.signature(serve.deployment).parameters else {}
-)
 
 
 class BuildArguments(BaseModel):
@@ -79,8 +73,10 @@ class BuildArguments(BaseModel):
 def build(args: BuildArguments) -> Application:
     """Return the application for `serve run`, `serve deploy` and `rlservo serve`.
 
-    Relative folders are taken from the directory this runs in, since a replica's own is another. Raises UsageError.
+    Relative folders are taken from the directory this runs in, since a replica's own is another. Raises UsageError, and
+    RuntimeError in a Ray that lacks what is used of its private parts.
     """
+    ray_parts.check()
     settings = ServerSettings.from_environment(args.settings)
     ServedConfig.read(args.served)
     # A folder may exist only on the nodes that run replicas, so it is the replica that looks.
@@ -110,7 +106,7 @@ def _serve_limit(settings: ServerSettings) -> int:
     health_check_timeout_s=2,
     graceful_shutdown_timeout_s=15,  # streams are closed with a code at its beginning, and cut at its end
     user_config={},
-    **SURGE,
+    max_surge_percent=100,  # a rolling update starts the new replica before the old one stops
 )
 @serve.ingress()
 class PolicyServer(InferenceService):
@@ -227,10 +223,6 @@ class PolicyServer(InferenceService):
     async def _call_all(self, method: str, *arguments: Any) -> list[Any]:
         """Call a method of every running replica. Raises PartlyAppliedError when one of them does not answer."""
         handle: Any = serve.get_deployment_handle(self._id.name, self._id.app_name)
-        if not hasattr(type(handle), "broadcast"):  # Ray before 2.60; the handle itself has every attribute
-            raise PartlyAppliedError(
-                f"Ray {ray.__version__} cannot ask every replica at once: the others follow within a few seconds"
-            )
         try:
             replies = await handle.broadcast(method, *arguments).results_async(
                 timeout_s=FOLLOW_TIMEOUT_S, return_exceptions=True
@@ -253,22 +245,18 @@ def _plain(error: RlservoError) -> RuntimeError:
 
 
 def _controller() -> Any:
-    """Return Serve's controller, which knows more than Serve's interface tells (ray 2.60): hence the private client."""
-    client: Any = _get_global_client()
-    return client._controller
+    """Return Serve's controller, which knows more than Serve's interface tells (ray 2.60)."""
+    return ray_parts.find("ray.serve.context:_get_global_client")()._controller
 
 
 def _can_be_left_out() -> bool:
-    """Whether Serve's handling of a request can be: a replica that stops then waits for its HTTP server (ray 2.60).
+    """Whether Serve's handling of a request can be: where Serve traces, it is to see every request.
 
-    Older ones wait only for the requests that Serve has counted. Where Serve traces, it is to see every request.
+    A replica that stops then waits for its HTTP server alone, as ray 2.60's does; one that does not is asked.
     """
-    try:
-        from ray.serve._private.replica import Replica
-        from ray.serve._private.tracing_utils import is_tracing_enabled
-    except ImportError:  # another Ray, which has moved its private names
+    if not ray_parts.is_there("ray.serve._private.replica:Replica._stop_accepting_direct_ingress"):
         return False
-    return hasattr(Replica, "_stop_accepting_direct_ingress") and not is_tracing_enabled()
+    return not ray_parts.find("ray.serve._private.tracing_utils:is_tracing_enabled")()
 
 
 def _alone() -> bool:

@@ -16,6 +16,7 @@ import grpc
 from starlette.types import Scope
 
 from rlservo.serve_app.ray_serve.haproxy_wrapper import CHECK_HEADER, CHECK_SECRET
+from rlservo.serve_app.ray_serve.ray_parts import find
 
 ROUTES, HEALTH = "/-/routes", "/-/healthz"
 GRPC_SERVICE = "/ray.serve."
@@ -32,12 +33,7 @@ def is_closed(scope: Scope) -> bool:
 
 def install() -> None:
     """Close the methods of gRPC servers that this process starts. Raises RuntimeError where Ray's names have moved."""
-    import ray
-    from ray.serve._private.grpc_util import gRPCGenericServer
-
-    override: Any = getattr(gRPCGenericServer, "_override_method_handler", None)
-    if override is None:
-        raise RuntimeError(f"Ray {ray.__version__} answers its gRPC methods in another way than 2.60 does")
+    override = find("ray.serve._private.grpc_util:gRPCGenericServer._override_method_handler")
     if getattr(override, "closes", False):
         return
 
@@ -48,7 +44,7 @@ def install() -> None:
         return handler._replace(unary_unary=_closed(service_method, handler.unary_unary))
 
     override_method_handler.closes = True  # type: ignore[attr-defined]
-    gRPCGenericServer._override_method_handler = override_method_handler  # type: ignore[assignment, method-assign]
+    find("ray.serve._private.grpc_util:gRPCGenericServer")._override_method_handler = override_method_handler
 
 
 def _closed(service_method: str, answer: Any) -> Any:

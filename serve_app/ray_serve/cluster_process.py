@@ -7,7 +7,6 @@ everything down when its standard input ends: because the launcher closed it, or
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import json
 import os
@@ -20,6 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from rlservo.serve_app.ray_serve import ray_parts
 from rlservo.serve_app.ray_serve.processes import SERVER_LOG, cut_log, describe_end, end_marked, remove_folder
 from rlservo.serve_app.server.admin_key import remove_key
 
@@ -36,12 +36,13 @@ def main() -> int:
     stop = threading.Event()
     started = threading.Event()
     threading.Thread(target=_watch_input, args=(stop, started, plan), daemon=True).start()
-    import ray
-
-    from rlservo.serve_app.ray_serve import app
-
-    _leave_out_extras()
     try:
+        ray_parts.check()
+        import ray
+
+        from rlservo.serve_app.ray_serve import app
+
+        _leave_out_extras()
         ray.init(
             address="local",  # whatever RAY_ADDRESS or a running cluster says
             num_cpus=max(1, plan["replicas"]),
@@ -88,26 +89,19 @@ def _leave_out_extras() -> None:
 
     The autoscaler's monitor and the log forwarder are 165 MB and a second; `ray start` has flags for both, `ray.init`
     none. Without a dashboard its process starts all the same, to send usage statistics that are off, and `ray.init`
-    waits until it is up. Where these private names have moved, everything starts.
+    waits until it is up. Where these private names have moved (`ray_parts.SPARED`), everything starts.
 
     The dashboard's agent is 80 MB, opens a port to every interface, which three half-open connections block, and logs
     a traceback a second about the dashboard that is not there. The raylet insists on a process, so it gets one that
     does nothing. Raises RuntimeError where Ray starts it in another way.
     """
-    import ray
-    from ray._private import parameter, services
-
-    with contextlib.suppress(AttributeError):
-        parameter.RayParams = functools.partial(  # type: ignore[misc, assignment]
-            parameter.RayParams,
-            no_monitor=True,
-            include_log_monitor=False,  # type: ignore[arg-type]
-        )
-    if hasattr(services, "start_api_server"):
+    if ray_parts.is_there("ray._private.parameter:RayParams"):
+        parameter = ray_parts.find("ray._private.parameter")
+        parameter.RayParams = functools.partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
+    services = ray_parts.find("ray._private.services")
+    if ray_parts.is_there("ray._private.services:start_api_server"):
         services.start_api_server = _no_api_server
-    start: Any = getattr(services, "start_ray_process", None)
-    if start is None:
-        raise RuntimeError(f"Ray {ray.__version__} starts its processes in another way than 2.60 does")
+    start: Any = services.start_ray_process
 
     def start_ray_process(command: list[str], process_type: str, *arguments: Any, **more: Any) -> Any:
         if process_type == "raylet":
@@ -141,9 +135,7 @@ def _ray_ended() -> str | None:
 
     Ray (2.60) leaves the driver of a cluster whose raylet is gone waiting for ever.
     """
-    from ray._private import worker
-
-    node: Any = worker._global_node
+    node: Any = ray_parts.find("ray._private.worker:_global_node")
     for name, process in [] if node is None else node.dead_processes():
         return f"its process '{name}' {describe_end(process.poll())}"
     return None

@@ -20,7 +20,7 @@ def ray_environment(
 ) -> dict[str, str]:
     """Return the environment of the cluster: this process's, without its Ray settings, with ours.
 
-    The variables are ray 2.60's (ray/serve/_private/constants.py).
+    The variables are ray 2.60's (ray/serve/_private/constants.py); `test_ray_variables.py` asks the installed one.
     """
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
     fallback_http, fallback_grpc, stats, metrics = free_ports(4)

@@ -6,10 +6,15 @@ number fails when the number is taken, which is all the agreement between replic
 
 from __future__ import annotations
 
-from ray.experimental.internal_kv import _internal_kv_del, _internal_kv_get, _internal_kv_list, _internal_kv_put
+from rlservo.serve_app.ray_serve.ray_parts import KEY_VALUE_STORE, find
 
 NAMESPACE = "rlservo"
 KEPT = 50  # plans; the newest alone is read
+
+# Ray has no public interface to the store.
+_internal_kv_get, _internal_kv_put, _internal_kv_list, _internal_kv_del = (
+    find(f"{KEY_VALUE_STORE}:_internal_kv_{verb}") for verb in ("get", "put", "list", "del")
+)
 
 
 class GcsLedger:

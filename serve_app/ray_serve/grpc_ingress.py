@@ -37,6 +37,10 @@ def add_service(_servicer: Any, server: Any) -> None:
     service: Any = grpc.method_handlers_generic_handler(SERVICE, handlers)
     server.add_generic_rpc_handlers((service,))
     # Serve has put its own functions in by now, and does not tell them the caller's deadline (ray 2.60).
+    if not hasattr(service, "_method_handlers"):
+        raise RuntimeError(
+            f"grpcio {grpc.__version__} keeps a service's methods in another way than 1.85 does: install such a one"
+        )
     for path, handler in service._method_handlers.items():
         if not handler.request_streaming:
             service._method_handlers[path] = handler._replace(unary_unary=_with_deadline(handler.unary_unary))

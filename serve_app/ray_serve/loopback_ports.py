@@ -11,9 +11,13 @@ Serve calls `ingress.middlewares` in each process before it binds anything, and 
 
 from __future__ import annotations
 
+import importlib
 import os
 import socket
+from collections.abc import Callable
 from typing import Any
+
+from rlservo.serve_app.ray_serve.ray_parts import KNOWN, find
 
 VARIABLE = "RLSERVO_BIND_LOOPBACK"
 ALL = "1"
@@ -29,24 +33,21 @@ def is_wanted() -> bool:
 
 def install() -> None:
     """Bind to loopback what this process opens from now on. Raises RuntimeError where Ray's names have moved."""
-    import ray
-    from ray.serve._private import default_impl, http_util, replica
-    from ray.serve._private.constants import RAY_SERVE_ENABLE_HA_PROXY
+    # A second time changes nothing. Serve pickles its proxy's class with the functions it calls, hence the names that
+    # those look up.
+    if os.environ[VARIABLE] == ALL:
+        _replace("ray.serve._private.default_impl:add_grpc_address", _on_loopback)
+    # Without HAProxy Serve's own proxy is the public one, and replicas have no port.
+    if find("ray.serve._private.constants:RAY_SERVE_ENABLE_HA_PROXY"):
+        _replace("ray.serve._private.http_util:socket", _sockets)
+    _replace("ray.serve._private.replica:add_port_to_grpc_server", _on_loopback)
 
-    http: Any = http_util  # what they import they do not export
-    own: Any = replica
-    try:
-        # A second time changes nothing. Serve pickles its proxy's class with the functions it calls, hence the names
-        # that those look up.
-        if os.environ[VARIABLE] == ALL:
-            default_impl.add_grpc_address = _on_loopback(default_impl.add_grpc_address)
-        if RAY_SERVE_ENABLE_HA_PROXY:  # otherwise Serve's own proxy is the public one, and replicas have no port
-            if http.socket not in (socket, SOCKETS):
-                raise AttributeError("its HTTP server has no module 'socket'")
-            http.socket = SOCKETS
-        own.add_port_to_grpc_server = _on_loopback(own.add_port_to_grpc_server)
-    except AttributeError as error:
-        raise RuntimeError(f"Ray {ray.__version__} binds its ports in another way than 2.60 does: {error}") from error
+
+def _replace(name: str, wrap: Callable[[Any], Any]) -> None:
+    """Put a wrapper in the place of what a module of Ray's looks up by a name."""
+    module, _, attribute = name.partition(":")
+    own = find(name)
+    setattr(importlib.import_module(module), attribute, wrap(own))
 
 
 def _on_loopback(add: Any) -> Any:
@@ -76,3 +77,12 @@ class _Sockets:
 
 
 SOCKETS = _Sockets()
+
+
+def _sockets(module: Any) -> _Sockets:
+    """Return what stands in for the module `socket` in Serve's HTTP server."""
+    if module not in (socket, SOCKETS):
+        import ray
+
+        raise RuntimeError(f"Ray {ray.__version__} opens its HTTP ports in another way than {KNOWN} does")
+    return SOCKETS

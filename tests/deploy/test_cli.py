@@ -195,8 +195,8 @@ def test_serve_refuses_a_default_policy_that_is_not_served(policies: Path) -> No
     assert "starting" not in done.stderr
 
 
-HEAVY = {"asyncio", "fastapi", "grpc", "gymnasium", "httpx", "mujoco", "numpy", "onnxruntime", "ray", "rich",
-         "starlette", "torch"}  # fmt: skip
+HEAVY = {"asyncio", "fastapi", "grpc", "gymnasium", "httpcore", "httpx", "mujoco", "numpy", "onnxruntime", "ray",
+         "rich", "starlette", "torch"}  # fmt: skip
 MODULES_OF = """
 import sys
 from rlservo.deploy.cli import main

@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "robo_gym_client.py"
 POLICIES = ("ur5", "mir100", "mir100_obstacle_avoidance")  # what the client asks for
 ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")  # what the fixture robo_gym_python installs
-CLIENT = ("httpx>=0.27", "pydantic>=2.6")
+CLIENT = ("httpcore>=1.0.6", "pydantic>=2.6")
 DOCUMENT = (ROOT / "examples" / "robo_gym.md").read_text()
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]

@@ -8,18 +8,26 @@ import json
 import queue
 import re
 import socket
-import tempfile
 import threading
 import time
+import uuid
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import grpc
+import numpy as np
 import pytest
 
+from rlservo.export.contract.errors import UnauthenticatedError
+from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.ray_serve.ingress import PROCESS
 from rlservo.serve_app.ray_serve.launcher import serve_policies
 from rlservo.serve_app.ray_serve.processes import LOG_BYTES, MARK, cut_log, free_ports
+from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -87,12 +95,11 @@ def processes_of(folder: Path) -> frozenset[int]:
 
 
 @contextlib.contextmanager
-def serving(policies: Path, *, with_grpc: bool, with_key: bool) -> Iterator[Server]:
+def serving(policies: Path, *, with_grpc: bool, with_key: bool, **settings: Any) -> Iterator[Server]:
     port, grpc_port = free_ports(2)
     key, line = new_key("tests")
     ready, stop = threading.Event(), threading.Event()
     failures: list[BaseException] = []
-    before = _folders()
 
     def serve() -> None:
         try:
@@ -104,6 +111,7 @@ def serving(policies: Path, *, with_grpc: bool, with_key: bool) -> Iterator[Serv
                     "stream_idle_s": IDLE_S,
                     "max_connections_per_address": 300,
                     **({"api_keys": line} if with_key else {}),
+                    **settings,
                 },
                 on_ready=lambda _: ready.set(),
                 stop=stop,
@@ -116,7 +124,7 @@ def serving(policies: Path, *, with_grpc: bool, with_key: bool) -> Iterator[Serv
     try:
         while not ready.wait(0.1):
             assert thread.is_alive(), failures
-        (folder,) = [made for made in _folders() - before if _is_of(made, port)]
+        folder = _folder_of(port)
         yield Server(port, grpc_port if with_grpc else None, folder, key, processes_of(folder))
     finally:
         stop.set()
@@ -124,18 +132,16 @@ def serving(policies: Path, *, with_grpc: bool, with_key: bool) -> Iterator[Serv
     assert failures == []
 
 
-def _folders() -> set[Path]:
-    return {folder for parent in {tempfile.gettempdir(), "/tmp"} for folder in Path(parent).glob("rlservo-*")}
-
-
-def _is_of(folder: Path, port: int) -> bool:
-    """Whether the cluster's process, whose plan is in its command line, has this folder and port."""
-    for command in Path("/proc").glob("[0-9]*/cmdline"):
+def _folder_of(port: int) -> Path:
+    """Return the folder of the server on a port, as its cluster's process was told."""
+    for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError):
-            content = command.read_text(errors="replace")
-            if str(folder) in content and f'"port": {port},' in content:
-                return True
-    return False
+            words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdigit() else []
+            if b"rlservo.serve_app.ray_serve.cluster_process" in words:
+                plan = json.loads(words[words.index(b"rlservo.serve_app.ray_serve.cluster_process") + 1])
+                if plan["port"] == port:
+                    return Path(plan["folder"])
+    raise AssertionError(f"no server runs on port {port}")
 
 
 @pytest.fixture(scope="module")
@@ -355,11 +361,60 @@ def test_a_log_is_cut_to_its_last_lines(tmp_path: Path) -> None:
     assert lines[0].startswith("line ")
 
 
-def test_without_a_grpc_port_nobody_speaks_grpc(policies: Path) -> None:
-    with serving(policies, with_grpc=False, with_key=False) as server:
-        for port in {port for _, port in server.listeners()}:
-            with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
-                for method in ("inference.GRPCInferenceService/ServerLive", "ray.serve.RayServeAPIService/Healthz"):
-                    with pytest.raises(grpc.RpcError) as raised:
-                        channel.unary_unary(f"/{method}")(b"", timeout=3)
-                    assert raised.value.code() is not grpc.StatusCode.OK
+@pytest.fixture(scope="module")
+def after_serve(policies: Path) -> Iterator[Server]:
+    """A server whose requests pass through Ray Serve's own handling, and that has no gRPC port."""
+    with serving(
+        policies, with_grpc=False, with_key=True, ahead_of_serve=False, default_policy="ur5", max_ongoing_requests=1
+    ) as made:
+        yield made
+
+
+def test_without_a_grpc_port_nobody_speaks_grpc(after_serve: Server) -> None:
+    for port in {port for _, port in after_serve.listeners()}:
+        with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+            for method in ("inference.GRPCInferenceService/ServerLive", "ray.serve.RayServeAPIService/Healthz"):
+                with pytest.raises(grpc.RpcError) as raised:
+                    channel.unary_unary(f"/{method}")(b"", timeout=3)
+                assert raised.value.code() is not grpc.StatusCode.OK
+
+
+def test_after_serves_own_handling_actions_and_streams_are_the_policys_own(after_serve: Server, ur5: Path) -> None:
+    url, policy = f"http://127.0.0.1:{after_serve.port}", Policy.load(ur5)
+    observations = np.random.default_rng(5).uniform(-0.5, 0.5, (20, 27)).astype(np.float32)
+    with PolicyClient(url, "ur5", api_key=after_serve.key, timeout_s=20) as client:
+        for obs in observations:
+            np.testing.assert_array_equal(client.act(obs), policy.act(obs))
+    with StreamClient(url, "ur5", api_key=after_serve.key, deadline_ms=20_000) as client:
+        for obs in observations:
+            np.testing.assert_array_equal(client.act(obs), policy.act(obs))
+
+
+def test_after_serves_own_handling_it_is_serve_that_numbers_requests(after_serve: Server) -> None:
+    """The setting does what it says: Serve's ids are UUIDs, those of requests that go ahead of it are ours."""
+    with pytest.raises(ValueError):
+        uuid.UUID(f"{PROCESS.decode()}-1")
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", after_serve.port, timeout=20)) as connection:
+        headers = {"content-type": "application/json", "authorization": f"Bearer {after_serve.key}"}
+        connection.request("POST", "/v1/policies/ur5/act", BODY, headers)
+        assert uuid.UUID(connection.getresponse().headers["x-request-id"])
+
+
+def test_after_serves_own_handling_keys_are_asked_for(after_serve: Server) -> None:
+    assert act(after_serve.port, "") == act(after_serve.port, f"{after_serve.key}x") == 401
+    with (
+        pytest.raises(UnauthenticatedError, match="key"),
+        StreamClient(f"http://127.0.0.1:{after_serve.port}", "ur5", deadline_ms=20_000) as client,
+    ):
+        client.act(np.zeros(27, np.float32))
+
+
+def test_after_serves_own_handling_what_is_too_much_gets_503(after_serve: Server) -> None:
+    """At most one request at a time is taken on: of those that arrive in one turn of the loop the others are not."""
+    seen: set[int] = set()
+    deadline = time.monotonic() + 60
+    with ThreadPoolExecutor(16) as threads:
+        while not {200, 503} <= seen and time.monotonic() < deadline:
+            seen |= set(threads.map(lambda _: act(after_serve.port, after_serve.key), range(64)))
+    assert seen == {200, 503}
+    assert act(after_serve.port, after_serve.key) == 200

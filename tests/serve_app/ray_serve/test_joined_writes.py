@@ -70,11 +70,11 @@ async def streams(scope: Scope, receive: Receive, send: Send) -> None:
     await StreamingResponse(parts())(scope, receive, send)
 
 
-def exchange(protocol: Any, app: Any, *pieces: bytes) -> Recorder:
+def exchange(protocol: Any, app: Any, *pieces: bytes, before: Any = Ingress) -> Recorder:
     """Feed a request, piece by piece, to a connection; return what it wrote."""
 
     async def run() -> Recorder:
-        config = uvicorn.Config(Ingress(app), lifespan="off", log_level="critical", access_log=False)
+        config = uvicorn.Config(before(app), lifespan="off", log_level="critical", access_log=False)
         config.load()
         state = ServerState()
         connection = protocol(config=config, server_state=state, app_state={})
@@ -102,6 +102,25 @@ def test_a_reply_to_post_is_one_write(protocol: Any) -> None:
     writes = exchange(protocol, echo, post(b"hello")).writes
     assert b"".join(writes).startswith(b"HTTP/1.1 200") and b"".join(writes).endswith(b"\r\n\r\nhello")
     assert len([write for write in writes if write]) == 1
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_where_a_request_has_no_transport_replies_are_written_as_before(protocol: Any) -> None:
+    """Another uvicorn: what sends is no method of an object that has a transport."""
+
+    def as_it_is(app: Any) -> Any:
+        return app
+
+    async def of_another_uvicorn(scope: Scope, receive: Receive, send: Send) -> None:
+        async def send_message(message: Any) -> None:
+            await send(message)
+
+        await Ingress(echo)(scope, receive, send_message)
+
+    writes = [
+        write for write in exchange(protocol, of_another_uvicorn, post(b"hello"), before=as_it_is).writes if write
+    ]
+    assert len(writes) == 2 and b"".join(writes).endswith(b"\r\n\r\nhello")
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -267,7 +267,7 @@ def test_a_closed_policy_does_not_act(ur5: Path) -> None:
 
 
 def test_the_runtime_imports_no_framework() -> None:
-    heavy = ["torch", "ray", "gymnasium", "fastapi", "starlette", "uvicorn", "mujoco", "onnx", "httpx"]
+    heavy = ["torch", "ray", "gymnasium", "fastapi", "starlette", "uvicorn", "mujoco", "onnx", "httpcore", "httpx"]
     code = f"import sys, rlservo.serve_app.runtime.policy; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
