@@ -17,8 +17,7 @@ from typing import IO, Any
 
 import rlservo
 from rlservo.export.contract.errors import UnavailableError, UsageError
-from rlservo.serve_app.ray_serve.environment import CLUSTER, HAPROXY_BINARY, PROXY_SETTINGS
-from rlservo.serve_app.server.settings import PREFIX
+from rlservo.serve_app.ray_serve.environment import CLUSTER, HAPROXY_BINARY
 
 SAY_S = 5.0  # between words about what is waited for
 LONGEST_S = 90.0  # without a report: a step's own bounds are shorter
@@ -55,7 +54,6 @@ def check_cluster(
         "address": address,
         "variables": {name: value for name, value in CLUSTER.items() if name not in own},
         "any_value": [HAPROXY_BINARY, *own],
-        "settings": [PREFIX + name.upper() for name in PROXY_SETTINGS],
         "versions": {
             "Python": "{}.{}".format(*sys.version_info),
             "Ray": metadata.version("ray"),

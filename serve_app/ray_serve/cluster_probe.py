@@ -26,6 +26,9 @@ AGAIN = 'run eval "$(rlservo cluster env)" there, then ray stop and ray start'
 Line = tuple[str, str | None, str]
 """(Which check, the problem or None, what was found)."""
 
+Looks = list[tuple[str, dict[str, Any] | str]]
+"""(A node's address, what `look` found there, or why it did not)."""
+
 
 def main() -> None:
     plan: dict[str, Any] = json.loads(sys.argv[1])
@@ -62,8 +65,9 @@ def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Line]:
     wait(f"a task on each node ({addresses})")
     applications = [each for each in serve.get("applications", {}).values() if _is_ours(each)]
     folders = plan["policies"] or [folder for each in applications for folder in _folders(each)]
-    looks = _look_at(nodes, [*plan["variables"], *plan["any_value"], *plan["settings"]], folders)
-    yield from _nodes(looks, plan, _settings(applications))
+    settings = _settings(applications)
+    looks = _look_at(nodes, [*plan["variables"], *plan["any_value"], *settings], folders)
+    yield from _nodes(looks, plan, settings)
     yield from _policies(looks, folders)
     if problem is not None:
         yield "serve", problem, ""
@@ -111,7 +115,7 @@ def _reach(address: str) -> None:
             pass
 
 
-def _look_at(nodes: list[dict[str, Any]], names: list[str], folders: list[str]) -> dict[str, dict[str, Any] | str]:
+def _look_at(nodes: list[dict[str, Any]], names: list[str], folders: list[str]) -> Looks:
     """Return by node's address what a task there found, or why there is none."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
@@ -119,41 +123,42 @@ def _look_at(nodes: list[dict[str, Any]], names: list[str], folders: list[str]) 
     from rlservo.serve_app.ray_serve.environment import HAPROXY_BINARY
 
     task: Any = ray.remote(num_cpus=0, max_retries=0)(look)
-    tasks = {
-        node["NodeManagerAddress"]: task.options(
-            scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-        ).remote(names, folders, HAPROXY_BINARY)
+    tasks = [
+        task.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)).remote(
+            names, folders, HAPROXY_BINARY
+        )
         for node in nodes
-    }
-    ready, _ = ray.wait(list(tasks.values()), num_returns=len(tasks), timeout=NODE_S)
-    looks: dict[str, dict[str, Any] | str] = {}
-    for address, reference in tasks.items():
+    ]
+    ready, _ = ray.wait(tasks, num_returns=len(tasks), timeout=NODE_S)
+    looks: Looks = []
+    for node, reference in zip(nodes, tasks, strict=True):
+        found: dict[str, Any] | str = f"no task ran there within {NODE_S:g} s"
         try:
-            looks[address] = ray.get(reference) if reference in ready else f"no task ran there within {NODE_S:g} s"
+            found = ray.get(reference) if reference in ready else found
         except Exception as error:
-            looks[address] = _sentence(error)
+            found = _sentence(error)
+        looks.append((node["NodeManagerAddress"], found))
     return looks
 
 
-def _nodes(looks: dict[str, dict[str, Any] | str], plan: dict[str, Any], settings: dict[str, str]) -> Iterator[Line]:
-    for address, look in looks.items():
+def _nodes(looks: Looks, plan: dict[str, Any], settings: dict[str, float]) -> Iterator[Line]:
+    for address, look in looks:
         if isinstance(look, str):
             yield "node", f"{address}: {look}", ""
             continue
         variables = look["variables"]
         wrong = [
-            f"{name} is {variables.get(name, 'not set')!r}, not {value!r}"
+            f"{name} is {variables[name]!r}, not {value!r}" if name in variables else f"{name} is not set"
             for name, value in plan["variables"].items()
             if variables.get(name) != value
         ]
         wrong += [f"{name} is not set" for name in plan["any_value"] if name not in variables]
-        wrong += [
-            f"{name} is {variables.get(name, 'not set')!r}, but the application's setting is {value!r}"
-            for name, value in settings.items()
-            if variables.get(name) != value
-        ]
         count = len(plan["variables"]) + len(plan["any_value"])
         yield "variables", f"{address}: {'; '.join(wrong)}: {AGAIN}" if wrong else None, f"{address} has all {count}"
+        for name, value in settings.items():
+            if float(variables.get(name, "nan")) != value:
+                said = f"{name} is {variables.get(name, 'not set')!r}, but the application's setting is {value:g}"
+                yield "settings", f"{address}: {said}: HAProxy goes by the first; give it to rlservo cluster env", ""
         other = [f"{name} {version}" for name, version in look["versions"].items() if version != plan["versions"][name]]
         mine = ", ".join(f"{name} {version}" for name, version in plan["versions"].items())
         yield (
@@ -165,10 +170,10 @@ def _nodes(looks: dict[str, dict[str, Any] | str], plan: dict[str, Any], setting
         yield "haproxy", haproxy and f"{address}: {haproxy}: {AGAIN}", f"{address} has HAProxy's wrapper"
 
 
-def _policies(looks: dict[str, dict[str, Any] | str], folders: list[str]) -> Iterator[Line]:
+def _policies(looks: Looks, folders: list[str]) -> Iterator[Line]:
     if not folders:
         return
-    for address, look in looks.items():
+    for address, look in looks:
         if not isinstance(look, str):
             missing = ", ".join(look["missing"])
             problem = f"{address}: {missing} is not there: replicas cannot start on this node" if missing else None
@@ -248,13 +253,13 @@ def _folders(application: dict[str, Any]) -> list[str]:
     return policies.split(",") if isinstance(policies, str) else [str(policy) for policy in policies]
 
 
-def _settings(applications: Iterable[dict[str, Any]]) -> dict[str, str]:
+def _settings(applications: Iterable[dict[str, Any]]) -> dict[str, float]:
     """Return what the applications' settings say that HAProxy has to know, by the variable's name."""
     from rlservo.serve_app.ray_serve.environment import PROXY_SETTINGS
     from rlservo.serve_app.server.settings import PREFIX
 
     return {
-        PREFIX + name.upper(): str(value)
+        PREFIX + name.upper(): float(value)
         for application in applications
         for name, value in (_arguments(application).get("settings") or {}).items()
         if name in PROXY_SETTINGS
