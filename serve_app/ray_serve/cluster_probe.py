@@ -53,7 +53,14 @@ def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Line]:
     address = plan["address"] or os.environ.get("RAY_ADDRESS") or "auto"
     wait(f"the cluster at {address}")
     _reach(address)
-    context: Any = ray.init(address=address, log_to_driver=False, configure_logging=False)
+    try:
+        context: Any = ray.init(address=address, log_to_driver=False, configure_logging=False)
+    except ConnectionError as error:
+        if address == "auto":
+            raise
+        # Somebody listens there; Ray says no more than that it failed, of a wrong token, too.
+        hint = "is it a head node, and is the token here the cluster's (RAY_AUTH_MODE, ~/.ray/auth_token)?"
+        raise ConnectionError(f"{_sentence(error)}: {hint}") from None
     nodes = [node for node in ray.nodes() if node["Alive"]]
     addresses = ", ".join(node["NodeManagerAddress"] for node in nodes)
     yield "cluster", None, f"{context.address_info['gcs_address']} answers; alive: {addresses}"

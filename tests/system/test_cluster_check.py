@@ -174,4 +174,4 @@ def test_a_wrong_token_is_one_sentence(cluster: Cluster) -> None:
     )
     assert done.returncode == 1 and done.stdout == "", done.stdout
     sentences = [line for line in done.stderr.splitlines() if not line.startswith("waiting for")]
-    assert len(sentences) == 1 and "oken" in sentences[0], done.stderr
+    assert len(sentences) == 1 and "is the token here the cluster's" in sentences[0], done.stderr

@@ -22,7 +22,7 @@ def answering(status: int) -> Iterator[int]:
             self.send_response(status if self.path == "/v1/policies" else 500)
             self.end_headers()
 
-        def log_message(self, *_: Any) -> None: ...
+        def log_message(self, format: str, *args: Any) -> None: ...
 
     with HTTPServer(("127.0.0.1", 0), Handler) as server:
         thread = threading.Thread(target=server.serve_forever)
