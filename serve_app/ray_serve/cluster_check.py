@@ -63,13 +63,14 @@ def check_cluster(
     }
     command = [sys.executable, "-m", "rlservo.serve_app.ray_serve.cluster_probe", json.dumps(plan)]
     with tempfile.TemporaryFile("w+") as log:
-        child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True)
+        child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True)
+        assert child.stdin is not None and child.stdout is not None
         try:
-            assert child.stdout is not None
             yield from _reports(child.stdout, log, on_wait)
         finally:
             child.kill()
-            child.communicate()
+            child.wait()
+            child.stdin.close()
 
 
 def read_policies(configuration: Path) -> list[str]:
@@ -87,8 +88,9 @@ def _reports(stdout: IO[str], log: IO[str], on_wait: Callable[[str], None]) -> I
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     def read() -> None:
-        for line in stdout:
-            lines.put(line)
+        with stdout:
+            for line in stdout:
+                lines.put(line)
         lines.put("")
 
     threading.Thread(target=read, daemon=True).start()

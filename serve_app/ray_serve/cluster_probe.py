@@ -11,6 +11,7 @@ import os
 import shlex
 import socket
 import sys
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterable, Iterator
@@ -32,6 +33,7 @@ Looks = list[tuple[str, dict[str, Any] | str]]
 
 def main() -> None:
     plan: dict[str, Any] = json.loads(sys.argv[1])
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     reports = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what Ray prints
 
@@ -51,7 +53,7 @@ def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Line]:
     import ray
 
     address = plan["address"] or os.environ.get("RAY_ADDRESS") or "auto"
-    wait(f"the cluster at {address}")
+    wait("this machine's cluster" if address == "auto" else f"the cluster at {address}")
     _reach(address)
     try:
         context: Any = ray.init(address=address, log_to_driver=False, configure_logging=False)
@@ -72,16 +74,16 @@ def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Line]:
     wait(f"a task on each node ({addresses})")
     applications = [each for each in serve.get("applications", {}).values() if _is_ours(each)]
     folders = plan["policies"] or [folder for each in applications for folder in _folders(each)]
-    settings = _settings(applications)
+    settings = proxy_settings(applications)
     looks = _look_at(nodes, [*plan["variables"], *plan["any_value"], *settings], folders)
-    yield from _nodes(looks, plan, settings)
+    yield from check_nodes(looks, plan, settings)
     yield from _policies(looks, folders)
     if problem is not None:
         yield "serve", problem, ""
         return
     yield from _health(serve)
     wait("an answer of the policy server")
-    yield from _exposure(serve, applications)
+    yield from check_keys(serve, applications)
 
 
 def look(names: list[str], folders: list[str], haproxy: str) -> dict[str, Any]:
@@ -148,7 +150,7 @@ def _look_at(nodes: list[dict[str, Any]], names: list[str], folders: list[str]) 
     return looks
 
 
-def _nodes(looks: Looks, plan: dict[str, Any], settings: dict[str, float]) -> Iterator[Line]:
+def check_nodes(looks: Looks, plan: dict[str, Any], settings: dict[str, float]) -> Iterator[Line]:
     for address, look in looks:
         if isinstance(look, str):
             yield "node", f"{address}: {look}", ""
@@ -219,7 +221,7 @@ def _health(serve: dict[str, Any]) -> Iterator[Line]:
         yield "application", f"{said}: {why}" if bad else None, said
 
 
-def _exposure(serve: dict[str, Any], applications: list[dict[str, Any]]) -> Iterator[Line]:
+def check_keys(serve: dict[str, Any], applications: list[dict[str, Any]]) -> Iterator[Line]:
     """Ask as anybody could who has no key."""
     options = serve.get("http_options") or {}
     host, port = str(options.get("host")), options.get("port")
@@ -260,7 +262,7 @@ def _folders(application: dict[str, Any]) -> list[str]:
     return policies.split(",") if isinstance(policies, str) else [str(policy) for policy in policies]
 
 
-def _settings(applications: Iterable[dict[str, Any]]) -> dict[str, float]:
+def proxy_settings(applications: Iterable[dict[str, Any]]) -> dict[str, float]:
     """Return what the applications' settings say that HAProxy has to know, by the variable's name."""
     from rlservo.serve_app.ray_serve.environment import PROXY_SETTINGS
     from rlservo.serve_app.server.settings import PREFIX
@@ -271,6 +273,13 @@ def _settings(applications: Iterable[dict[str, Any]]) -> dict[str, float]:
         for name, value in (_arguments(application).get("settings") or {}).items()
         if name in PROXY_SETTINGS
     }
+
+
+def _end_with_parent() -> None:
+    """End when standard input does: the command is no more, whatever ended it."""
+    while os.read(0, 4096):
+        pass
+    os._exit(1)
 
 
 def _sentence(error: Exception) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from rlservo.serve_app.ray_serve.cluster_probe import _exposure, _nodes, _settings
+from rlservo.serve_app.ray_serve.cluster_probe import check_keys, check_nodes, proxy_settings
 
 APPLICATION = {"route_prefix": "/", "deployed_app_config": {"args": {"settings": {"stream_idle_s": 60, "threads": 2}}}}
 
@@ -45,7 +45,7 @@ def answering(status: int) -> Iterator[int]:
 )
 def test_only_a_server_that_others_reach_needs_keys(host: str, status: int, problem: str | None) -> None:
     with answering(status) as port:
-        ((name, found, _),) = _exposure({"http_options": {"host": host, "port": port}}, [APPLICATION])
+        ((name, found, _),) = check_keys({"http_options": {"host": host, "port": port}}, [APPLICATION])
     assert name == "keys"
     assert found is None if problem is None else problem in str(found)
 
@@ -53,7 +53,7 @@ def test_only_a_server_that_others_reach_needs_keys(host: str, status: int, prob
 def test_a_server_that_does_not_answer_is_a_problem() -> None:
     with answering(200) as port:
         pass
-    ((_, found, _),) = _exposure({"http_options": {"host": "127.0.0.1", "port": port}}, [APPLICATION])
+    ((_, found, _),) = check_keys({"http_options": {"host": "127.0.0.1", "port": port}}, [APPLICATION])
     assert "does not answer" in str(found)
 
 
@@ -66,7 +66,7 @@ def test_settings_that_haproxy_shares_must_be_the_nodes(there: str | None, is_pr
         "haproxy": None,
     }
     plan = {"variables": {}, "any_value": [], "versions": versions}
-    lines = list(_nodes([("10.0.0.1", look)], plan, _settings([APPLICATION])))
+    lines = list(check_nodes([("10.0.0.1", look)], plan, proxy_settings([APPLICATION])))
     problems = [(name, problem) for name, problem, _ in lines if problem is not None]
     assert [name for name, _ in problems] == ["settings"] * is_problem
     assert not is_problem or "the application's setting is 60" in str(problems)
@@ -84,7 +84,7 @@ def test_a_node_with_faults_is_named_with_each_of_them() -> None:
         "versions": {"Python": "3.11", "Ray": "2.60", "rlservo": "0.1.0"},
     }
     looks: list[tuple[str, dict[str, Any] | str]] = [("10.0.0.1", look), ("10.0.0.2", "no task ran there within 60 s")]
-    problems = {name: problem for name, problem, _ in _nodes(looks, plan, {}) if problem is not None}
+    problems = {name: problem for name, problem, _ in check_nodes(looks, plan, {}) if problem is not None}
     assert "10.0.0.1: A is '2', not '1'; B is not set; C is not set: run eval" in problems["variables"]
     assert "10.0.0.1: rlservo not importable" in problems["versions"] and "here: " in problems["versions"]
     assert problems["haproxy"].startswith("10.0.0.1: /h/haproxy cannot be read")
