@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 import rlservo
-from rlservo.deploy import export_commands, policy_commands, robot_commands, serve_commands, terminal
+from rlservo.deploy import cluster_commands, export_commands, policy_commands, robot_commands, serve_commands, terminal
 from rlservo.export.contract.errors import RlservoError, UsageError
 
 app = typer.Typer(
@@ -61,6 +61,7 @@ for command in (
     app.command()(command)
 robot_commands.add_to(app)
 app.add_typer(policy_commands.policy, name="policy")
+app.add_typer(cluster_commands.cluster, name="cluster")
 
 
 if __name__ == "__main__":

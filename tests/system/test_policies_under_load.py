@@ -32,7 +32,7 @@ import yaml
 from rlservo.export.contract.errors import ConflictError, RefusedError, UnauthenticatedError
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.ray_serve import haproxy_wrapper
+from rlservo.serve_app.ray_serve.environment import cluster_environment
 from rlservo.serve_app.ray_serve.processes import MARK, end_marked, free_ports, remove_folder
 from rlservo.serve_app.server.api_keys import new_key
 
@@ -266,17 +266,8 @@ def cluster(repository: Path) -> Iterator[Cluster]:
     application["args"] = {"policies": [str(repository)], "replicas": 2, "settings": settings}
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")} | {
         MARK: mark,
-        "RAY_AUTH_MODE": "token",
+        **cluster_environment(folder),
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
-        "RAY_USAGE_STATS_ENABLED": "0",
-        "RAY_SERVE_ENABLE_HA_PROXY": "1",
-        "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",
-        "RAY_SERVE_RUN_ROUTER_IN_SEPARATE_LOOP": "0",
-        "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
-        "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
-        "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
-        "RAY_SERVE_HAPROXY_RETRIES": "20",
-        "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "rlservo.serve_app.ray_serve.ingress:middlewares",
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
@@ -284,9 +275,6 @@ def cluster(repository: Path) -> Iterator[Cluster]:
         "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "a.sock"),
         "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
         "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
-        "RAY_SERVE_HAPROXY_BINARY_PATH": str(
-            haproxy_wrapper.prepare(folder, haproxy_wrapper.find_binary() or "haproxy")
-        ),
         "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "1",
     }
     plan = json.dumps({"dashboard": dashboard, "folder": str(folder)})

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from rlservo.export.contract.errors import BundleError, UsageError
-from rlservo.serve_app.ray_serve import haproxy_wrapper
+from rlservo.serve_app.ray_serve.environment import cluster_environment
 from rlservo.serve_app.ray_serve.launcher import serve_policies
 from rlservo.serve_app.ray_serve.processes import check_port, free_ports, port_holder
 from rlservo.serve_app.runtime.policy import Policy
@@ -303,18 +303,9 @@ def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
     file.write_text(yaml.safe_dump(configuration))
     ray_folder = Path(tempfile.mkdtemp(prefix="r"))
     environment = {
-        "RAY_AUTH_MODE": "token",
+        **cluster_environment(ray_folder),
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
         "RAY_TMPDIR": str(ray_folder),
-        "RAY_SERVE_ENABLE_HA_PROXY": "1",
-        "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",
-        "RAY_SERVE_RUN_ROUTER_IN_SEPARATE_LOOP": "0",
-        "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
-        "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
-        "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "rlservo.serve_app.ray_serve.ingress:middlewares",
-        "RAY_SERVE_HAPROXY_BINARY_PATH": str(
-            haproxy_wrapper.prepare(ray_folder, haproxy_wrapper.find_binary() or "haproxy")
-        ),
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),

@@ -22,7 +22,7 @@ import pytest
 
 from rlservo.serve_app.ray_serve import environment as environment_module
 from rlservo.serve_app.ray_serve import haproxy_wrapper
-from rlservo.serve_app.ray_serve.environment import ray_environment
+from rlservo.serve_app.ray_serve.environment import cluster_environment, ray_environment
 from rlservo.serve_app.ray_serve.processes import free_ports, is_free
 from rlservo.serve_app.server.settings import ServerSettings
 
@@ -509,14 +509,20 @@ def test_a_connection_to_the_http_port_is_no_hundred_requests_of_http2(node: Nod
 
 
 def test_the_cluster_gets_the_variables_that_the_launcher_sets(tmp_path: Path) -> None:
-    """deploy/serve.yaml tells operators to export what `rlservo serve` does by itself."""
-    text = (Path(__file__).resolve().parents[3] / "deploy" / "serve.yaml").read_text()
-    comment = "".join(re.findall(r"^#(.*)$", text, re.MULTILINE))
-    told = dict(re.findall(r'(RAY_SERVE_\w+)="?((?<=")[^"]*|[^"\s]+)', comment))
+    """`rlservo cluster env` gives operators what `rlservo serve` does by itself."""
+    cluster = cluster_environment(tmp_path / "cluster")
     ours = ray_environment(tmp_path, haproxy="/bin/true", mark="test")
-    own = {"RAY_SERVE_HAPROXY_BINARY_PATH", "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S"}  # a folder; no updates
-    assert len(told) > 10
-    assert {name: ours.get(name) for name in told.keys() - own} == {name: told[name] for name in told.keys() - own}
+    own = {environment_module.HAPROXY_BINARY, environment_module.DRAINING}  # a folder; the launcher has no updates
+    assert len(cluster) > 15
+    assert {name: ours.get(name) for name in cluster.keys() - own} == {
+        name: cluster[name] for name in cluster.keys() - own
+    }
+    local = cluster_environment(tmp_path / "cluster", one_machine=True)
+    secret = haproxy_wrapper.CHECK_SECRET
+    assert {name: ours.get(name) for name in local.keys() - own - {secret}} == {
+        name: local[name] for name in local.keys() - own - {secret}
+    }
+    assert len(local[secret]) == 32
 
 
 def test_a_server_whose_replicas_ports_are_in_use_gets_others(tmp_path: Path) -> None:
