@@ -210,7 +210,7 @@ def test_an_empty_tensor_that_numpy_cannot_make_is_refused(ask: Ask, more: dict[
 
 
 def test_over_grpc_it_is_refused_too() -> None:
-    from rlservo.export.errors import RequestError
+    from rlservo.export.contract.errors import RequestError
     from rlservo.serve_app import oip_grpc
     from rlservo.serve_app import oip_messages as messages
 
