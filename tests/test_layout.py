@@ -59,7 +59,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "google.protobuf": ("envs/robot_server/", "serve_app/protocols/oip_messages.py", "serve_app/protocols/oip_grpc.py"),
     "httpx": ("serve_app/client/http_transport.py",),
     "httpcore": ("serve_app/client/deadline_backend.py",),
-    "websockets": ("serve_app/client/websocket_connection.py",),
+    "websockets": ("serve_app/client/websocket_connection.py", "serve_app/ray_serve/http_connections.py"),
     "pickle": ("export/checkpoints/unpickle.py",),
     "onnxruntime": ("export/contract/onnx_session.py", "serve_app/runtime/"),
     "asyncio": (
