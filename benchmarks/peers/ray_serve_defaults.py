@@ -1,4 +1,4 @@
-"""What one writes first with Ray Serve: a FastAPI ingress over onnxruntime, on Ray Serve's defaults.
+"""A server as one first writes it with Ray Serve: a FastAPI ingress over onnxruntime, on Ray Serve's defaults.
 
 python benchmarks/peers/ray_serve_defaults.py PORT POLICY.onnx
 """
