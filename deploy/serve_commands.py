@@ -147,6 +147,9 @@ def rollout(
     api_key: Annotated[
         str | None, typer.Option(envvar="RLSERVO_API_KEY", help="Rather in the variable: others see arguments.")
     ] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Record every decision, with rewards and ends: a new .mcap file, or a folder.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Drive an environment with a policy. Success, return, latency and deadline misses are reported.
@@ -173,6 +176,7 @@ def rollout(
             explore=explore,
             env_kwargs=parse_env_arguments(env_arg or []),
             video=video,
+            record=record,
         )
     if as_json:
         print_json(report.as_dict())

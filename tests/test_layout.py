@@ -26,8 +26,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "serve_app/interface.py": {"export/contract"},
     "serve_app/runtime": {"export/contract", "serve_app/interface.py"},
     "serve_app/wire": {"export/contract"},
-    "serve_app/client": {"export/contract", "serve_app/interface.py", "serve_app/wire"},
-    "serve_app/rollout": {"export/contract", "serve_app/interface.py"},
+    "serve_app/recording": {"export/contract", "serve_app/interface.py"},
+    "serve_app/replay": {"export/contract", "serve_app/recording", "serve_app/runtime"},
+    "serve_app/client": {"export/contract", "serve_app/interface.py", "serve_app/recording", "serve_app/wire"},
+    "serve_app/rollout": {"export/contract", "serve_app/interface.py", "serve_app/recording"},
     "serve_app/versions": {"export/contract", "serve_app/interface.py", "serve_app/runtime"},
     "serve_app/episodes": {"export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/wire"},
     "serve_app/server": {
@@ -57,6 +59,9 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "mujoco": ("envs/",),
     "grpc": ("envs/robot_server/", "serve_app/protocols/", "serve_app/ray_serve/"),
     "google.protobuf": ("envs/robot_server/", "serve_app/protocols/oip_messages.py", "serve_app/protocols/oip_grpc.py"),
+    "mcap": ("serve_app/recording/log_file.py", "serve_app/recording/reader.py"),
+    "pyarrow": ("serve_app/recording/parquet_export.py", "serve_app/recording/lerobot_export.py", "export/"),
+    "minari": ("serve_app/recording/minari_export.py",),
     "httpx": (),
     "httpcore": ("serve_app/client/deadline_backend.py", "serve_app/client/http_transport.py"),
     "websockets": ("serve_app/client/websocket_connection.py", "serve_app/ray_serve/http_connections.py"),
@@ -184,7 +189,9 @@ def reached_from(start: Path) -> set[str]:
 
 @pytest.mark.parametrize("folder", ["client", "rollout"])
 def test_client_and_rollout_reach_neither_runtime_nor_server(folder: str) -> None:
-    allowed = {f"serve_app/{folder}", "serve_app/interface.py", "serve_app/wire", "export/contract"}
+    allowed = {
+        f"serve_app/{folder}", "serve_app/interface.py", "serve_app/recording", "serve_app/wire", "export/contract",
+    }  # fmt: skip
     assert reached_from(ROOT / "serve_app" / folder) <= allowed
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from rlservo.serve_app.client.policy_client import PolicyClient
     from rlservo.serve_app.client.stream_client import StreamClient
     from rlservo.serve_app.interface import ActingPolicy
+    from rlservo.serve_app.recording.recorded_policy import WithRecording
+    from rlservo.serve_app.recording.recorder import Recorder
     from rlservo.serve_app.rollout.control_loop import rollout
     from rlservo.serve_app.rollout.fallback import WithFallback
     from rlservo.serve_app.runtime.policy import Policy
@@ -32,8 +34,10 @@ __all__ = [
     "AdminClient",
     "Policy",
     "PolicyClient",
+    "Recorder",
     "StreamClient",
     "WithFallback",
+    "WithRecording",
     "__version__",
     "errors",
     "export_checkpoint",
@@ -47,14 +51,23 @@ _MODULES = {
     "Policy": "rlservo.serve_app.runtime.policy",
     "PolicyClient": "rlservo.serve_app.client.policy_client",
     "StreamClient": "rlservo.serve_app.client.stream_client",
+    "Recorder": "rlservo.serve_app.recording.recorder",
     "WithFallback": "rlservo.serve_app.rollout.fallback",
+    "WithRecording": "rlservo.serve_app.recording.recorded_policy",
     "errors": "rlservo.export.contract",
     "export_checkpoint": "rlservo.export.commands.export",
     "rollout": "rlservo.serve_app.rollout.control_loop",
 }
 
 # The extra that installs what a name needs beyond the in-process runtime.
-_EXTRAS = {"AdminClient": "client", "PolicyClient": "client", "StreamClient": "client", "export_checkpoint": "train"}
+_EXTRAS = {
+    "AdminClient": "client",
+    "PolicyClient": "client",
+    "Recorder": "record",
+    "StreamClient": "client",
+    "WithRecording": "record",
+    "export_checkpoint": "train",
+}
 
 if not TYPE_CHECKING:  # a type checker would take it for a promise of every name
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 import itertools
 import time
 import uuid
+from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +24,10 @@ from rlservo.export.contract.errors import DeadlineError, RequestError, Unavaila
 from rlservo.serve_app.client.http_transport import Transport, encode
 from rlservo.serve_app.client.replies import carried, check_sender, check_step, is_action, restored, sendable
 from rlservo.serve_app.interface import Observation
+from rlservo.serve_app.recording.start import record_policy
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.recording.recorder import Recorder
 
 POLL_S = 0.1  # between two looks at a server that is starting
 
@@ -56,12 +61,13 @@ class PolicyClient:
         api_key: str | None = None,
         deadline_ms: float | None = None,
         server_state: bool = False,
+        record: str | Path | Recorder | None = None,
     ) -> None:
         """Check the arguments; the server is first asked when `contract` or `act` needs it.
 
         `policy` may be None where the server has exactly one. `timeout_s` bounds one call, its retries included, and
         `deadline_ms` instead of it each `act`; `retries` counts further attempts after a failed connection or a 503,
-        nothing else is ever sent twice.
+        nothing else is ever sent twice. `record` keeps every decision: a new .mcap file, a folder, or a Recorder.
         """
         if deadline_ms is not None and not deadline_ms > 0:
             raise UsageError(f"deadline_ms must be above 0, got {deadline_ms}")
@@ -81,6 +87,9 @@ class PolicyClient:
         self._unsure = False  # whether the last action may be another one to the server than to the robot
         self._session = uuid.uuid4().hex if server_state else None
         self._steps = 0  # of the session's episode
+        self.last_reply: dict[str, Any] = {}
+        """The server's reply to the last request that got an action."""
+        self._recorded = None if record is None else record_policy(self, record, act=self._act)
 
     @property
     def reconnects(self) -> int:
@@ -107,6 +116,27 @@ class PolicyClient:
         answer is not an action of this policy, DeadlineError after `timeout_s`, UnavailableError when the server
         cannot be reached, is not ready, or answers another request than this one.
         """
+        act = self._act if self._recorded is None else self._recorded.act
+        return act(obs, explore=explore, seed=seed, reward=reward)
+
+    def outcome(
+        self,
+        reward: float | None = None,
+        *,
+        terminated: bool = False,
+        truncated: bool = False,
+        final_status: str | None = None,
+        final_obs: Observation | None = None,
+    ) -> None:
+        """Record what the last action brought (`WithRecording.outcome`). Nothing to do where nothing is recorded."""
+        if self._recorded is not None:
+            self._recorded.outcome(
+                reward, terminated=terminated, truncated=truncated, final_status=final_status, final_obs=final_obs
+            )
+
+    def _act(
+        self, obs: Observation, *, explore: bool = False, seed: int | None = None, reward: ArrayLike | None = None
+    ) -> Any:
         contract = self.contract
         deadline = time.monotonic() + self._deadline_ms / 1e3
         plain, batch = sendable(obs, contract)
@@ -142,7 +172,7 @@ class PolicyClient:
             self._steps = check_step(reply, self._steps)
         elif "state" in request:
             self._state = carried(reply, contract)
-        self._last, self._unsure = reply["action"], False
+        self._last, self._unsure, self.last_reply = reply["action"], False, reply
         return action
 
     def commanded(self, action: Any) -> None:
@@ -152,10 +182,14 @@ class PolicyClient:
         there. `action` is as `act` returns it.
         """
         self._last, self._unsure = action, True
+        if self._recorded is not None:
+            self._recorded.commanded(action)
 
     def reset(self) -> None:
         """Start an episode: the next request begins with the state of an episode's start. Sends nothing."""
         self._state, self._steps, self._last = {}, 0, None
+        if self._recorded is not None:
+            self._recorded.begin()
 
     def _ask(self, request: dict[str, Any], contract: Contract) -> Any:
         """Send a request under a number of its own and return the reply to it. Raises DeadlineError."""
@@ -186,6 +220,8 @@ class PolicyClient:
 
     def close(self) -> None:
         """Close the connections; later calls raise UsageError."""
+        if self._recorded is not None:
+            self._recorded.end()
         self._transport.close()
 
     def __enter__(self) -> Self:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import itertools
 import json
 import time
+from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit, urlunsplit
 
 import numpy as np
@@ -33,7 +34,11 @@ from rlservo.serve_app.client.http_transport import error_from, error_of_status
 from rlservo.serve_app.client.replies import carried, check_sender, check_step, is_action, restored, sendable
 from rlservo.serve_app.client.websocket_connection import BrokenError, RefusedError, WebSocket
 from rlservo.serve_app.interface import Observation
+from rlservo.serve_app.recording.start import record_policy
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.recording.recorder import Recorder
 
 WAIT_S = 0.02  # between two attempts to connect within one call
 POLL_S = 0.1
@@ -63,11 +68,13 @@ class StreamClient:
         api_key: str | None = None,
         deadline_ms: float | None = None,
         server_state: bool = False,
+        record: str | Path | Recorder | None = None,
     ) -> None:
         """Check the arguments; nothing is sent before `contract` or `act` needs it.
 
         `policy` may be None where the server has a default policy. `timeout_s` bounds the first contact, `deadline_ms`
-        (by default the same) each `act`, in which a broken connection is made anew.
+        (by default the same) each `act`, in which a broken connection is made anew. `record` keeps every
+        decision: a new .mcap file, a folder, or a Recorder.
         """
         if version is not None and policy is None:
             raise UsageError(f"version {version!r} was given without the policy's name")
@@ -92,6 +99,9 @@ class StreamClient:
         self._unsure = True  # whether the connection knows the last action that was used: a new one does not
         self.stale = 0
         """Answers that came after their deadline, and were dropped."""
+        self.last_reply: dict[str, Any] = {}
+        """The server's reply to the last request that got an action."""
+        self._recorded = None if record is None else record_policy(self, record, act=self._act)
 
     @property
     def reconnects(self) -> int:
@@ -113,6 +123,27 @@ class StreamClient:
 
         Raises what `PolicyClient.act` raises, and SessionLostError when the episode's memory went with a connection.
         """
+        act = self._act if self._recorded is None else self._recorded.act
+        return act(obs, explore=explore, seed=seed, reward=reward)
+
+    def outcome(
+        self,
+        reward: float | None = None,
+        *,
+        terminated: bool = False,
+        truncated: bool = False,
+        final_status: str | None = None,
+        final_obs: Observation | None = None,
+    ) -> None:
+        """Record what the last action brought (`WithRecording.outcome`). Nothing to do where nothing is recorded."""
+        if self._recorded is not None:
+            self._recorded.outcome(
+                reward, terminated=terminated, truncated=truncated, final_status=final_status, final_obs=final_obs
+            )
+
+    def _act(
+        self, obs: Observation, *, explore: bool = False, seed: int | None = None, reward: ArrayLike | None = None
+    ) -> Any:
         contract = self.contract
         deadline = time.monotonic() + self._deadline_s
         plain, batch = sendable(obs, contract)
@@ -165,17 +196,21 @@ class StreamClient:
                 self._steps = check_step(reply, self._steps)
             elif contract.state:
                 self._state = carried(reply, contract)
-            self._last, self._unsure, self._begins = sent, False, False
+            self._last, self._unsure, self._begins, self.last_reply = sent, False, False, reply
             return action
 
     def commanded(self, action: Any) -> None:
         """Tell what the robot was commanded instead of an answer that did not come, as `PolicyClient` does."""
         self._last, self._unsure = action, True
+        if self._recorded is not None:
+            self._recorded.commanded(action)
 
     def reset(self) -> None:
         """Start an episode: the next request says so. Sends nothing."""
         self._state, self._steps, self._lost, self._last = {}, 0, False, None
         self._begins = True
+        if self._recorded is not None:
+            self._recorded.begin()
 
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:
         """Return as soon as the server offers the policy.
@@ -195,6 +230,8 @@ class StreamClient:
 
     def close(self) -> None:
         """Close the connection; later calls raise UsageError."""
+        if self._recorded is not None:
+            self._recorded.end()
         self._drop()
         self._closed = True
 

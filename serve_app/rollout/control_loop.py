@@ -18,6 +18,7 @@ import numpy as np
 from rlservo.export.contract.contract import REWARD
 from rlservo.export.contract.errors import RlservoError, UsageError
 from rlservo.serve_app.interface import ActingPolicy
+from rlservo.serve_app.recording.start import record_policy
 from rlservo.serve_app.rollout.environment import check_fit, control_rate_of, make_env
 from rlservo.serve_app.rollout.fallback import LinkCounts, StoppedError, WithFallback
 from rlservo.serve_app.rollout.report import EpisodeRow, Link, Rate, RolloutReport, summarise
@@ -25,6 +26,9 @@ from rlservo.serve_app.rollout.video import VideoFile, rgb_frame
 
 if TYPE_CHECKING:
     import gymnasium as gym
+
+    from rlservo.serve_app.recording.recorded_policy import WithRecording
+    from rlservo.serve_app.recording.recorder import Recorder
 
 OnEpisode = Callable[[EpisodeRow], None]
 
@@ -40,6 +44,7 @@ def rollout(
     env_kwargs: Mapping[str, Any] | None = None,
     video: str | Path | None = None,
     video_episodes: int = 1,
+    record: str | Path | Recorder | None = None,
     on_episode: OnEpisode | None = None,
 ) -> RolloutReport:
     """Run `episodes` episodes of `env_id` with `policy` and return what came of it.
@@ -48,6 +53,7 @@ def rollout(
     from the same number. With rate 'real' the loop keeps the control rate on an absolute schedule, as on a robot: a
     period that is missed is counted and skipped, never caught up in a burst. `video` receives the frames of the first
     `video_episodes` episodes at the control rate; drawing happens inside the loop, so it counts as its time.
+    `record` receives every decision with its reward and end: a new .mcap file, a folder, or a Recorder.
     `on_episode` is called after each episode. Ctrl-C returns what was finished, with `interrupted` set; so does a
     fallback (`WithFallback`) that is to stop, with `stopped`.
 
@@ -75,7 +81,16 @@ def rollout(
                 f"{wanted} needs a control rate, and neither {env_id} (describe(), render_fps) nor the policy's "
                 "contract states one"
             )
-        loop = _Loop(policy, env, pacer=_Pacer(control_rate_hz if rate == "real" else None), explore=explore)
+        recorded = None if record is None else record_policy(policy, record)
+        if recorded is not None:
+            cleanup.callback(recorded.end)
+        loop = _Loop(
+            recorded or policy,
+            env,
+            recorded=recorded,
+            pacer=_Pacer(control_rate_hz if rate == "real" else None),
+            explore=explore,
+        )
         if video is not None and control_rate_hz is not None:
             loop.video = cleanup.enter_context(VideoFile(video, fps=control_rate_hz))
         rows: list[EpisodeRow] = []
@@ -83,8 +98,8 @@ def rollout(
         began = time.perf_counter()
         try:
             for index in range(episodes):
-                recorded = video is not None and index < video_episodes
-                row = loop.run(index, None if seed is None else seed + index, recorded=recorded)
+                filmed = video is not None and index < video_episodes
+                row = loop.run(index, None if seed is None else seed + index, filmed=filmed)
                 rows.append(row)
                 if on_episode is not None:
                     on_episode(row)
@@ -166,16 +181,17 @@ class _Loop:
     env: gym.Env[Any, Any]
     pacer: _Pacer
     explore: bool
+    recorded: WithRecording | None = None
     video: VideoFile | None = None
     latencies_s: list[float] = field(default_factory=list)
 
-    def run(self, index: int, seed: int | None, *, recorded: bool) -> EpisodeRow:
+    def run(self, index: int, seed: int | None, *, filmed: bool) -> EpisodeRow:
         """Run one episode: observe, act, step, until the environment ends it."""
         rewarded = any(tensor.name == REWARD for tensor in self.policy.contract.inputs)
         draws = np.random.default_rng(seed)  # one seed per exploring action; unused otherwise
         self.policy.reset()
         obs = self._in_env(index, 0, self.env.reset, seed=seed)[0]
-        self._record(recorded)
+        self._film(filmed)
         steps, total, reward = 0, 0.0, 0.0
         first = len(self.latencies_s)
         self.pacer.start()
@@ -184,8 +200,17 @@ class _Loop:
             action = self._act(obs, index, steps, seeded, {REWARD: float(reward)} if rewarded else {})
             command = _command(action)
             obs, reward, terminated, truncated, info = self._in_env(index, steps, self.env.step, command)
-            self._record(recorded)
+            self._film(filmed)
             steps, total = steps + 1, total + float(reward)
+            if self.recorded is not None:
+                ends = bool(terminated or truncated)
+                self.recorded.outcome(
+                    reward,
+                    terminated=terminated,
+                    truncated=truncated,
+                    final_status=_final_status(info) if ends else None,
+                    final_obs=obs if ends else None,
+                )
             if terminated or truncated:
                 break
             self.pacer.wait()
@@ -196,7 +221,7 @@ class _Loop:
             steps=steps,
             episode_return=total,
             success=success_of(info),
-            final_status=None if info.get("final_status") is None else str(info["final_status"]),
+            final_status=_final_status(info),
             latency_p50_ms=float(np.median(latencies)),
             latency_max_ms=float(latencies.max()),
         )
@@ -219,8 +244,8 @@ class _Loop:
                 f"episode {index}, step {step}: the environment failed with {type(error).__name__}: {error}"
             ) from error
 
-    def _record(self, recorded: bool) -> None:
-        if recorded and self.video is not None:
+    def _film(self, filmed: bool) -> None:
+        if filmed and self.video is not None:
             self.video.add(rgb_frame(self.env))
 
 
@@ -231,6 +256,10 @@ def _command(action: Any) -> Any:
     if isinstance(action, tuple):
         return tuple(_command(part) for part in action)
     return int(action) if action.ndim == 0 and action.dtype.kind in "iu" else action
+
+
+def _final_status(info: Mapping[str, Any]) -> str | None:
+    return None if info.get("final_status") is None else str(info["final_status"])
 
 
 def success_of(info: Mapping[str, Any]) -> bool | None:

@@ -85,6 +85,8 @@ class WithFallback:
         self._last: Any = None
         self._said_at = -LOG_EVERY_S
         self.counts = LinkCounts()
+        self.failure: RlservoError | None = None
+        """Why the last action is the fallback's; None where the policy gave it."""
 
     @property
     def name(self) -> str:
@@ -124,7 +126,7 @@ class WithFallback:
                     self._count(error)
                     continue  # the robot has not been commanded yet, and what it sees has not changed
                 return self._fall_back(error)
-            self._last = _copy(action)  # a loop may write into what it got
+            self._last, self.failure = _copy(action), None  # a loop may write into what it got
             return action
         raise AssertionError("the last try returns or raises")
 
@@ -147,6 +149,7 @@ class WithFallback:
 
     def _fall_back(self, error: DeadlineError | UnavailableError | SessionLostError) -> Any:
         self._count(error)
+        self.failure = error
         if self._fallback_is("stop"):
             raise StoppedError(f"stopped: {error.message}", error.details) from error
         action = self._given if self._given is not None else self._last

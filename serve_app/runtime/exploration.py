@@ -6,12 +6,14 @@ algorithms use and what RLlib does to a sample before `env.step`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.contract import Distribution
+from rlservo.export.contract.log_probability import MAX_LOG_STD, MIN_LOG_STD
 from rlservo.export.contract.scores import parameter_count, split_parameters
 from rlservo.export.contract.spaces import (
     BoxSpec,
@@ -24,9 +26,17 @@ from rlservo.export.contract.spaces import (
     leaf_specs,
 )
 
-# RLlib clamps the log of a squashed Gaussian's scale to this range: ray/rllib/utils/numpy.py, ray 2.60.
-MIN_LOG_STD = -5.0
-MAX_LOG_STD = 2.0
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """An exploring action, and what a recording keeps of how it came about."""
+
+    action: dict[str, NDArray[Any]]
+    """By tensor name, `[batch, *shape]`, ready for the environment."""
+    own: dict[str, NDArray[Any]]
+    """The module's own action: the sample before it was unsquashed, clipped or given the space's start."""
+    inputs: NDArray[Any]
+    """`action_dist_inputs`, `[batch, distribution_size]`."""
 
 
 def distribution_size(distribution: Distribution, space: SpaceSpec) -> int:
@@ -41,20 +51,22 @@ def distribution_size(distribution: Distribution, space: SpaceSpec) -> int:
 
 def sample_action(
     inputs: NDArray[np.floating], distribution: Distribution, space: LeafSpec, rng: np.random.Generator
-) -> NDArray[np.float64] | NDArray[np.int64]:
-    """Draw one action per row of `inputs` `[batch, distribution_size]`, in environment units: `[batch, *space.shape]`.
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Draw one action per row of `inputs` `[batch, distribution_size]`: (in environment units, the module's own).
 
-    'diag_gaussian' rows are [mean, log_std]; 'squashed_gaussian' rows are too, with the sample through tanh;
-    'categorical' rows are logits, sampled by the Gumbel-max trick (Gumbel 1954; Maddison et al. 2014,
-    arXiv:1411.0030); 'multi_categorical' rows are several such rows side by side.
+    Both are `[batch, *space.shape]`. 'diag_gaussian' rows are [mean, log_std]; 'squashed_gaussian' rows are too, with
+    the sample through tanh; 'categorical' rows are logits, sampled by the Gumbel-max trick (Gumbel 1954; Maddison et
+    al. 2014, arXiv:1411.0030); 'multi_categorical' rows are several such rows side by side.
     """
     rows = inputs.astype(np.float64)
     if isinstance(space, DiscreteSpec):
-        return np.asarray(_choose(rows, rng) + space.start, np.int64)
+        chosen = _choose(rows, rng)
+        return chosen + space.start, chosen
     if isinstance(space, MultiDiscreteSpec):
         parts = np.split(rows, np.cumsum(space.nvec)[:-1], axis=-1)
-        chosen = np.stack([_choose(part, rng) for part in parts], axis=-1) + np.array(space.start)
-        return np.asarray(chosen.reshape((-1, *space.shape)), np.int64)
+        chosen = np.stack([_choose(part, rng) for part in parts], axis=-1)
+        own = chosen.reshape((-1, *space.shape))
+        return (chosen + np.array(space.start)).reshape(own.shape), own
     assert isinstance(space, BoxSpec), "RLlib has no distribution for other spaces"
     mean, log_std = np.split(rows, 2, axis=-1)
     if distribution.kind == "squashed_gaussian":
@@ -66,20 +78,20 @@ def sample_action(
     low, high = space.bounds()
     bounded = bool(np.isfinite(low).all() and np.isfinite(high).all())
     if distribution.transform == "none" or (distribution.transform == "unsquash" and not bounded):
-        return sample
-    if distribution.transform == "unsquash":
-        sample = low + (sample + 1.0) * (high - low) / 2.0
-    return np.clip(sample, low, high)
+        return sample, sample
+    sent = low + (sample + 1.0) * (high - low) / 2.0 if distribution.transform == "unsquash" else sample
+    return np.clip(sent, low, high), sample
 
 
-def sample_leaves(
+def draw_action(
     inputs: NDArray[np.floating], distribution: Distribution, space: SpaceSpec, rng: np.random.Generator
-) -> dict[str, NDArray[Any]]:
-    """Draw every leaf of the action by tensor name, in the leaf's own dtype."""
-    return {
-        name: sample_action(part, distribution, leaf, rng).astype(leaf.dtype)
-        for name, leaf, part in split_parameters(inputs, space)
-    }
+) -> Draw:
+    """Draw every leaf of the action, in the leaf's own dtype."""
+    action, own = {}, {}
+    for name, leaf, part in split_parameters(inputs, space):
+        sent, sample = sample_action(part, distribution, leaf, rng)
+        action[name], own[name] = sent.astype(leaf.dtype), sample.astype(leaf.dtype)
+    return Draw(action, own, inputs)
 
 
 def _choose(logits: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.int64]:

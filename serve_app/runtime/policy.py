@@ -27,7 +27,7 @@ from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.runtime.action_guard import ActionGuard
 from rlservo.serve_app.runtime.drift import Drift
-from rlservo.serve_app.runtime.exploration import sample_leaves
+from rlservo.serve_app.runtime.exploration import Draw, draw_action
 from rlservo.serve_app.runtime.loading import (
     Run,
     check_contract,
@@ -103,6 +103,8 @@ class Policy:
         self.options = options
         self.notices: deque[str] = deque(maxlen=16)
         """What was out of bounds or beyond a limit and used all the same, for who answers to a client."""
+        self.draw: Draw | None = None
+        """How the last exploring action came about, for a recording; None before the first."""
         self._unlogged = 0
         self._logged_at = -NOTICE_EVERY_S
         self._reader = StructureReader(
@@ -172,6 +174,11 @@ class Policy:
     def path(self) -> Path:
         """The bundle folder this policy was loaded from."""
         return self._bundle.path
+
+    @property
+    def graph_hash(self) -> str:
+        """SHA-256 of the graph file, in hexadecimal digits."""
+        return self._graph_hash
 
     @property
     def digest(self) -> str:
@@ -369,7 +376,8 @@ class Policy:
             raise ActionError(
                 f"policy '{self._contract.name}' gave a non-finite action distribution for this observation"
             )
-        return sample_leaves(inputs, self._check_explores(), self._contract.action_space, rng)
+        self.draw = draw_action(inputs, self._check_explores(), self._contract.action_space, rng)
+        return self.draw.action
 
 
 def _named(run: Run, names: list[str]) -> Network:

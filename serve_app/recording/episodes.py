@@ -1,0 +1,226 @@
+"""Episodes put together from a recording's messages: columns of numbers, one row a decision.
+
+It streams: an episode is yielded when it ends, a very long one in pieces, and of too many that never end the one that
+was silent longest is given up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.serve_app.recording.policy_format import PolicyFormat
+from rlservo.serve_app.recording.reader import Entry, Recording
+
+LONGEST_PIECE = 10_000  # decisions
+MOST_OPEN = 2_000  # episodes at a time
+LOOSE_PIECE = 1_000  # decisions that belong to no episode, at a time
+
+Columns = dict[str, NDArray[Any]]
+
+
+@dataclass
+class Episode:
+    """Decisions of one episode in their order, or a piece of it, or decisions that belong to none (`id` is empty)."""
+
+    policy: PolicyFormat
+    id: str
+    begins: bool
+    """Whether the first decision is the episode's first."""
+    goes_on: bool = False
+    """Whether another piece follows."""
+    ended: bool = False
+    """Whether the recording says how it ended."""
+    terminated: bool = False
+    truncated: bool = False
+    final_status: str | None = None
+    _decisions: list[dict[str, Any]] = field(default_factory=list, repr=False)
+    _outcomes: list[dict[str, Any] | None] = field(default_factory=list, repr=False)
+    _log_times_ns: list[int] = field(default_factory=list, repr=False)
+    _wall_ns: list[int] = field(default_factory=list, repr=False)
+
+    def __len__(self) -> int:
+        return len(self._decisions)
+
+    @cached_property
+    def steps(self) -> NDArray[np.int64]:
+        """Which decision of the episode each is, from 0."""
+        return np.array([one["step"] for one in self._decisions], np.int64)
+
+    @property
+    def gap(self) -> int | None:
+        """Return the first row before which decisions are missing; None where there are all."""
+        expected = self.steps[0] + np.arange(len(self)) if self.id else self.steps
+        if self.id and not self.begins and self.steps[0] == 0:
+            return 0
+        missing = np.flatnonzero(self.steps != expected)
+        return int(missing[0]) if len(missing) else None
+
+    @cached_property
+    def time_s(self) -> NDArray[np.float64]:
+        """When each decision was made [s since 1970], by a clock that never jumps."""
+        return np.array(self._log_times_ns, np.float64) / 1e9
+
+    @cached_property
+    def wall_ns(self) -> NDArray[np.int64]:
+        """The same by the wall clock [ns since 1970]."""
+        return np.array(self._wall_ns, np.int64)
+
+    @cached_property
+    def obs(self) -> Columns:
+        """The observations by tensor name, `[rows, *shape]`."""
+        return self.policy.observations.columns([one["obs"] for one in self._decisions])
+
+    @cached_property
+    def action(self) -> Columns:
+        """The actions that were sent, by tensor name; zeros where there was none (`acted`)."""
+        return self.policy.actions.columns([one.get("action") for one in self._decisions])
+
+    @cached_property
+    def acted(self) -> NDArray[np.bool_]:
+        """Whether the policy gave an action."""
+        return np.array(["action" in one for one in self._decisions], np.bool_)
+
+    @cached_property
+    def fell_back(self) -> NDArray[np.bool_]:
+        """Whether the robot was commanded something else."""
+        return np.array([one is not None for one in self._commands()], np.bool_)
+
+    @cached_property
+    def executed(self) -> Columns:
+        """The actions that the robot was commanded: the policy's, or what stood in for it."""
+        commands = self._commands()
+        return self.policy.actions.columns(
+            [
+                one.get("action") if command is None else command
+                for one, command in zip(self._decisions, commands, strict=True)
+            ]
+        )
+
+    @cached_property
+    def explored(self) -> NDArray[np.bool_]:
+        """Whether the action was drawn from the policy's distribution."""
+        return np.array([one.get("explore", False) for one in self._decisions], np.bool_)
+
+    @cached_property
+    def own_action(self) -> Columns:
+        """The module's own actions; zeros where `logp` is not a number."""
+        return self.policy.actions.columns([one.get("own_action") for one in self._decisions])
+
+    @cached_property
+    def logp(self) -> NDArray[np.float64]:
+        """The log-probability of each own action; not a number where it is not known."""
+        return self._numbers("logp")
+
+    @cached_property
+    def dist_inputs(self) -> NDArray[np.float64]:
+        """The distribution's parameters `[rows, n]`; not a number where they are not known."""
+        size = next((len(one["dist_inputs"]) for one in self._decisions if "dist_inputs" in one), 0)
+        unknown = [math.nan] * size
+        rows = [one.get("dist_inputs", unknown) for one in self._decisions]
+        return np.array([[-math.inf if x is None else x for x in row] for row in rows], np.float64)
+
+    @cached_property
+    def reward(self) -> NDArray[np.float64]:
+        """What each decision brought; not a number where it is not known."""
+        return np.array([math.nan if one is None else one.get("reward", math.nan) for one in self._outcomes])
+
+    @cached_property
+    def reward_input(self) -> NDArray[np.float64]:
+        """The reward that the policy was given to see; not a number where it was given none."""
+        return self._numbers("reward_input")
+
+    @cached_property
+    def latency_ms(self) -> NDArray[np.float64]:
+        return self._numbers("latency_ms")
+
+    @cached_property
+    def final_obs(self) -> Columns | None:
+        """The observation after the last action, `[1, *shape]`, where it was recorded."""
+        last = self._outcomes[-1] if self._outcomes else None
+        return (
+            None if last is None or "final_obs" not in last else self.policy.observations.columns([last["final_obs"]])
+        )
+
+    @property
+    def warnings(self) -> list[tuple[int, str]]:
+        """Return (row, sentence) of everything that was warned of."""
+        return [(row, text) for row, one in enumerate(self._decisions) for text in one.get("warnings", ())]
+
+    @property
+    def errors(self) -> list[str | None]:
+        """Return for each row why there was no action; None where there was."""
+        return [one.get("error") for one in self._decisions]
+
+    def field(self, name: str) -> list[Any]:
+        """Return a field as it was recorded, such as `seq` or `request_id`; None where it is absent."""
+        return [one.get(name) for one in self._decisions]
+
+    def _numbers(self, name: str) -> NDArray[np.float64]:
+        return np.array([one.get(name, math.nan) for one in self._decisions], np.float64)
+
+    def _commands(self) -> list[Any]:
+        return [
+            one.get("commanded", None if outcome is None else outcome.get("commanded"))
+            for one, outcome in zip(self._decisions, self._outcomes, strict=True)
+        ]
+
+
+def episodes(recording: Recording) -> Iterator[Episode]:
+    """Yield every episode of a recording as it ends, then those that did not."""
+    opened: OrderedDict[tuple[int, str], Episode] = OrderedDict()
+    for entry in recording.entries():
+        key = (id(entry.policy), str(entry.fields.get("episode", "")))
+        if entry.kind == "decision":
+            yield from _add_decision(opened, key, entry)
+        elif (episode := opened.get(key)) is not None:
+            _add_outcome(episode, entry.fields)
+            if episode.ended:
+                yield opened.pop(key)
+        if len(opened) > MOST_OPEN:
+            yield opened.popitem(last=False)[1]
+    yield from opened.values()
+
+
+def _add_decision(
+    opened: OrderedDict[tuple[int, str], Episode], key: tuple[int, str], entry: Entry
+) -> Iterator[Episode]:
+    episode = opened.get(key)
+    step = entry.fields["step"]
+    first = True
+    if episode is not None:
+        begins_anew = bool(key[1]) and step <= episode._decisions[-1]["step"]
+        full = len(episode) >= (LONGEST_PIECE if key[1] else LOOSE_PIECE)
+        first = begins_anew or not key[1]
+        if begins_anew or full:
+            episode.goes_on = full and not begins_anew
+            yield opened.pop(key)
+            episode = None
+    if episode is None:
+        episode = opened[key] = Episode(entry.policy, key[1], begins=first and step == 0)
+    episode._decisions.append(entry.fields)
+    episode._outcomes.append(None)
+    episode._log_times_ns.append(entry.log_time_ns)
+    episode._wall_ns.append(entry.wall_ns)
+    opened.move_to_end(key)
+
+
+def _add_outcome(episode: Episode, fields: dict[str, Any]) -> None:
+    """Put what came of a decision beside it: nearly always the last one."""
+    for row in range(len(episode) - 1, -1, -1):
+        if episode._decisions[row]["step"] == fields["step"]:
+            episode._outcomes[row] = {**(episode._outcomes[row] or {}), **fields}
+            break
+        if episode._decisions[row]["step"] < fields["step"]:
+            break
+    episode.terminated |= fields.get("terminated", False)
+    episode.truncated |= fields.get("truncated", False)
+    episode.final_status = fields.get("final_status", episode.final_status)
+    episode.ended = episode.terminated or episode.truncated or episode.final_status is not None

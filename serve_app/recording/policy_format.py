@@ -1,0 +1,307 @@
+"""Messages of one policy: its contract's spaces as JSON, each element by its own name, and back bit for bit.
+
+A float32 is written with the fewest digits that give the same float32 again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from rlservo.export.contract.contract import Contract, contract_json
+from rlservo.export.contract.errors import RequestError
+from rlservo.export.contract.log_probability import log_probability
+from rlservo.export.contract.nested import action_leaves
+from rlservo.export.contract.spaces import DictSpec, DiscreteSpec, LeafSpec, SpaceSpec, TupleSpec, leaf_specs
+
+NUMBERS = orjson.OPT_SERIALIZE_NUMPY
+Leaves = Mapping[str, NDArray[Any]]
+
+
+class PolicyFormat:
+    """How one policy's decisions are written and read; one object per policy, version and graph."""
+
+    def __init__(self, contract: Contract, *, graph_hash: str = "", options: Mapping[str, Any] | None = None) -> None:
+        """`graph_hash` is empty where only a server knows it; `options` are those of `PolicyOptions` that were set."""
+        self.contract = contract
+        self.graph_hash = graph_hash
+        self.options = dict(options or {})
+        self.contract_document = contract_json(contract).encode()
+        self.contract_hash = hashlib.sha256(self.contract_document).hexdigest()
+        self.observations = SpaceFormat(contract.observation_space, "obs")
+        self.actions = SpaceFormat(contract.action_space, "action")
+
+    @property
+    def title(self) -> str:
+        return f"{self.contract.name}/{self.contract.version}"
+
+    @property
+    def key(self) -> tuple[str, str, str, str]:
+        """What makes two recorded policies the same one."""
+        return self.contract.name, self.contract.version, self.graph_hash, self.contract_hash
+
+    @property
+    def record_bytes(self) -> int:
+        """About how much memory one decision takes while it waits for the writer."""
+        spaces = (self.contract.observation_space, self.contract.action_space)
+        return 1000 + sum(
+            leaf.size * np.dtype(leaf.dtype).itemsize for space in spaces for leaf in leaf_specs(space, "").values()
+        )
+
+    def log_probability(self, inputs: NDArray[Any], own: Leaves) -> NDArray[np.float64] | None:
+        """Return the log-probability of each row's own action; None where the policy has no distribution."""
+        if self.contract.distribution is None:
+            return None
+        return log_probability(inputs, own, self.contract.distribution, self.contract.action_space)
+
+
+class SpaceFormat:
+    """Values of one space as JSON text, and as columns of many values."""
+
+    def __init__(self, space: SpaceSpec, path: str) -> None:
+        self._space = space
+        self._path = path
+        self.leaves = leaf_specs(space, path)
+        self._formats = {name: _LeafFormat(leaf) for name, leaf in self.leaves.items()}
+
+    def rows(self, value: Any) -> list[dict[str, NDArray[Any]]]:
+        """Return the leaves of one value, or of each row of a batch, in the space's own types.
+
+        Raises ValueError or RequestError where the value is not of the space.
+        """
+        found: dict[str, NDArray[Any]] = {}
+        batch: int | None = None
+        for name, given in self._parts(value).items():
+            leaf = self.leaves[name]
+            array = np.asarray(given)
+            if array.ndim and array.shape[-1:] == (1,) and not leaf.shape:  # a choice with an axis of its own
+                array = array.reshape(array.shape[:-1])
+            if array.ndim == len(leaf.shape) + 1:
+                batch = len(array)
+            elif array.shape != leaf.shape:
+                raise ValueError(f"{name} has shape {array.shape}, expected {leaf.shape}")
+            found[name] = array.astype(leaf.dtype, copy=False)
+        if batch is None:
+            return [found]
+        return [{name: array[row] for name, array in found.items()} for row in range(batch)]
+
+    def encode(self, leaves: Mapping[str, Any]) -> bytes:
+        """Return one value's JSON."""
+        return self._encode(self._space, self._path, leaves)
+
+    def columns(self, documents: Sequence[Any]) -> dict[str, NDArray[Any]]:
+        """Return the leaves `[len(documents), *shape]` of parsed values; a value of None becomes zeros."""
+        found: dict[str, NDArray[Any]] = {}
+        self._columns(self._space, self._path, documents, found)
+        return found
+
+    def schema(self) -> dict[str, Any]:
+        """Return the JSON schema of one value, its numbers with their units."""
+        return self._schema(self._space, self._path)
+
+    def labels(self, name: str) -> list[str]:
+        """Return the name of each element of a leaf."""
+        return self._formats[name].labels(name)
+
+    def _parts(self, value: Any) -> Mapping[str, Any]:
+        if isinstance(self._space, DictSpec | TupleSpec):
+            return action_leaves(self._space, value, self._path)
+        if isinstance(value, Mapping):  # a flat observation by element names
+            names = [element.name for element in self._space.elements]
+            if set(names) != set(value):
+                raise RequestError(f"{self._path} does not have the elements {', '.join(names)}")
+            array = np.stack([np.asarray(value[name]) for name in names], axis=-1)
+            return {self._path: array.reshape((*array.shape[:-1], *self._space.shape))}
+        return {self._path: value}
+
+    def _encode(self, space: SpaceSpec, path: str, leaves: Mapping[str, Any]) -> bytes:
+        if path in self._formats:
+            return self._formats[path].encode(leaves[path])
+        inside = (
+            orjson.dumps(key) + b":" + self._encode(child, f"{path}.{key}", leaves) for key, child in _children(space)
+        )
+        return b"{" + b",".join(inside) + b"}"
+
+    def _columns(self, space: SpaceSpec, path: str, documents: Sequence[Any], found: dict[str, NDArray[Any]]) -> None:
+        if path in self._formats:
+            found[path] = self._formats[path].column(documents)
+            return
+        for key, child in _children(space):
+            self._columns(child, f"{path}.{key}", [one if one is None else one[key] for one in documents], found)
+
+    def _schema(self, space: SpaceSpec, path: str) -> dict[str, Any]:
+        if path in self._formats:
+            return self._formats[path].schema()
+        inside = {key: self._schema(child, f"{path}.{key}") for key, child in _children(space)}
+        return {"type": "object", "properties": inside}
+
+
+def _children(space: SpaceSpec) -> list[tuple[str, SpaceSpec]]:
+    """Return a nested space's parts by key. A Tuple is an object too: viewers want an array's items of one kind."""
+    if isinstance(space, DictSpec):
+        return list(space.spaces.items())
+    assert isinstance(space, TupleSpec), "a leaf has no parts"
+    return [(str(index), child) for index, child in enumerate(space.spaces)]
+
+
+class _LeafFormat:
+    """One array: an object by element name where all elements have one, else a flat array; a choice is a number."""
+
+    def __init__(self, leaf: LeafSpec) -> None:
+        self._leaf = leaf
+        names = [element.name for element in leaf.elements]
+        self._names = names if leaf.shape and len(set(names)) == leaf.size else None
+        self._template = b""
+        if self._names is not None:
+            keys = [json.dumps(name).encode().replace(b"%", b"%%") for name in self._names]
+            self._template = b"{" + b",".join(key + b":%b" for key in keys) + b"}"
+            getter = itemgetter(*self._names)
+            self._values = getter if len(names) > 1 else lambda document: (getter(document),)
+
+    def encode(self, array: NDArray[Any]) -> bytes:
+        if not self._leaf.shape:
+            return orjson.dumps(array[()], option=NUMBERS)
+        flat = orjson.dumps(np.ascontiguousarray(array).reshape(-1), option=NUMBERS)
+        return flat if self._names is None else self._template % tuple(flat[1:-1].split(b","))
+
+    def column(self, documents: Sequence[Any]) -> NDArray[Any]:
+        size = self._leaf.size
+        absent = [0] * size if self._leaf.shape else 0
+        rows = (
+            [absent if one is None else one for one in documents]
+            if self._names is None
+            else [absent if one is None else self._values(one) for one in documents]
+        )
+        kind = np.dtype(self._leaf.dtype)
+        wide = np.array(rows, np.float64 if kind.kind == "f" else kind)  # a null is not a number
+        return wide.astype(kind, copy=False).reshape(len(rows), *self._leaf.shape)
+
+    def labels(self, name: str) -> list[str]:
+        if self._names is not None:
+            return list(self._names)
+        return [f"{name}[{i}]" for i in range(self._leaf.size)] if self._leaf.shape else [name]
+
+    def schema(self) -> dict[str, Any]:
+        if self._names is None:
+            number = self._number(self._leaf.elements[0].unit if self._leaf.elements else "")
+            return {"type": "array", "items": number} if self._leaf.shape else number
+        inside = {element.name: self._number(element.unit) for element in self._leaf.elements}
+        return {"type": "object", "properties": inside}
+
+    def _number(self, unit: str) -> dict[str, Any]:
+        number: dict[str, Any] = {"type": "number" if np.dtype(self._leaf.dtype).kind == "f" else "integer"}
+        if isinstance(self._leaf, DiscreteSpec):
+            number["description"] = f"one of {self._leaf.n} from {self._leaf.start} on"
+        if unit:
+            number |= {"description": f"[{unit}]", "unit": unit}
+        return number
+
+
+def decision_schema(policy: PolicyFormat) -> dict[str, Any]:
+    """Return the JSON schema of a policy's decisions."""
+    action = policy.actions.schema()
+    return _object(
+        f"Decision of {policy.title}",
+        {
+            "episode": _text("Session, stream or loop; absent where nothing tells"),
+            "step": _integer("Which decision of the episode, from 0"),
+            "obs": policy.observations.schema(),
+            "action": {**action, "description": "As sent; absent where there was none"},
+            "commanded": {**action, "description": "What the robot was commanded instead of an action"},
+            "own_action": {**action, "description": "The module's own action, before unsquash, clip and start"},
+            "dist_inputs": {"type": "array", "items": {"type": "number"}, "description": "null: minus infinity"},
+            "logp": {"type": "number", "description": "Log-probability of own_action"},
+            "explore": {"type": "boolean"},
+            "reward_input": {"type": "number", "description": "The reward that the policy was given to see"},
+            "latency_ms": {"type": "number", "description": "[ms]", "unit": "ms"},
+            "seq": _integer("The request's number"),
+            "request_id": _text("The request's id in the server's log"),
+            "warnings": {"type": "array", "items": {"type": "string"}},
+            "error": _text("The code of what came instead of an action"),
+        },
+    )
+
+
+def outcome_schema(policy: PolicyFormat) -> dict[str, Any]:
+    """Return the JSON schema of what came of a policy's decisions."""
+    return _object(
+        f"Outcome of a decision of {policy.title}",
+        {
+            "episode": _text("As in the decision"),
+            "step": _integer("As in the decision"),
+            "reward": {"type": "number"},
+            "terminated": {"type": "boolean"},
+            "truncated": {"type": "boolean"},
+            "final_status": _text("How the episode ended, in the environment's word"),
+            "final_obs": {**policy.observations.schema(), "description": "The observation after the last action"},
+            "commanded": {**policy.actions.schema(), "description": "What the robot was commanded instead"},
+        },
+    )
+
+
+DROPPED_SCHEMA: dict[str, Any] = {
+    "$schema": "https://json-schema.org/draft/2020-12/schema",
+    "title": "Records that did not fit into the buffer and are missing before this place",
+    "type": "object",
+    "properties": {"count": {"type": "integer"}},
+}
+
+
+def element_differences(recorded: Contract, other: Contract) -> Iterator[str]:
+    """Yield a sentence for each difference between two contracts that keeps one from being fed the other's records."""
+    for side, ours, theirs in (
+        ("observation", recorded.observation_space, other.observation_space),
+        ("action", recorded.action_space, other.action_space),
+    ):
+        mine, yours = leaf_specs(ours, side), leaf_specs(theirs, side)
+        for name in sorted({*mine, *yours}):
+            if name not in mine or name not in yours:
+                yield f"{name} is only in the {'recording' if name in mine else 'bundle'}"
+            else:
+                yield from _leaf_differences(name, mine[name], yours[name], bounds=side == "action")
+
+
+def _leaf_differences(name: str, ours: LeafSpec, theirs: LeafSpec, *, bounds: bool) -> Iterator[str]:
+    for word in ("kind", "shape", "dtype"):
+        mine, yours = getattr(ours, word), getattr(theirs, word)
+        if mine != yours:
+            yield f"{name} has {word} {mine} in the recording and {yours} in the bundle"
+            return
+    if ours.elements and theirs.elements:
+        for index, (mine, yours) in enumerate(zip(ours.elements, theirs.elements, strict=True)):
+            if mine.name != yours.name:
+                yield f"element {index} of the {name} is {mine.name!r} there and {yours.name!r} in the bundle"
+            elif mine.unit != yours.unit and mine.unit and yours.unit:
+                yield f"element {index} of the {name} ({mine.name}) is in {mine.unit} there and {yours.unit} here"
+    discrete = ours.kind in ("discrete", "multi_discrete")
+    for word, mine, yours in zip(("low", "high"), ours.bounds(), theirs.bounds(), strict=True):
+        if (bounds or discrete) and not np.array_equal(mine, yours):
+            index = int(np.argmax(np.ravel(mine != yours)))
+            yield (
+                f"element {index} of the {name} has {word} {np.ravel(mine)[index]:g} in the recording and "
+                f"{np.ravel(yours)[index]:g} in the bundle"
+            )
+
+
+def _object(title: str, properties: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": title,
+        "type": "object",
+        "properties": properties,
+    }
+
+
+def _text(description: str) -> dict[str, Any]:
+    return {"type": "string", "description": description}
+
+
+def _integer(description: str) -> dict[str, Any]:
+    return {"type": "integer", "description": description}

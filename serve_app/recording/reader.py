@@ -1,0 +1,206 @@
+"""Recordings read back: one pass over the messages of MCAP files, to the last whole chunk of each.
+
+A file without an end (its writer was killed, or is still writing) is read as far as it goes. Memory is bounded: a chunk
+is in it at a time.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import orjson
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from pydantic import ValidationError
+
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import RlservoError, first_line
+from rlservo.serve_app.recording.log_file import DROPPED_TOPIC
+from rlservo.serve_app.recording.policy_format import PolicyFormat
+from rlservo.serve_app.recording.recorder import SUFFIX, is_being_written
+
+LARGEST_RECORD = 512 * 1024 * 1024  # beyond it a length is no length, but damage
+CLOCK_JUMP_NS = 1_000_000_000
+
+
+class RecordingError(RlservoError):
+    """The path holds no recording of rlservo's."""
+
+    code = "recording-invalid"
+
+
+@dataclass(slots=True)
+class Entry:
+    """One message: a decision of a policy, or what came of one."""
+
+    policy: PolicyFormat
+    kind: str  # decision or outcome
+    log_time_ns: int
+    wall_ns: int
+    fields: dict[str, Any]
+
+
+@dataclass
+class FileFacts:
+    """What reading one file came to."""
+
+    path: Path
+    metadata: dict[str, str] = field(default_factory=dict)
+    whole: bool = False
+    """Whether the file has its end; else it was read to its last whole chunk."""
+    being_written: bool = False
+    damage: str | None = None
+    """What is wrong with it beyond a missing end."""
+    messages: int = 0
+    dropped: int = 0
+    clock_jumps: int = 0
+    """How often the wall clock moved by more than a second against the monotonic clock."""
+
+
+class Recording:
+    """The recordings in some files and folders, read one after the other."""
+
+    def __init__(self, paths: Sequence[str | Path] | str | Path) -> None:
+        """Raise RecordingError where there is no file."""
+        given = [paths] if isinstance(paths, str | Path) else list(paths)
+        self.paths: list[Path] = []
+        for path in map(Path, given):
+            inside = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
+            if not inside:
+                raise RecordingError(f"{path} holds no recording (*{SUFFIX})")
+            self.paths += inside
+        missing = next((path for path in self.paths if not path.is_file()), None)
+        if missing is not None:
+            raise RecordingError(f"{missing} does not exist, or is no file")
+        self.files: list[FileFacts] = []
+        """Of the files that were read so far."""
+        self.policies: list[PolicyFormat] = []
+        """Those that were met so far; the same one for the same policy of several files."""
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield every decision and outcome, in the order they were written.
+
+        Raises RecordingError where a file is no MCAP file, or another program's.
+        """
+        self.files = []
+        for path in self.paths:
+            facts = FileFacts(path, being_written=is_being_written(path))
+            self.files.append(facts)
+            yield from _FileReader(self, facts).entries()
+
+    def known(self, policy: PolicyFormat) -> PolicyFormat:
+        """Return the one object that stands for this policy."""
+        for known in self.policies:
+            if known.key == policy.key and known.options == policy.options:
+                return known
+        self.policies.append(policy)
+        return policy
+
+
+class _FileReader:
+    """One pass over one file."""
+
+    def __init__(self, recording: Recording, facts: FileFacts) -> None:
+        self._recording = recording
+        self._facts = facts
+        self._contracts: dict[str, Contract] = {}
+        self._channels: dict[int, tuple[PolicyFormat | None, str]] = {}
+        self._foreign: set[str] = set()
+        self._offset_ns: int | None = None
+
+    def entries(self) -> Iterator[Entry]:
+        facts = self._facts
+        with facts.path.open("rb") as stream:
+            try:
+                for record in StreamReader(stream, emit_chunks=True, record_size_limit=LARGEST_RECORD).records:
+                    if isinstance(record, Chunk):
+                        for inside in breakup_chunk(record, validate_crc=True):
+                            if isinstance(inside, Message):
+                                entry = self._entry(inside)
+                                if entry is not None:
+                                    yield entry
+                            elif isinstance(inside, Channel):
+                                self._add_channel(inside)
+                    elif isinstance(record, Channel):
+                        self._add_channel(record)
+                    elif isinstance(record, Message):
+                        entry = self._entry(record)
+                        if entry is not None:
+                            yield entry
+                    elif isinstance(record, Attachment):
+                        self._add_contract(record)
+                    elif isinstance(record, Metadata) and record.name == "rlservo":
+                        facts.metadata = dict(record.metadata)
+                facts.whole = True  # the footer and the closing magic were there
+            except InvalidMagic:
+                if stream.tell() <= len(b"\x89MCAP0\r\n"):
+                    raise RecordingError(f"{facts.path} is no MCAP file") from None
+            except (EndOfFile, struct.error) as error:  # in the middle of a record
+                if stream.tell() < len(b"\x89MCAP0\r\n"):
+                    raise RecordingError(f"{facts.path} is no MCAP file, or empty") from error
+            except RecordingError:
+                raise
+            except (McapError, CRCValidationError, ValueError, MemoryError, OverflowError) as error:
+                self._damaged(error, stream.tell())
+            except Exception as error:  # zstandard's and lz4's own errors share no base
+                if not type(error).__module__.startswith(("zstandard", "lz4", "builtins", "zstd")):
+                    raise
+                self._damaged(error, stream.tell())
+        if self._foreign and not self._channels:
+            raise RecordingError(
+                f"{facts.path} holds no decisions of rlservo's policies: its topics are "
+                f"{', '.join(sorted(self._foreign)[:5])}"
+            )
+
+    def _damaged(self, error: Exception, place: int) -> None:
+        """A last chunk that is cut off is a missing end; anything before it is damage."""
+        if place < self._facts.path.stat().st_size:
+            self._facts.damage = f"damaged before byte {place}, read up to there: {first_line(error)}"
+
+    def _entry(self, message: Message) -> Entry | None:
+        policy, kind = self._channels.get(message.channel_id, (None, ""))
+        if kind == "":
+            return None
+        fields = orjson.loads(message.data)
+        self._facts.messages += 1
+        if policy is None:
+            self._facts.dropped += int(fields["count"])
+            return None
+        offset = message.publish_time - message.log_time
+        if self._offset_ns is not None and abs(offset - self._offset_ns) > CLOCK_JUMP_NS:
+            self._facts.clock_jumps += 1
+        self._offset_ns = offset
+        return Entry(policy, kind, message.log_time, message.publish_time, fields)
+
+    def _add_contract(self, attachment: Attachment) -> None:
+        if not attachment.name.startswith("contracts/"):
+            return
+        try:
+            contract = Contract.model_validate_json(attachment.data)
+        except ValidationError as error:
+            raise RecordingError(
+                f"{self._facts.path}: the contract {attachment.name} in it cannot be read: "
+                f"{error.errors(include_url=False)[0]['msg']}"
+            ) from error
+        self._contracts[attachment.name.removeprefix("contracts/").removesuffix(".json")] = contract
+
+    def _add_channel(self, channel: Channel) -> None:
+        if channel.id in self._channels:
+            return
+        if channel.topic == DROPPED_TOPIC:
+            self._channels[channel.id] = (None, "dropped")
+            return
+        contract = self._contracts.get(channel.metadata.get("contract_sha256", ""))
+        kind = channel.topic.rpartition("/")[2]
+        if contract is None or kind not in ("decision", "outcome"):
+            self._foreign.add(channel.topic)
+            return
+        graph_hash = channel.metadata.get("graph_sha256", "")
+        options = orjson.loads(channel.metadata.get("options", "{}"))
+        policy = self._recording.known(PolicyFormat(contract, graph_hash=graph_hash, options=options))
+        self._channels[channel.id] = (policy, kind)

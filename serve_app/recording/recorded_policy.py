@@ -1,0 +1,195 @@
+"""A policy whose decisions are recorded: in process, over HTTP, over a WebSocket, with or without a fallback."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from typing_extensions import Self
+
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import RlservoError
+from rlservo.serve_app.interface import ActingPolicy, Observation
+from rlservo.serve_app.recording.policy_format import PolicyFormat
+from rlservo.serve_app.recording.recorder import Recorder
+from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
+
+
+class WithRecording:
+    """A policy that records what it sees and does; `outcome` adds what only the control loop knows.
+
+    ```python
+    with WithRecording(Policy.load("policies/ur5"), "run.mcap") as policy:
+        policy.reset()
+        action = policy.act(obs)
+        obs, reward, terminated, truncated, info = env.step(action)
+        policy.outcome(reward, terminated=terminated, truncated=truncated, final_obs=obs)
+    ```
+
+    It records one loop's episodes: each loop has a policy of its own; they may share a Recorder.
+    """
+
+    def __init__(
+        self, policy: ActingPolicy, record: str | Path | Recorder, *, act: Callable[..., Any] | None = None
+    ) -> None:
+        """Record to the new file `record` (.mcap), into the folder `record`, or with a Recorder that is there already.
+
+        `act` stands in for `policy.act` where a policy records itself.
+        """
+        self._policy = policy
+        self._act = policy.act if act is None else act
+        self._own = None if isinstance(record, Recorder) else Recorder(record)
+        self._recorder = record if isinstance(record, Recorder) else self._own
+        self._source = _innermost(policy)
+        self._format: PolicyFormat | None = None
+        self._episode = ""
+        self._step = 0
+        self.begin()
+
+    @property
+    def policy(self) -> ActingPolicy:
+        """What is recorded."""
+        return self._policy
+
+    @property
+    def contract(self) -> Contract:
+        return self._policy.contract
+
+    @property
+    def recorder(self) -> Recorder:
+        """Where the records go."""
+        assert self._recorder is not None
+        return self._recorder
+
+    def act(
+        self, obs: Observation, *, explore: bool = False, seed: int | None = None, reward: ArrayLike | None = None
+    ) -> Any:
+        """Return the policy's action and record it; what the policy raises is recorded and raised."""
+        seen = _copy(obs)  # an environment may write into what it gave
+        more: dict[str, Any] = {} if reward is None else {"reward": reward}
+        wall_ns, monotonic_ns, began = time.time_ns(), time.monotonic_ns(), time.perf_counter()
+        action, error = None, None
+        try:
+            action = self._act(obs, explore=explore, seed=seed, **more)
+        except RlservoError as raised:
+            error = raised.code
+            raise
+        finally:
+            latency_ms = 1e3 * (time.perf_counter() - began)
+            policy = self._known_format(action is not None)
+            if policy is not None:
+                record = DecisionRecord(
+                    policy, seen, _copy(action), self._episode, self._step, latency_ms, explore,
+                    reward_input=reward, error=error, wall_ns=wall_ns, monotonic_ns=monotonic_ns,
+                )  # fmt: skip
+                self._add_details(record)
+                self.recorder.record(record)
+            self._step += 1
+        return action
+
+    def outcome(
+        self,
+        reward: float | None = None,
+        *,
+        terminated: bool = False,
+        truncated: bool = False,
+        final_status: str | None = None,
+        final_obs: Observation | None = None,
+    ) -> None:
+        """Record what the last action brought and whether the episode ended with it.
+
+        `final_obs` is the observation after an episode's last action. Nothing to do before the first action.
+        """
+        self._add_outcome(
+            reward=None if reward is None else float(reward),
+            terminated=bool(terminated),
+            truncated=bool(truncated),
+            final_status=final_status,
+            final_obs=None if final_obs is None else _copy(final_obs),
+        )
+
+    def commanded(self, action: Any) -> None:
+        """Record what the robot was commanded instead of the last action."""
+        self._add_outcome(commanded=_copy(action))
+        passed_on = getattr(self._policy, "commanded", None)
+        if passed_on is not None and self._source is not self._policy:
+            passed_on(action)
+
+    def begin(self) -> None:
+        """Begin an episode of the recording, and of nothing else."""
+        self._episode, self._step = uuid.uuid4().hex[:16], 0
+
+    def end(self) -> None:
+        """End the recording, and nothing else; a Recorder that was given goes on."""
+        if self._own is not None:
+            self._own.close()
+
+    def reset(self) -> None:
+        """Start an episode."""
+        self.begin()
+        self._policy.reset()
+
+    def close(self) -> None:
+        """End the recording and close the policy."""
+        self.end()
+        self._policy.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _known_format(self, has_acted: bool) -> PolicyFormat | None:
+        """Return the policy's format; None before a server has told its contract."""
+        if self._format is None and has_acted:
+            options = getattr(self._source, "options", None)
+            self._format = self.recorder.policy(
+                self._policy.contract,
+                graph_hash=getattr(self._source, "graph_hash", ""),
+                options=None if options is None else options.model_dump(mode="json", exclude_defaults=True),
+            )
+        return self._format
+
+    def _add_details(self, record: DecisionRecord) -> None:
+        """Add what the policy says of its last action."""
+        failure = getattr(self._policy, "failure", None)  # of a policy with a fallback
+        if failure is not None and record.error is None:
+            record.action, record.commanded, record.error = None, record.action, failure.code
+        draw = getattr(self._source, "draw", None)
+        if record.explore and draw is not None and record.action is not None:
+            record.own_action, record.dist_inputs = draw.own, draw.inputs
+        reply = getattr(self._source, "last_reply", None)  # of a client
+        if isinstance(reply, Mapping) and record.action is not None:
+            record.seq, record.warnings = reply.get("seq"), reply.get("warnings") or ()
+        notices = getattr(self._source, "notices", None)  # of a policy in process
+        if notices:
+            record.warnings = tuple(notices)
+            notices.clear()
+
+    def _add_outcome(self, **fields: Any) -> None:
+        if self._format is not None and self._step:
+            self.recorder.record(OutcomeRecord(self._format, self._episode, self._step - 1, **fields))
+
+
+def _innermost(policy: Any) -> Any:
+    """Return the policy inside all wrappers."""
+    while (inner := getattr(policy, "policy", None)) is not None:
+        policy = inner
+    return policy
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _copy(part) for key, part in value.items()}
+    if isinstance(value, tuple):
+        return tuple(_copy(part) for part in value)
+    return None if value is None else np.array(value)

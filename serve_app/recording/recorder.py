@@ -1,0 +1,238 @@
+"""Recorder: a bounded buffer on the hot path, and a thread that writes what is in it to MCAP files.
+
+Recording never gets in the way of acting: `record` takes a microsecond and raises nothing, what does not fit into the
+buffer is dropped and counted (and the file says where), and when a file cannot be written recording ends with one
+line in the log.
+"""
+
+from __future__ import annotations
+
+import atexit
+import fcntl
+import logging
+import os
+import re
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from typing_extensions import Self
+
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import RlservoError, UsageError, first_line
+from rlservo.serve_app.recording.log_file import LogFile
+from rlservo.serve_app.recording.policy_format import PolicyFormat
+from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
+
+logger = logging.getLogger(__name__)
+
+SUFFIX = ".mcap"
+FILE_NAME = re.compile(r"^rlservo-[0-9]{8}T[0-9]{6}-.+-[0-9]+-[0-9]+\.mcap$")
+MIB = 1024 * 1024
+BUFFER_RECORDS = 20_000
+BUFFER_BYTES = 64 * MIB
+DRAIN_S = 0.1  # between two looks into the buffer
+FLUSH_S = 0.7  # together under a second: that much a killed process loses
+YIELD_EVERY = 8  # records written at a stretch before other threads get the interpreter
+WAIT_S = 10.0  # for the writer to finish at close
+
+
+class Recorder:
+    """Writes records to one file, or to a folder of files that rotate.
+
+    ```python
+    with Recorder("recordings") as recorder:
+        policy = recorder.policy(contract)
+        recorder.record(DecisionRecord(policy, obs, action))
+    ```
+
+    Any thread may record. Several processes may record into one folder: each has files of its own.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        max_file_bytes: int = 256 * MIB,
+        max_file_s: float = 3600.0,
+        max_folder_bytes: int = 10 * 1024 * MIB,
+    ) -> None:
+        """Record to the new file `path` where that ends in .mcap, else into the folder `path`.
+
+        A folder's file is ended at `max_file_bytes` or after `max_file_s`; of a folder beyond `max_folder_bytes` the
+        oldest recordings that nobody is writing are deleted. Raises UsageError where nothing can be written there.
+        """
+        if max_file_bytes < MIB or max_file_s <= 0 or max_folder_bytes < 2 * max_file_bytes:
+            raise UsageError(
+                f"a recording's file has at least {MIB} bytes and its folder room for two, got max_file_bytes "
+                f"{max_file_bytes}, max_file_s {max_file_s:g}, max_folder_bytes {max_folder_bytes}"
+            )
+        self.path = Path(path)
+        self._is_folder = self.path.suffix != SUFFIX
+        self._max_file_bytes, self._max_file_s, self._max_folder_bytes = max_file_bytes, max_file_s, max_folder_bytes
+        self._buffer: deque[DecisionRecord | OutcomeRecord] = deque()
+        self._room = BUFFER_RECORDS
+        self._policies: dict[tuple[str, str, str, str], PolicyFormat] = {}
+        self.dropped = 0
+        """Records that did not fit into the buffer, or came after recording had ended."""
+        self.written = 0
+        self.failure: str | None = None
+        """Why recording has ended, where it could not go on."""
+        self._marked = 0
+        self._unreadable = False
+        self._files = 0
+        self._file: LogFile | None = None
+        self._began = f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{socket.gethostname()}-{os.getpid()}"
+        try:
+            if self._is_folder:
+                self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+                if not os.access(self.path, os.W_OK | os.X_OK):
+                    raise PermissionError(13, "Permission denied", str(self.path))
+            else:
+                self._file = LogFile(self.path)
+        except FileExistsError:
+            raise UsageError(f"{self.path} exists: a recording is a new file, or a folder") from None
+        except OSError as error:
+            raise UsageError(f"nothing can be recorded at {self.path}: {error.strerror or error}") from error
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="rlservo-recorder", daemon=True)
+        self._thread.start()
+        atexit.register(self.close)
+
+    def policy(
+        self, contract: Contract, *, graph_hash: str = "", options: Mapping[str, Any] | None = None
+    ) -> PolicyFormat:
+        """Return the format under which a policy's records are made; the same one for the same policy."""
+        made = PolicyFormat(contract, graph_hash=graph_hash, options=options)
+        made = self._policies.setdefault(made.key, made)
+        self._room = min(self._room, max(64, BUFFER_BYTES // made.record_bytes))
+        return made
+
+    def record(self, record: DecisionRecord | OutcomeRecord) -> bool:
+        """Take a record; return whether there was room for it."""
+        if len(self._buffer) >= self._room or self.failure is not None:
+            self.dropped += 1
+            return False
+        self._buffer.append(record)
+        return True
+
+    def close(self) -> None:
+        """Write what is in the buffer and end the file."""
+        atexit.unregister(self.close)
+        self._closing.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(WAIT_S)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        flushed = time.monotonic()
+        try:
+            while True:
+                closing = self._closing.wait(DRAIN_S)
+                self._drain()
+                now = time.monotonic()
+                if self._file is not None and (closing or now - flushed >= FLUSH_S):
+                    self._file.flush()
+                    flushed = now
+                    self._rotate()
+                if closing and not self._buffer:
+                    break
+            if self._file is not None:
+                self._file.close()
+        except Exception as error:  # a full disk, a folder that went away: acting goes on
+            self._end(error)
+
+    def _drain(self) -> None:
+        """Write what was in the buffer when this began."""
+        for count in range(len(self._buffer)):
+            record = self._buffer.popleft()
+            file = self._file or self._next_file()
+            try:
+                if isinstance(record, DecisionRecord):
+                    file.add_decision(record)
+                else:
+                    file.add_outcome(record)
+                self.written += 1
+            except (RlservoError, ValueError, TypeError, KeyError, IndexError) as error:  # not of the policy's spaces
+                self.dropped += 1
+                if not self._unreadable:
+                    self._unreadable = True
+                    logger.warning("a record of policy '%s' was dropped: %s", record.policy.title, first_line(error))
+            if count % YIELD_EVERY == 0:
+                time.sleep(0)
+        missing = self.dropped - self._marked
+        if missing and self._file is not None:
+            self._file.add_dropped(missing)
+            self._marked += missing
+
+    def _rotate(self) -> None:
+        file = self._file
+        if file is None or not self._is_folder:
+            return
+        if file.size >= self._max_file_bytes or file.age_s >= self._max_file_s:
+            self._file = None
+            file.close()
+
+    def _next_file(self) -> LogFile:
+        while True:
+            self._files += 1
+            try:
+                self._file = LogFile(self.path / f"rlservo-{self._began}-{self._files:06d}{SUFFIX}")
+            except FileExistsError:  # of another recorder in this process
+                continue
+            _delete_oldest(self.path, self._max_folder_bytes - self._max_file_bytes)
+            return self._file
+
+    def _end(self, error: Exception) -> None:
+        self.failure = first_line(error)
+        self.dropped += len(self._buffer)
+        self._buffer.clear()
+        if self._file is not None:
+            self._file.abandon()
+        logger.error("recording to %s has ended, acting goes on: %s", self.path, self.failure)
+
+
+def _delete_oldest(folder: Path, limit: int) -> None:
+    """Delete the oldest recordings in a folder until the rest has at most `limit` bytes; never one being written."""
+    found: list[tuple[float, int, Path]] = []
+    for path in folder.iterdir():
+        if FILE_NAME.match(path.name):
+            try:
+                facts = path.lstat()
+            except FileNotFoundError:  # another writer of the folder was faster
+                continue
+            found.append((facts.st_mtime, facts.st_size, path))
+    total = sum(size for _, size, _ in found)
+    for _, size, path in sorted(found):
+        if total <= limit:
+            return
+        if not is_being_written(path):
+            path.unlink(missing_ok=True)
+            total -= size
+
+
+def is_being_written(path: Path) -> bool:
+    """Return whether a process holds the file open for recording."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False

@@ -1,0 +1,27 @@
+"""Start of a recording for those who may not have its packages installed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.interface import ActingPolicy
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.recording.recorded_policy import WithRecording
+    from rlservo.serve_app.recording.recorder import Recorder
+
+
+def record_policy(
+    policy: ActingPolicy, record: str | Path | Recorder, *, act: Callable[..., Any] | None = None
+) -> WithRecording:
+    """Return `WithRecording(policy, record)`; raise UsageError where a package is missing."""
+    try:
+        from rlservo.serve_app.recording.recorded_policy import WithRecording
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("rlservo"):
+            raise
+        raise UsageError(f"recording needs the Python package {error.name!r}: pip install 'rlservo[record]'") from error
+    return WithRecording(policy, record, act=act)
