@@ -120,12 +120,12 @@ class Episode:
         return self._numbers("logp")
 
     @cached_property
-    def dist_inputs(self) -> NDArray[np.float64]:
+    def dist_inputs(self) -> NDArray[np.float32]:
         """The distribution's parameters `[rows, n]`; not a number where they are not known."""
         size = next((len(one["dist_inputs"]) for one in self._decisions if "dist_inputs" in one), 0)
         unknown = [math.nan] * size
         rows = [one.get("dist_inputs", unknown) for one in self._decisions]
-        return np.array([[-math.inf if x is None else x for x in row] for row in rows], np.float64)
+        return np.array([[-math.inf if x is None else x for x in row] for row in rows], np.float32)
 
     @cached_property
     def reward(self) -> NDArray[np.float64]:

@@ -36,15 +36,20 @@ class WithRecording:
     """
 
     def __init__(
-        self, policy: ActingPolicy, record: str | Path | Recorder, *, act: Callable[..., Any] | None = None
+        self,
+        policy: ActingPolicy,
+        record: str | Path | Recorder,
+        *,
+        wait: bool = False,
+        act: Callable[..., Any] | None = None,
     ) -> None:
         """Record to the new file `record` (.mcap), into the folder `record`, or with a Recorder that is there already.
 
-        `act` stands in for `policy.act` where a policy records itself.
+        `wait` is the Recorder's; `act` stands in for `policy.act` where a policy records itself.
         """
         self._policy = policy
         self._act = policy.act if act is None else act
-        self._own = None if isinstance(record, Recorder) else Recorder(record)
+        self._own = None if isinstance(record, Recorder) else Recorder(record, wait=wait)
         self._recorder = record if isinstance(record, Recorder) else self._own
         self._source = _innermost(policy)
         self._format: PolicyFormat | None = None

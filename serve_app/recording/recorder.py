@@ -61,11 +61,13 @@ class Recorder:
         max_file_bytes: int = 256 * MIB,
         max_file_s: float = 3600.0,
         max_folder_bytes: int = 10 * 1024 * MIB,
+        wait: bool = False,
     ) -> None:
         """Record to the new file `path` where that ends in .mcap, else into the folder `path`.
 
         A folder's file is ended at `max_file_bytes` or after `max_file_s`; of a folder beyond `max_folder_bytes` the
-        oldest recordings that nobody is writing are deleted. Raises UsageError where nothing can be written there.
+        oldest recordings that nobody is writing are deleted. `wait` lets a full buffer hold the caller up instead of
+        dropping: for a simulation, which has the time. Raises UsageError where nothing can be written there.
         """
         if max_file_bytes < MIB or max_file_s <= 0 or max_folder_bytes < 2 * max_file_bytes:
             raise UsageError(
@@ -73,6 +75,7 @@ class Recorder:
                 f"{max_file_bytes}, max_file_s {max_file_s:g}, max_folder_bytes {max_folder_bytes}"
             )
         self.path = Path(path)
+        self._wait = wait
         self._is_folder = self.path.suffix != SUFFIX
         self._max_file_bytes, self._max_file_s, self._max_folder_bytes = max_file_bytes, max_file_s, max_folder_bytes
         self._buffer: deque[DecisionRecord | OutcomeRecord] = deque()
@@ -115,6 +118,8 @@ class Recorder:
 
     def record(self, record: DecisionRecord | OutcomeRecord) -> bool:
         """Take a record; return whether there was room for it."""
+        while self._wait and len(self._buffer) >= self._room and self._thread.is_alive():
+            time.sleep(0.001)
         if len(self._buffer) >= self._room or self.failure is not None:
             self.dropped += 1
             return False

@@ -15,7 +15,11 @@ if TYPE_CHECKING:
 
 
 def record_policy(
-    policy: ActingPolicy, record: str | Path | Recorder, *, act: Callable[..., Any] | None = None
+    policy: ActingPolicy,
+    record: str | Path | Recorder,
+    *,
+    wait: bool = False,
+    act: Callable[..., Any] | None = None,
 ) -> WithRecording:
     """Return `WithRecording(policy, record)`; raise UsageError where a package is missing."""
     try:
@@ -24,4 +28,4 @@ def record_policy(
         if (error.name or "").startswith("rlservo"):
             raise
         raise UsageError(f"recording needs the Python package {error.name!r}: pip install 'rlservo[record]'") from error
-    return WithRecording(policy, record, act=act)
+    return WithRecording(policy, record, wait=wait, act=act)

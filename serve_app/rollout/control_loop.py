@@ -81,7 +81,7 @@ def rollout(
                 f"{wanted} needs a control rate, and neither {env_id} (describe(), render_fps) nor the policy's "
                 "contract states one"
             )
-        recorded = None if record is None else record_policy(policy, record)
+        recorded = None if record is None else record_policy(policy, record, wait=rate == "max")
         if recorded is not None:
             cleanup.callback(recorded.end)
         loop = _Loop(

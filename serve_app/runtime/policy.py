@@ -53,6 +53,18 @@ Network = Callable[[dict[str, NDArray[Any]]], dict[str, NDArray[Any]]]
 
 
 @dataclass(frozen=True, slots=True)
+class Answer:
+    """What the policy would have done in an episode that took another course (`Policy.follow`)."""
+
+    leaves: dict[str, NDArray[Any]]
+    """The deterministic action by tensor name, `[batch, *shape]`."""
+    inputs: NDArray[Any] | None
+    """`action_dist_inputs`, where the policy has a distribution."""
+    state: State
+    """For the next step."""
+
+
+@dataclass(frozen=True, slots=True)
 class Step:
     """What one step of an episode came to."""
 
@@ -269,6 +281,34 @@ class Policy:
         space = self._contract.action_space
         own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
         return Step(build_action(space, own), action, after, rows if batch else None, feed)
+
+    def follow(
+        self,
+        obs: Observation,
+        done: Mapping[str, NDArray[Any]],
+        *,
+        before: State | None = None,
+        last: Mapping[str, NDArray[Any]] | None = None,
+        reward: ArrayLike | None = None,
+    ) -> Answer:
+        """Return what the policy would have done, and remember nothing, where what was done is `done`.
+
+        `done` and `last`, the step before's, are leaves `[batch, *shape]`: what the policy sees of its actions, and
+        what limits count from, is what the robot did. Raises what `step` raises.
+        """
+        feed, _ = self._reader.read(obs)
+        rows = len(next(iter(feed.values())))
+        feed.update(self._memory.feed(before, rows, reward))
+        explores = self._contract.distribution is not None
+        names = list(self._guards) + (self._dist_only if explores else []) + self._memory.outputs
+        computed = dict(zip(names, self._run(names, feed), strict=True))
+        action = {name: computed[name] for name in self._guards}
+        for name, guard in self._guards.items():
+            guard.check(action[name])
+        if self._limit and last is not None:
+            action, _ = self._limit.apply(action, last)
+        inputs = computed["action_dist_inputs"] if explores else None
+        return Answer(action, inputs, self._memory.keep(computed, done))
 
     def read(self, obs: Observation) -> tuple[dict[str, NDArray[Any]], bool]:
         """Return what the network would be given, and whether that is a batch. Raises ObservationError."""

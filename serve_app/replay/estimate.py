@@ -1,0 +1,282 @@
+"""Estimate: the return a bundle would have earned, from recordings of another policy, before it drives anything.
+
+Where the recorded actions explored, with known log-probabilities, episodes are weighted by how much likelier the bundle
+makes them (per-decision importance sampling: Precup, Sutton, Singh 2000). Where they did not, a model of the action's
+value is fitted (`fitted_q.py`). Each estimate says whether the recordings can support it, and why not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.spaces import leaf_specs
+from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.replay.fitted_q import fitted_q
+from rlservo.serve_app.replay.followed import Followed, Follower
+
+LARGEST = 5_000_000  # numbers in one matrix of episodes by steps
+RESAMPLES = 1000
+CONFIDENCE = 0.95
+FEWEST_EPISODES = 30
+SMALLEST_SAMPLE = 30.0  # effective episodes; below it a bootstrap interval is too narrow (benchmarks/estimates.md)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One way of estimating the bundle's mean return."""
+
+    method: str
+    value: float
+    interval: tuple[float, float]
+    effective_samples: float
+    """Episodes of the bundle's own that would tell as much."""
+    supported: bool
+    reason: str
+    """A sentence: why the interval holds, or why the recordings cannot support it."""
+
+
+@dataclass
+class EstimateReport:
+    """What the recordings say of a bundle's return."""
+
+    bundle: str
+    target: str
+    """Which of the bundle's policies: 'deterministic', as it is served by default, or 'exploring'."""
+    policies: list[str] = field(default_factory=list)
+    gamma: float = 1.0
+    episodes: int = 0
+    recorded_return: float | None = None
+    """Mean over the episodes that were used."""
+    recorded_interval: tuple[float, float] | None = None
+    not_used: dict[str, int] = field(default_factory=dict)
+    """Episodes that could not be used, by the reason."""
+    estimates: list[Estimate] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain JSON types."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What an estimate needs of one episode."""
+
+    rewards: NDArray[np.float64]
+    log_weights: NDArray[np.float64] | None
+    """Log of how much likelier each action is under the bundle; None where that is not known."""
+    obs: NDArray[np.float32]
+    """`[steps, n]`"""
+    actions: NDArray[np.float32]
+    """`[steps, m]`, choices one-hot."""
+    chosen: NDArray[np.float32]
+    """The same of the bundle's deterministic actions."""
+
+
+def estimate(
+    recording: Recording,
+    bundle: str | Path,
+    *,
+    explore: bool = False,
+    gamma: float = 1.0,
+    name: str | None = None,
+    seed: int = 0,
+) -> EstimateReport:
+    """Estimate the mean return of a bundle's deterministic policy, or with `explore` of its exploring one.
+
+    Raises OtherContractError where the recording does not fit the bundle, and UsageError where no episode can be used.
+    """
+    if not 0 < gamma <= 1:
+        raise UsageError(f"gamma must be above 0 and at most 1, got {gamma:g}")
+    follower = Follower(bundle)
+    contract = follower.contract
+    if explore and contract.distribution is None:
+        raise UsageError(f"policy '{contract.name}' has no action distribution and cannot explore")
+    report = EstimateReport(
+        f"{contract.name}/{contract.version}", "exploring" if explore else "deterministic", gamma=gamma
+    )
+    trajectories: list[Trajectory] = []
+    for followed in follower.follow(recording, name):
+        if followed.episode.policy.title not in report.policies:
+            report.policies.append(followed.episode.policy.title)
+        reason = _why_not(followed)
+        if reason is None:
+            trajectories.append(_trajectory(followed, contract, explore))
+        else:
+            report.not_used[reason] = report.not_used.get(reason, 0) + 1
+    if not trajectories:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in report.not_used.items()) or "there are none"
+        raise UsageError(f"no recorded episode can be used: {reasons}")
+    longest = max(len(one.rewards) for one in trajectories)
+    if longest * len(trajectories) > LARGEST:
+        kept = max(1, LARGEST // longest)
+        report.not_used["beyond what fits into memory"] = len(trajectories) - kept
+        trajectories = trajectories[-kept:]
+    rng = np.random.default_rng(seed)
+    returns = np.array([_discounted(one.rewards, gamma) for one in trajectories])
+    report.episodes = len(trajectories)
+    report.recorded_return = float(returns.mean())
+    report.recorded_interval = _interval(_resampled_means(returns, rng))
+    if all(one.log_weights is not None for one in trajectories):
+        report.estimates += importance_sampling(trajectories, gamma, rng)
+    else:
+        report.estimates.append(_fitted(trajectories, gamma, explore, contract, rng))
+    return report
+
+
+def importance_sampling(trajectories: list[Trajectory], gamma: float, rng: np.random.Generator) -> list[Estimate]:
+    """Return per-decision importance sampling's estimates, the weighted form first."""
+    longest = max(len(one.rewards) for one in trajectories)
+    weights = np.zeros((len(trajectories), longest))
+    earned = np.zeros((len(trajectories), longest))
+    discounts = gamma ** np.arange(longest)
+    for row, one in enumerate(trajectories):
+        assert one.log_weights is not None
+        steps = len(one.rewards)
+        total = np.cumsum(one.log_weights)
+        weights[row, :steps] = np.exp(np.minimum(total, 700.0))
+        weights[row, steps:] = weights[row, steps - 1]  # the episode is over: it weighs what it did at its end
+        earned[row, :steps] = one.rewards
+    discounted = weights * earned * discounts
+    final = weights[:, -1]
+    squares = float((final**2).sum())
+    effective = float(final.sum()) ** 2 / squares if squares > 0 else 0.0
+
+    counts = rng.multinomial(len(trajectories), np.full(len(trajectories), 1 / len(trajectories)), RESAMPLES)
+    numerators, denominators = counts @ discounted, counts @ weights
+    with np.errstate(invalid="ignore", divide="ignore"):
+        resampled = np.nan_to_num(numerators / denominators).sum(axis=1)
+        weighted = float(np.nan_to_num(discounted.sum(axis=0) / weights.sum(axis=0)).sum())
+    plain = discounted.sum(axis=1)
+    supported, reason = _support(len(trajectories), effective)
+    return [
+        Estimate(
+            "weighted per-decision importance sampling", weighted, _interval(resampled), effective, supported, reason
+        ),
+        Estimate(
+            "per-decision importance sampling",
+            float(plain.mean()),
+            _interval(_resampled_means(plain, rng)),
+            effective,
+            supported,
+            reason,
+        ),
+    ]
+
+
+def _support(episodes: int, effective: float) -> tuple[bool, str]:
+    if episodes < FEWEST_EPISODES:
+        return False, f"{episodes} episodes are too few: at least {FEWEST_EPISODES} are needed"
+    if effective < SMALLEST_SAMPLE:
+        return False, (
+            f"the bundle acts too differently from what was recorded: {episodes} episodes tell as much as "
+            f"{effective:.1f} of its own, and {SMALLEST_SAMPLE:g} are needed"
+        )
+    return True, f"{episodes} episodes tell as much as {effective:.0f} of the bundle's own"
+
+
+def _fitted(
+    trajectories: list[Trajectory], gamma: float, explore: bool, contract: Contract, rng: np.random.Generator
+) -> Estimate:
+    if explore:
+        raise UsageError(
+            "an exploring policy's return can be estimated only from recorded actions that explored, with their "
+            f"log-probabilities (policy '{contract.name}'): leave --explore out, or record with it"
+        )
+    fit = fitted_q([(one.rewards, one.obs, one.actions, one.chosen) for one in trajectories], gamma, RESAMPLES, rng)
+    reason = fit.doubt
+    if len(trajectories) < FEWEST_EPISODES:
+        reason = f"{len(trajectories)} episodes are too few: at least {FEWEST_EPISODES} are needed"
+    return Estimate(
+        "fitted Q evaluation",
+        fit.value,
+        _interval(fit.resampled),
+        fit.effective_samples,
+        reason is None,
+        reason
+        or f"the fitted value gives the recorded return again, and {fit.inside:.0%} of the bundle's actions "
+        "are like recorded ones",
+    )
+
+
+def _why_not(followed: Followed) -> str | None:
+    episode = followed.episode
+    if not episode.begins or not episode.id or episode.goes_on or episode.gap is not None:
+        return "incomplete"
+    if not episode.ended:
+        return "without an end"
+    if not np.isfinite(episode.reward).all():
+        return "without every reward"
+    if episode.fell_back.any() or not episode.acted.all():
+        return "with fallback actions"
+    return None if followed.known.all() else "in which the bundle's action is unsafe"
+
+
+def _trajectory(followed: Followed, contract: Contract, explore: bool) -> Trajectory:
+    episode = followed.episode
+    return Trajectory(
+        episode.reward,
+        _log_weights(followed, contract, explore),
+        _flat(episode.obs),
+        _one_hot(episode.executed, contract),
+        _one_hot(followed.action, contract),
+    )
+
+
+def _log_weights(followed: Followed, contract: Contract, explore: bool) -> NDArray[np.float64] | None:
+    """Return the log of each action's probability under the bundle over that under the recorded policy."""
+    episode = followed.episode
+    if not np.isfinite(episode.logp).all():
+        return None
+    if explore:
+        assert followed.inputs is not None
+        likelier = episode.policy.log_probability(followed.inputs, episode.own_action)
+        return None if likelier is None else likelier - episode.logp
+    leaves = leaf_specs(contract.action_space, "action")
+    if any(leaf.kind == "box" for leaf in leaves.values()):
+        return None  # a single action has no probability in a continuum
+    same = np.ones(len(episode), np.bool_)
+    for name, leaf in followed.action.items():
+        same &= (leaf == episode.action[name]).reshape(len(episode), -1).all(axis=1)
+    return np.where(same, 0.0, -np.inf) - episode.logp
+
+
+def _flat(leaves: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
+    columns = [leaf.reshape(len(leaf), -1).astype(np.float32) for leaf in leaves.values()]
+    return np.concatenate(columns, axis=1)
+
+
+def _one_hot(leaves: dict[str, NDArray[Any]], contract: Contract) -> NDArray[np.float32]:
+    parts: list[NDArray[np.float32]] = []
+    for name, leaf in leaf_specs(contract.action_space, "action").items():
+        flat = leaves[name].reshape(len(leaves[name]), -1)
+        if leaf.kind == "discrete":
+            parts.append(np.eye(leaf.n, dtype=np.float32)[flat[:, 0] - leaf.start])
+        elif leaf.kind == "multi_discrete":
+            parts += [np.eye(size, dtype=np.float32)[flat[:, i] - leaf.start[i]] for i, size in enumerate(leaf.nvec)]
+        else:
+            parts.append(flat.astype(np.float32))
+    return np.concatenate(parts, axis=1)
+
+
+def _discounted(rewards: NDArray[np.float64], gamma: float) -> float:
+    return float((rewards * gamma ** np.arange(len(rewards))).sum())
+
+
+def _resampled_means(values: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    counts = rng.multinomial(len(values), np.full(len(values), 1 / len(values)), RESAMPLES)
+    return np.asarray(counts @ values / len(values))
+
+
+def _interval(resampled: Iterable[float]) -> tuple[float, float]:
+    """Return the percentile bootstrap interval (Efron, Tibshirani 1993)."""
+    tail = 100 * (1 - CONFIDENCE) / 2
+    low, high = np.percentile(np.fromiter(resampled, np.float64), (tail, 100 - tail))
+    return float(low), float(high)

@@ -1,0 +1,217 @@
+"""Recorded episodes followed by another policy: what it would have done, decision by decision.
+
+A policy that remembers nothing computes an episode's observations at once. A batch's sums may be formed in another
+order, so that last bits differ: where the action is not the recorded one and close to it, the observation is computed
+again by itself, as it was when the robot was driven. Recurrent state and step limits start where the episode did.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from rlservo.export.contract.contract import REWARD, Contract
+from rlservo.export.contract.errors import ActionError, UsageError
+from rlservo.export.contract.nested import build_action
+from rlservo.serve_app.recording.episodes import Episode, episodes
+from rlservo.serve_app.recording.policy_format import PolicyFormat, element_differences
+from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.runtime.options import PolicyOptions
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.runtime.recurrent_state import State
+
+SHOWN_DIFFERENCES = 10
+ROUNDING = 1e-4  # relative: beyond it a difference is not a batch's last bits
+
+
+class OtherContractError(UsageError):
+    """The recording is of a policy with other observations or actions."""
+
+
+@dataclass(frozen=True)
+class Followed:
+    """An episode and what the bundle would have done in it. Rows that are not `known` hold zeros."""
+
+    episode: Episode
+    known: NDArray[np.bool_]
+    """Whether the bundle's action is known: not after a gap where the policy remembers, nor without a recorded action."""
+    unsafe: NDArray[np.bool_]
+    """Whether the bundle's action was none of its space."""
+    action: dict[str, NDArray[Any]]
+    inputs: NDArray[Any] | None
+    """The bundle's `action_dist_inputs`, `[rows, n]`."""
+
+
+class Follower:
+    """One bundle that follows recordings."""
+
+    def __init__(self, bundle: str | Path) -> None:
+        """Load and prove the bundle."""
+        self._bundle = bundle
+        self.policy = Policy.load(bundle)
+        self._loaded: dict[str, Policy] = {"{}": self.policy}
+        self._checked: set[int] = set()
+        self._carried: dict[tuple[int, str], tuple[State | None, dict[str, NDArray[Any]] | None]] = {}
+        self.skipped: dict[str, int] = {}
+        """How many decisions are of other policies, by their name."""
+
+    @property
+    def contract(self) -> Contract:
+        return self.policy.contract
+
+    def follow(self, recording: Recording, name: str | None = None) -> Iterator[Followed]:
+        """Yield every episode of the policy `name`, of the bundle's own name by default, or of the only one there is.
+
+        Raises OtherContractError where its observations or actions are others than the bundle's.
+        """
+        for episode in episodes(recording):
+            recorded = episode.policy
+            own = self.contract.name if name is None else name
+            if recorded.contract.name != own and (name is not None or not _is_only(recording, recorded)):
+                self.skipped[recorded.title] = self.skipped.get(recorded.title, 0) + len(episode)
+                continue
+            self._check(recorded)
+            yield self._follow(episode)
+
+    def _follow(self, episode: Episode) -> Followed:
+        policy = self._policy_of(episode.policy)
+        if not policy.episodic and all(tensor.name != REWARD for tensor in policy.contract.inputs):
+            at_once = _follow_at_once(policy, episode)
+            if at_once is not None:
+                return at_once
+        rows = len(episode)
+        known = episode.acted.copy()
+        unsafe = np.zeros(rows, np.bool_)
+        action = {name: np.zeros_like(leaf) for name, leaf in episode.action.items()}
+        inputs: NDArray[Any] | None = None
+        key = (id(episode.policy), episode.id)
+        before, last = (None, None) if episode.begins else self._carried.pop(key, (None, None))
+        if policy.episodic:
+            end = self._end_of_memory(episode, before, last, policy)
+            known[end:] = False
+        rewarded = any(tensor.name == REWARD for tensor in policy.contract.inputs)
+        space, seen = policy.contract.observation_space, episode.obs
+        executed = episode.executed
+        moved = episode.acted | episode.fell_back
+        for row in range(rows):
+            done = {name: leaf[row : row + 1] for name, leaf in executed.items()}
+            if known[row]:
+                obs = build_action(space, {name: leaf[row] for name, leaf in seen.items()}, "obs")
+                reward = episode.reward_input[row] if rewarded else None
+                try:
+                    answer = policy.follow(obs, done, before=before, last=last, reward=reward)
+                except ActionError:
+                    known[row], unsafe[row] = False, True
+                    if policy.episodic:  # what it would remember then is not known either
+                        known[row + 1 :] = False
+                    continue
+                for name, leaf in answer.leaves.items():
+                    action[name][row] = leaf[0].reshape(action[name].shape[1:])
+                if answer.inputs is not None:
+                    inputs = np.zeros((rows, answer.inputs.shape[1]), answer.inputs.dtype) if inputs is None else inputs
+                    inputs[row] = answer.inputs[0]
+                before = answer.state or None
+            if policy.limited and moved[row]:
+                last = done
+        if episode.goes_on:
+            self._carried[key] = (before, last)
+        return Followed(episode, known, unsafe, action, inputs)
+
+    def _end_of_memory(self, episode: Episode, before: Any, last: Any, policy: Policy) -> int:
+        """Return the first row for which the policy's memory of the episode is not known."""
+        if not episode.id or (not episode.begins and before is None and last is None):
+            return 0
+        return len(episode) if episode.gap is None else episode.gap
+
+    def _policy_of(self, recorded: PolicyFormat) -> Policy:
+        """Return the bundle under the options that the recorded policy had."""
+        try:
+            options = PolicyOptions.model_validate(recorded.options)
+        except ValidationError:  # of a newer version
+            options = PolicyOptions()
+        key = options.model_dump_json(exclude_defaults=True)
+        if key not in self._loaded:
+            self._loaded[key] = Policy.load(self._bundle, check_golden=False, options=options)
+        return self._loaded[key]
+
+    def _check(self, recorded: PolicyFormat) -> None:
+        if id(recorded) in self._checked:
+            return
+        found = list(element_differences(recorded.contract, self.contract))
+        if found:
+            shown = "; ".join(found[:SHOWN_DIFFERENCES])
+            more = f"; and {len(found) - SHOWN_DIFFERENCES} more" if len(found) > SHOWN_DIFFERENCES else ""
+            raise OtherContractError(
+                f"the recording of {recorded.title} does not fit the bundle {self.contract.name}/"
+                f"{self.contract.version}: {shown}{more}",
+                {"differences": found},
+            )
+        self._checked.add(id(recorded))
+
+
+def _follow_at_once(policy: Policy, episode: Episode) -> Followed | None:
+    """Follow an episode with a policy that remembers nothing; None where a row needs a look of its own."""
+    known = np.flatnonzero(episode.acted)
+    action = {name: np.zeros_like(leaf) for name, leaf in episode.action.items()}
+    inputs: NDArray[Any] | None = None
+    space = policy.contract.observation_space
+    if len(known):
+        try:
+            answer = policy.follow(
+                build_action(space, {name: leaf[known] for name, leaf in episode.obs.items()}, "obs"), {}
+            )
+        except ActionError:
+            return None
+        for name, leaf in answer.leaves.items():
+            action[name][known] = leaf.reshape(action[name][known].shape)
+        if answer.inputs is not None:
+            inputs = np.zeros((len(episode), answer.inputs.shape[1]), answer.inputs.dtype)
+            inputs[known] = answer.inputs
+        for row in known[_is_close_only(episode, action, inputs, known)]:
+            obs = build_action(space, {name: leaf[row] for name, leaf in episode.obs.items()}, "obs")
+            answer = policy.follow(obs, {})
+            for name, leaf in answer.leaves.items():
+                action[name][row] = leaf[0].reshape(action[name].shape[1:])
+            if inputs is not None and answer.inputs is not None:
+                inputs[row] = answer.inputs[0]
+    return Followed(episode, episode.acted.copy(), np.zeros(len(episode), np.bool_), action, inputs)
+
+
+def _is_close_only(
+    episode: Episode, action: dict[str, NDArray[Any]], inputs: NDArray[Any] | None, rows: NDArray[np.intp]
+) -> NDArray[np.bool_]:
+    """Return which rows differ from what was recorded by no more than rounding may."""
+    pairs = [(leaf[rows], action[name][rows]) for name, leaf in episode.action.items()]
+    explored = episode.explored[rows]
+    close = np.zeros(len(rows), np.bool_)
+    far = np.zeros(len(rows), np.bool_)
+    for recorded, replayed in pairs:
+        _add_closeness(recorded, replayed, ~explored, close, far)
+    if inputs is not None and explored.any() and episode.dist_inputs.shape == inputs.shape:
+        _add_closeness(episode.dist_inputs[rows], inputs[rows], explored, close, far)
+    return close & ~far
+
+
+def _add_closeness(
+    recorded: NDArray[Any],
+    replayed: NDArray[Any],
+    rows: NDArray[np.bool_],
+    close: NDArray[np.bool_],
+    far: NDArray[np.bool_],
+) -> None:
+    ours, theirs = (array.reshape(len(array), -1).astype(np.float64) for array in (recorded, replayed))
+    with np.errstate(invalid="ignore"):
+        difference = np.abs(ours - theirs)
+        limit = ROUNDING * np.maximum(1.0, np.abs(ours))
+        close |= rows & (difference > 0).any(axis=1)
+        far |= rows & (difference > limit).any(axis=1)
+
+
+def _is_only(recording: Recording, recorded: PolicyFormat) -> bool:
+    return {policy.contract.name for policy in recording.policies} == {recorded.contract.name}
