@@ -126,8 +126,13 @@ def estimate(
     report.recorded_interval = _interval(_resampled_means(returns, rng))
     if all(one.log_weights is not None for one in trajectories):
         report.estimates += importance_sampling(trajectories, gamma, rng)
-    else:
-        report.estimates.append(_fitted(trajectories, gamma, explore, contract, rng))
+    elif explore:
+        raise UsageError(
+            "an exploring policy's return can be estimated only from recorded actions that explored, with their "
+            f"log-probabilities, and {contract.name}'s did not all: leave --explore out, or record with it"
+        )
+    if not explore:
+        report.estimates.append(fitted_estimate(trajectories, gamma, rng))
     return report
 
 
@@ -182,15 +187,9 @@ def _support(episodes: int, effective: float) -> tuple[bool, str]:
     return True, f"{episodes} episodes tell as much as {effective:.0f} of the bundle's own"
 
 
-def _fitted(
-    trajectories: list[Trajectory], gamma: float, explore: bool, contract: Contract, rng: np.random.Generator
-) -> Estimate:
-    if explore:
-        raise UsageError(
-            "an exploring policy's return can be estimated only from recorded actions that explored, with their "
-            f"log-probabilities (policy '{contract.name}'): leave --explore out, or record with it"
-        )
-    fit = fitted_q([(one.rewards, one.obs, one.actions, one.chosen) for one in trajectories], gamma, RESAMPLES, rng)
+def fitted_estimate(trajectories: list[Trajectory], gamma: float, rng: np.random.Generator) -> Estimate:
+    """Return fitted Q evaluation's estimate."""
+    fit = fitted_q([(one.rewards, one.obs, one.actions, one.chosen) for one in trajectories], gamma, rng)
     reason = fit.doubt
     if len(trajectories) < FEWEST_EPISODES:
         reason = f"{len(trajectories)} episodes are too few: at least {FEWEST_EPISODES} are needed"
@@ -198,7 +197,7 @@ def _fitted(
         "fitted Q evaluation",
         fit.value,
         _interval(fit.resampled),
-        fit.effective_samples,
+        len(trajectories) * fit.inside,
         reason is None,
         reason
         or f"the fitted value gives the recorded return again, and {fit.inside:.0%} of the bundle's actions "

@@ -1,9 +1,10 @@
-"""Fitted Q evaluation in closed form: the value of a deterministic policy from another policy's episodes.
+"""Fitted Q evaluation: the value of a deterministic policy from another policy's episodes (Le, Voloshin, Yue 2019).
 
-The value of an action in a state is a sum over fixed features of both (and of the step, since episodes have a time
-limit); least-squares temporal differences (Bradtke, Barto 1996; Lagoudakis, Parr 2003) give the weights. The same model
-is fitted to the recorded policy, whose return is known: what it gets wrong there is taken off, and if that is much, or
-if the bundle's actions are unlike the recorded ones, nothing is claimed.
+The value of an action in a state is a weighted sum of fixed features of both (and of the step, since episodes have a
+time limit), fitted by least squares to the reward and the value of what the bundle would do next, again and again, each
+time within what can be earned in the steps that are left. The same model is fitted to the recorded policy, whose return
+is known: what it gets wrong there is taken off and added to the interval. Where that is much, or where the bundle's
+actions are unlike the recorded ones, nothing is claimed.
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-LARGEST_BASIS = 400
-WAVES = 250  # random Fourier features (Rahimi, Recht 2007), where squares and products would be too many
-RIDGE = 1e-4  # relative to the features' own scale
-GROUPS = 60  # of episodes, for the bootstrap
+LARGEST_BASIS = 200
+WAVES = 150  # random Fourier features (Rahimi, Recht 2007), where squares and products would be too many
+RIDGE = 1e-3  # relative to the features' own scale
+RESAMPLES = 30
+SETTLED = 1e-3  # of the values' scale: fitting ends when they move by less
+MOST_ROWS = 6_000
 FARTHEST = 0.05  # the share of the bundle's actions that may be unlike recorded ones
 LARGEST_ERROR = 4.0  # of the recorded policy's fitted return, in its standard errors
 
@@ -32,72 +35,98 @@ class Fit:
 
     value: float
     resampled: NDArray[np.float64]
-    effective_samples: float
     inside: float
     """The share of the bundle's actions that are like recorded ones."""
     doubt: str | None
 
 
-def fitted_q(episodes: Sequence[Episode], gamma: float, resamples: int, rng: np.random.Generator) -> Fit:
+def fitted_q(episodes: Sequence[Episode], gamma: float, rng: np.random.Generator) -> Fit:
     """Estimate the mean return of the policy that chose each episode's last array."""
-    longest = max(len(rewards) for rewards, *_ in episodes)
-    steps = [np.arange(len(rewards))[:, None] / longest for rewards, *_ in episodes]
-    recorded = [
-        np.concatenate([obs, actions, t], axis=1) for (_, obs, actions, _), t in zip(episodes, steps, strict=True)
-    ]
-    chosen = [np.concatenate([obs, other, t], axis=1) for (_, obs, _, other), t in zip(episodes, steps, strict=True)]
-    basis = _basis(np.concatenate(recorded), rng)
+    kept = _within(episodes, MOST_ROWS)
+    lengths = np.array([len(rewards) for rewards, *_ in kept])
+    longest = int(lengths.max())
+    steps = np.concatenate([np.arange(length) for length in lengths])
+    of_episode = np.repeat(np.arange(len(kept)), lengths)
+    rewards, obs, actions, others = (np.concatenate(column).astype(np.float64) for column in zip(*kept, strict=True))
+    share = (steps / longest)[:, None]
+    recorded, chosen = (np.concatenate([obs, one, share], axis=1) for one in (actions, others))
+    basis = _basis(recorded, rng)
+    phi, other = basis(recorded), basis(chosen)
+    first = steps == 0
+    last = np.append(first[1:], True)
+    model = _Model(phi, other, rewards, first, last, longest - 1 - steps, gamma)
 
-    groups = min(GROUPS, len(episodes))
-    group_of = np.arange(len(episodes)) % groups
-    first = basis(np.zeros((1, recorded[0].shape[1]))).shape[1]
-    ours, theirs = (np.zeros((groups, first, first)) for _ in range(2))  # the bundle's, the recorded policy's
-    rewards_by = np.zeros((groups, first))
-    starts_ours, starts_theirs = np.zeros((groups, first)), np.zeros((groups, first))
-    returns, sizes = np.zeros(groups), np.zeros(groups)
-    gram = np.zeros((first, first))
-    for index, (rewards, *_) in enumerate(episodes):
-        group = group_of[index]
-        phi, other = basis(recorded[index]), basis(chosen[index])
-        nothing = np.zeros((1, first))  # after an episode's last action nothing is earned
-        ours[group] += phi.T @ (phi - gamma * np.concatenate([other[1:], nothing]))
-        theirs[group] += phi.T @ (phi - gamma * np.concatenate([phi[1:], nothing]))
-        rewards_by[group] += phi.T @ rewards
-        starts_ours[group] += other[0]
-        starts_theirs[group] += phi[0]
-        returns[group] += float((rewards * gamma ** np.arange(len(rewards))).sum())
-        sizes[group] += 1
-        gram += phi.T @ phi
-    ridge = RIDGE * np.trace(gram) / first * np.eye(first) / len(episodes)
-
-    def values(counts: NDArray[np.float64]) -> tuple[float, float, float]:
-        """Return (the bundle's fitted return, the recorded policy's, its mean) of so many of each group."""
-        total = float(counts @ sizes)
-        reward = np.tensordot(counts, rewards_by, 1)
-        fits = []
-        for matrices, starts in ((ours, starts_ours), (theirs, starts_theirs)):
-            matrix = np.tensordot(counts, matrices, 1) + total * ridge
-            fits.append(float(np.tensordot(counts, starts, 1) @ np.linalg.solve(matrix, reward)) / total)
-        return fits[0], fits[1], float(counts @ returns) / total
-
-    fitted, again, known = values(np.ones(groups))
-    draws = rng.multinomial(groups, np.full(groups, 1 / groups), min(resamples, 200)).astype(np.float64)
-    samples = np.array([values(draw) for draw in draws])
-    inside = _inside(gram, basis, recorded, chosen)
-    spread = float(samples[:, 2].std()) or 1e-9
-    doubt = None
-    own = np.array([float((rewards * gamma ** np.arange(len(rewards))).sum()) for rewards, *_ in episodes])
+    returns = np.zeros(len(kept))
+    np.add.at(returns, of_episode, rewards * gamma**steps)
+    fitted, again = model.values(np.ones(len(phi)))
+    known = float(returns.mean())
+    samples = np.zeros(RESAMPLES)
+    for index in range(RESAMPLES):
+        counts = rng.multinomial(len(kept), np.full(len(kept), 1 / len(kept))).astype(np.float64)
+        one, two = model.values(counts[of_episode])
+        samples[index] = one - two + float(counts @ returns) / len(kept)
+    wider = abs(again - known)  # what the model is known to get wrong
     value = known + fitted - again
+    inside = _inside(phi, other)
+    error = float(returns.std()) / np.sqrt(len(kept))
+    doubt = None
     if inside < 1 - FARTHEST:
         doubt = f"{1 - inside:.0%} of the bundle's actions are unlike any that were recorded"
-    elif abs(again - known) > LARGEST_ERROR * spread:
+    elif wider > LARGEST_ERROR * error:
         doubt = f"the fitted value gives the recorded return as {again:.4g}, and it was {known:.4g}"
-    elif not own.min() <= value <= own.max():
+    elif not returns.min() <= value <= returns.max():
         doubt = f"the estimate {value:.4g} is beyond every recorded return"
-    resampled = samples[:, 2] + samples[:, 0] - samples[:, 1]
-    wider = abs(again - known)  # what the model is known to get wrong
-    resampled = np.concatenate([resampled - wider, resampled + wider])
-    return Fit(value, resampled, len(episodes) * inside, inside, doubt)
+    return Fit(value, np.concatenate([samples - wider, samples + wider]), inside, doubt)
+
+
+@dataclass(frozen=True)
+class _Model:
+    """Least squares over all rows, and the rows' successors."""
+
+    phi: NDArray[np.float64]
+    other: NDArray[np.float64]
+    """Features of the bundle's actions in the same rows."""
+    rewards: NDArray[np.float64]
+    first: NDArray[np.bool_]
+    last: NDArray[np.bool_]
+    left: NDArray[np.int64]
+    """Steps that can follow a row."""
+    gamma: float
+
+    def values(self, weights: NDArray[np.float64]) -> tuple[float, float]:
+        """Return the fitted returns of the bundle and of the recorded policy, of rows that count so often."""
+        size = self.phi.shape[1]
+        weighted = self.phi * weights[:, None]
+        gram = weighted.T @ self.phi
+        solve = np.linalg.solve(gram + RIDGE * np.trace(gram) / size * np.eye(size), weighted.T)
+        bounds = float(self.rewards.min()), float(self.rewards.max())
+        starts = weights * self.first
+        found = []
+        for successors in (self.other, self.phi):
+            coefficients = np.zeros(size)
+            moved, before = np.inf, np.inf
+            following = np.concatenate([successors[1:], np.zeros((1, size))])
+            for _ in range(int(self.left.max()) + 1):
+                to_come = np.clip(following @ coefficients, bounds[0] * self.left, bounds[1] * self.left)
+                coefficients = solve @ (self.rewards + self.gamma * np.where(self.last, 0.0, to_come))
+                value = float(starts @ (successors @ coefficients)) / float(starts.sum())
+                moved, before = abs(value - before), value
+                if moved <= SETTLED * max(abs(value), 1e-9):
+                    break
+            found.append(value)
+        return found[0], found[1]
+
+
+def _within(episodes: Sequence[Episode], rows: int) -> list[Episode]:
+    """Return as many of the newest episodes as have at most so many rows, one at least."""
+    kept: list[Episode] = []
+    total = 0
+    for episode in reversed(episodes):
+        total += len(episode[0])
+        if kept and total > rows:
+            break
+        kept.append(episode)
+    return kept
 
 
 def _basis(rows: NDArray[np.float64], rng: np.random.Generator) -> Basis:
@@ -116,23 +145,15 @@ def _basis(rows: NDArray[np.float64], rng: np.random.Generator) -> Basis:
         one = np.ones((len(inputs), 1))
         if products:
             return np.concatenate([one, scaled, scaled[:, upper[0]] * scaled[:, upper[1]]], axis=1)
-        return np.concatenate([one, scaled, scaled**2, np.cos(scaled @ frequencies + phases)], axis=1)
+        return np.concatenate([one, scaled, np.cos(scaled @ frequencies + phases)], axis=1)
 
     return basis
 
 
-def _inside(
-    gram: NDArray[np.float64],
-    basis: Basis,
-    recorded: Sequence[NDArray[np.float64]],
-    chosen: Sequence[NDArray[np.float64]],
-) -> float:
+def _inside(phi: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """Return the share of the bundle's actions whose features lie where the recorded ones do (their leverage)."""
-    size = len(gram)
+    size = phi.shape[1]
+    gram = phi.T @ phi
     inverse = np.linalg.inv(gram + 1e-6 * np.trace(gram) / size * np.eye(size))
-
-    def leverage(rows: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        return np.concatenate([np.einsum("ij,jk,ik->i", phi, inverse, phi) for phi in map(basis, rows)])
-
-    limit = float(np.quantile(leverage(recorded), 0.999))
-    return float((leverage(chosen) <= 2 * limit).mean())
+    recorded, chosen = (np.einsum("ij,ij->i", rows @ inverse, rows) for rows in (phi, other))
+    return float((chosen <= 2 * np.quantile(recorded, 0.999)).mean())

@@ -40,7 +40,7 @@ class Followed:
 
     episode: Episode
     known: NDArray[np.bool_]
-    """Whether the bundle's action is known: not after a gap where the policy remembers, nor without a recorded action."""
+    """Whether the bundle's action is known: not without a recorded one, nor after a gap where the policy remembers."""
     unsafe: NDArray[np.bool_]
     """Whether the bundle's action was none of its space."""
     action: dict[str, NDArray[Any]]
@@ -93,7 +93,7 @@ class Follower:
         key = (id(episode.policy), episode.id)
         before, last = (None, None) if episode.begins else self._carried.pop(key, (None, None))
         if policy.episodic:
-            end = self._end_of_memory(episode, before, last, policy)
+            end = _end_of_memory(episode, before, last)
             known[end:] = False
         rewarded = any(tensor.name == REWARD for tensor in policy.contract.inputs)
         space, seen = policy.contract.observation_space, episode.obs
@@ -122,12 +122,6 @@ class Follower:
         if episode.goes_on:
             self._carried[key] = (before, last)
         return Followed(episode, known, unsafe, action, inputs)
-
-    def _end_of_memory(self, episode: Episode, before: Any, last: Any, policy: Policy) -> int:
-        """Return the first row for which the policy's memory of the episode is not known."""
-        if not episode.id or (not episode.begins and before is None and last is None):
-            return 0
-        return len(episode) if episode.gap is None else episode.gap
 
     def _policy_of(self, recorded: PolicyFormat) -> Policy:
         """Return the bundle under the options that the recorded policy had."""
@@ -211,6 +205,13 @@ def _add_closeness(
         limit = ROUNDING * np.maximum(1.0, np.abs(ours))
         close |= rows & (difference > 0).any(axis=1)
         far |= rows & (difference > limit).any(axis=1)
+
+
+def _end_of_memory(episode: Episode, before: State | None, last: dict[str, NDArray[Any]] | None) -> int:
+    """Return the first row for which what the policy remembers of the episode is not known."""
+    if not episode.id or (not episode.begins and before is None and last is None):
+        return 0
+    return len(episode) if episode.gap is None else episode.gap
 
 
 def _is_only(recording: Recording, recorded: PolicyFormat) -> bool:

@@ -1,0 +1,161 @@
+"""How often an estimate's interval covers the truth: repeated recordings of CartPole, estimated and counted.
+
+Each repetition records so many episodes with one policy and estimates the return of others, whose true returns come
+from many episodes of their own. Run: python benchmarks/estimates.py
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.serve_app.replay.estimate import Estimate, Trajectory, fitted_estimate, importance_sampling
+
+DIRECTION = np.array([0.05, 0.35, 2.2, 1.1])  # of a linear policy that balances
+BEHAVIOUR = 1.0
+TRUTH_EPISODES = 20_000
+LIMIT = 200  # steps of an episode
+
+Probability = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Of pushing right, for observations `[rows, 4]`."""
+
+
+@dataclass
+class Candidate:
+    """A policy to estimate, and the count of what was claimed of it."""
+
+    name: str
+    probability: Probability
+    deterministic: bool
+    truth: float = 0.0
+    claimed: dict[str, int] = field(default_factory=dict)
+    covered: dict[str, int] = field(default_factory=dict)
+    widths: dict[str, list[float]] = field(default_factory=dict)
+    covered_unclaimed: dict[str, int] = field(default_factory=dict)
+
+    def count(self, estimate: Estimate) -> None:
+        low, high = estimate.interval
+        covers = low <= self.truth <= high
+        method = estimate.method
+        if estimate.supported:
+            self.claimed[method] = self.claimed.get(method, 0) + 1
+            self.covered[method] = self.covered.get(method, 0) + covers
+            self.widths.setdefault(method, []).append(high - low)
+        else:
+            self.covered_unclaimed[method] = self.covered_unclaimed.get(method, 0) + covers
+
+
+def linear(gain: float, shift: float = 0.0) -> Probability:
+    return lambda obs: 1 / (1 + np.exp(-gain * (obs @ DIRECTION + shift)))
+
+
+def greedy(direction: Sequence[float]) -> Probability:
+    weights = np.array(direction)
+    return lambda obs: (obs @ weights > 0).astype(np.float64)
+
+
+def run_episodes(
+    probability: Probability, episodes: int, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return (observations `[steps, episodes, 4]`, actions `[steps, episodes]`, lengths)."""
+    env = gym.make_vec("CartPole-v1", num_envs=episodes, vectorization_mode="vector_entry_point")
+    rng = np.random.default_rng(seed)
+    obs, _ = env.reset(seed=seed)
+    seen, done = [], []
+    lengths = np.full(episodes, LIMIT, np.int64)
+    alive = np.ones(episodes, np.bool_)
+    for step in range(LIMIT):
+        action = (rng.random(episodes) < probability(obs.astype(np.float64))).astype(np.int64)
+        seen.append(obs.astype(np.float64))
+        done.append(action)
+        obs, _, terminated, truncated, _ = env.step(action)
+        ended = alive & (terminated | truncated)
+        lengths[ended] = step + 1
+        alive &= ~ended
+        if not alive.any():
+            break
+    env.close()
+    return np.array(seen), np.array(done), lengths
+
+
+def trajectories(
+    obs: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    lengths: NDArray[np.int64],
+    recorded: Probability | None,
+    candidate: Candidate,
+) -> list[Trajectory]:
+    """Return what an estimate is made of; `recorded` is None where the log-probabilities are not known."""
+    found = []
+    one_hot = np.eye(2, dtype=np.float32)
+    for index, length in enumerate(lengths):
+        rows, taken = obs[:length, index], actions[:length, index]
+        right = candidate.probability(rows)
+        weights = None
+        if recorded is not None:
+            known = recorded(rows)
+            with np.errstate(divide="ignore"):
+                weights = np.log(np.where(taken == 1, right, 1 - right)) - np.log(
+                    np.where(taken == 1, known, 1 - known)
+                )
+        chosen = one_hot[(right > 0.5).astype(np.int64)]
+        found.append(Trajectory(np.ones(length), weights, rows.astype(np.float32), one_hot[taken], chosen))
+    return found
+
+
+def study(candidates: list[Candidate], recorded: Probability, episodes: int, repetitions: int) -> None:
+    """Fill in the candidates' counts."""
+    for candidate in candidates:
+        candidate.truth = float(run_episodes(candidate.probability, TRUTH_EPISODES, 10**6)[2].mean())
+    for repetition in range(repetitions):
+        obs, actions, lengths = run_episodes(recorded, episodes, repetition)
+        rng = np.random.default_rng(repetition)
+        for candidate in candidates:
+            made = trajectories(obs, actions, lengths, recorded, candidate)
+            for one in importance_sampling(made, 1.0, rng):
+                candidate.count(one)
+            if candidate.deterministic:
+                candidate.count(fitted_estimate(made, 1.0, rng))
+
+
+def candidates_of_the_study() -> list[Candidate]:
+    return [
+        Candidate("the recorded policy", linear(BEHAVIOUR), False),
+        Candidate("gain 1.1", linear(1.1), False),
+        Candidate("gain 1.3", linear(1.3), False),
+        Candidate("gain 2", linear(2.0), False),
+        Candidate("gain 4", linear(4.0), False),
+        Candidate("gain 1, leaning", linear(1.0, 0.2), False),
+        Candidate("greedy", greedy(DIRECTION.tolist()), True),
+        Candidate("greedy, angle only", greedy([0, 0, 1, 0]), True),
+        Candidate("greedy, angle and its speed", greedy([0, 0, 1, 1]), True),
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=300)
+    parser.add_argument("--repetitions", type=int, default=100)
+    arguments = parser.parse_args()
+    candidates = candidates_of_the_study()
+    study(candidates, linear(BEHAVIOUR), arguments.episodes, arguments.repetitions)
+    print(f"{arguments.repetitions} repetitions of {arguments.episodes} episodes; 95% intervals")
+    for candidate in candidates:
+        print(f"{candidate.name}: true return {candidate.truth:.1f}")
+        for method in sorted({*candidate.claimed, *candidate.covered_unclaimed}):
+            claimed, covered = candidate.claimed.get(method, 0), candidate.covered.get(method, 0)
+            width = float(np.mean(candidate.widths[method])) if claimed else float("nan")
+            outside = candidate.covered_unclaimed.get(method, 0)
+            print(
+                f"  {method}: claimed {claimed}, covered {covered} of them, mean width {width:.1f}; "
+                f"covered {outside} of {arguments.repetitions - claimed} not claimed"
+            )
+
+
+if __name__ == "__main__":
+    main()
