@@ -12,7 +12,15 @@ from typing import Annotated
 import typer
 
 import rlservo
-from rlservo.deploy import cluster_commands, export_commands, policy_commands, robot_commands, serve_commands, terminal
+from rlservo.deploy import (
+    cluster_commands,
+    export_commands,
+    log_commands,
+    policy_commands,
+    robot_commands,
+    serve_commands,
+    terminal,
+)
 from rlservo.export.contract.errors import RlservoError, UsageError
 
 app = typer.Typer(
@@ -57,11 +65,14 @@ for command in (
     serve_commands.key,
     serve_commands.rollout,
     serve_commands.demo,
+    log_commands.replay,
+    log_commands.estimate,
 ):
     app.command()(command)
 robot_commands.add_to(app)
 app.add_typer(policy_commands.policy, name="policy")
 app.add_typer(cluster_commands.cluster, name="cluster")
+app.add_typer(log_commands.log, name="log")
 
 
 if __name__ == "__main__":

@@ -167,7 +167,7 @@ class _LeafFormat:
 
     def encode(self, array: NDArray[Any]) -> bytes:
         if not self._leaf.shape:
-            return orjson.dumps(array[()], option=NUMBERS)
+            return orjson.dumps(array.item())
         flat = orjson.dumps(np.ascontiguousarray(array).reshape(-1), option=NUMBERS)
         return flat if self._names is None else self._template % tuple(flat[1:-1].split(b","))
 

@@ -26,7 +26,7 @@ LARGEST = 5_000_000  # numbers in one matrix of episodes by steps
 RESAMPLES = 1000
 CONFIDENCE = 0.95
 FEWEST_EPISODES = 30
-SMALLEST_SAMPLE = 30.0  # effective episodes; below it a bootstrap interval is too narrow (benchmarks/estimates.md)
+SMALLEST_SHARE = 0.5  # of effective episodes; below it the intervals miss the truth too often (docs/recording.md)
 
 
 @dataclass(frozen=True)
@@ -160,15 +160,22 @@ def importance_sampling(trajectories: list[Trajectory], gamma: float, rng: np.ra
         resampled = np.nan_to_num(numerators / denominators).sum(axis=1)
         weighted = float(np.nan_to_num(discounted.sum(axis=0) / weights.sum(axis=0)).sum())
     plain = discounted.sum(axis=1)
+    # A few heavy weights make a bootstrap too sure of itself: measured, this much wider covers (docs/recording.md).
+    wider = float(np.sqrt(len(trajectories) / effective)) if effective > 0 else 1.0
     supported, reason = _support(len(trajectories), effective)
     return [
         Estimate(
-            "weighted per-decision importance sampling", weighted, _interval(resampled), effective, supported, reason
+            "weighted per-decision importance sampling",
+            weighted,
+            _interval(weighted + wider * (resampled - weighted)),
+            effective,
+            supported,
+            reason,
         ),
         Estimate(
             "per-decision importance sampling",
             float(plain.mean()),
-            _interval(_resampled_means(plain, rng)),
+            _interval(plain.mean() + wider * (_resampled_means(plain, rng) - plain.mean())),
             effective,
             supported,
             reason,
@@ -179,10 +186,10 @@ def importance_sampling(trajectories: list[Trajectory], gamma: float, rng: np.ra
 def _support(episodes: int, effective: float) -> tuple[bool, str]:
     if episodes < FEWEST_EPISODES:
         return False, f"{episodes} episodes are too few: at least {FEWEST_EPISODES} are needed"
-    if effective < SMALLEST_SAMPLE:
+    if effective < SMALLEST_SHARE * episodes:
         return False, (
             f"the bundle acts too differently from what was recorded: {episodes} episodes tell as much as "
-            f"{effective:.1f} of its own, and {SMALLEST_SAMPLE:g} are needed"
+            f"{effective:.1f} of its own, and {SMALLEST_SHARE * episodes:.0f} are needed"
         )
     return True, f"{episodes} episodes tell as much as {effective:.0f} of the bundle's own"
 

@@ -1,0 +1,243 @@
+"""The commands `rlservo log`, `replay` and `estimate`: recordings shown, converted and put through another bundle."""
+
+from __future__ import annotations
+
+import time
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.terminal import Json, needs_extra, print_json
+from rlservo.export.contract.errors import UsageError
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.recording.summary import Summary
+    from rlservo.serve_app.replay.estimate import EstimateReport
+    from rlservo.serve_app.replay.replay import ReplayReport
+
+log = typer.Typer(no_args_is_help=True, help="Recordings: what is in them, as other formats, as pictures.")
+
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), or folders of them.")]
+Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder: its newest version.")]
+PolicyName = Annotated[
+    str | None, typer.Option("--policy", help="Which recorded policy, by name; needed where it is not clear.")
+]
+
+
+class Format(str, Enum):
+    """What a recording is converted to."""
+
+    parquet = "parquet"
+    lerobot = "lerobot"
+    minari = "minari"
+
+
+@log.command()
+def info(files: Files, as_json: Json = False) -> None:
+    """Show what is in recordings: policies, episodes, decisions, what is missing.
+
+    Example: `rlservo log info recordings`
+    """
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.reader import Recording
+        from rlservo.serve_app.recording.summary import summarise_recording
+
+    summary = summarise_recording(Recording(files))
+    if as_json:
+        print_json(summary.as_dict())
+    else:
+        _print_summary(summary)
+
+
+@log.command()
+def export(
+    files: Files,
+    to: Annotated[Format, typer.Option("--to", help="The format.")],
+    out: Annotated[Path, typer.Option(help="New file (parquet), or new folder.")],
+    policy: PolicyName = None,
+    task: Annotated[str | None, typer.Option(help="For LeRobot: a sentence that says what the robot does.")] = None,
+) -> None:
+    """Convert recordings to Parquet, a LeRobotDataset v3.0 or a Minari dataset.
+
+    Example: `rlservo log export run.mcap --to parquet --out run.parquet`
+    """
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.lerobot_export import export_lerobot
+        from rlservo.serve_app.recording.minari_export import PATH_VARIABLE, export_minari
+        from rlservo.serve_app.recording.parquet_export import export_parquet
+        from rlservo.serve_app.recording.reader import Recording
+
+    recording = Recording(files)
+    if to is Format.parquet:
+        line = f"written {out}: {export_parquet(recording, out, name=policy)} decisions"
+    elif to is Format.lerobot:
+        episodes, frames = export_lerobot(recording, out, name=policy, task=task)
+        line = f"written {out}: {episodes} episodes, {frames} frames"
+    else:
+        identity, episodes = export_minari(recording, out, name=policy)
+        line = f"written {out}: {episodes} episodes; {PATH_VARIABLE}={out}, then minari.load_dataset({identity!r})"
+    terminal.output().print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+@log.command()
+def plot(
+    files: Files,
+    episode: Annotated[int, typer.Option(min=0, help="Which episode, from 0, in the order they ended.")] = 0,
+    out: Annotated[Path, typer.Option(help="The picture: .png, .svg, .pdf.")] = Path("episode.png"),
+) -> None:
+    """Draw one recorded episode: observations and actions by name, rewards, latency, warnings.
+
+    Example: `rlservo log plot run.mcap --episode 3 --out episode.png`
+    """
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.plot import plot_episode
+        from rlservo.serve_app.recording.reader import Recording
+
+    drawn = plot_episode(Recording(files), episode, out)
+    terminal.output().print(f"written {out}: {len(drawn)} decisions", markup=False, highlight=False, soft_wrap=True)
+
+
+def replay(
+    files: Files,
+    bundle: Bundle,
+    tolerance: Annotated[
+        float, typer.Option(min=0.0, help="By how much an element may differ without counting as changed.")
+    ] = 0.0,
+    policy: PolicyName = None,
+    as_json: Json = False,
+) -> None:
+    """Put recorded episodes through a bundle and show what it would have done otherwise.
+
+    Exit code 0: no action would change; 1: some would; 2: the recording does not fit the bundle.
+
+    Example: `rlservo replay run.mcap --bundle policies/ur5/2`
+    """
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.reader import Recording
+        from rlservo.serve_app.replay.replay import replay as run_replay
+
+    began = time.perf_counter()
+    report = run_replay(Recording(files), bundle, tolerance=tolerance, name=policy)
+    seconds = time.perf_counter() - began
+    if as_json:
+        print_json({**report.as_dict(), "seconds": round(seconds, 3)})
+    else:
+        _print_replay(report, seconds)
+    if report.changed:
+        raise typer.Exit(1)
+
+
+def estimate(
+    files: Files,
+    bundle: Bundle,
+    explore: Annotated[bool, typer.Option("--explore", help="Of the exploring policy, not of the mode.")] = False,
+    gamma: Annotated[float, typer.Option(help="Discount per step.")] = 1.0,
+    policy: PolicyName = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Estimate the return a bundle would have earned, from recordings of another version.
+
+    Exit code 0: an estimate holds; 1: the recordings cannot support one.
+
+    Example: `rlservo estimate recordings --bundle policies/ur5/2`
+    """
+    if not 0 < gamma <= 1:
+        raise UsageError(f"--gamma must be above 0 and at most 1, got {gamma:g}")
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.reader import Recording
+        from rlservo.serve_app.replay.estimate import estimate as run_estimate
+
+    report = run_estimate(Recording(files), bundle, explore=explore, gamma=gamma, name=policy, seed=seed)
+    if as_json:
+        print_json(report.as_dict())
+    else:
+        _print_estimate(report)
+    if not any(one.supported for one in report.estimates):
+        raise typer.Exit(1)
+
+
+def _print_summary(summary: Summary) -> None:
+    for file in summary.files:
+        state = "whole" if file["whole"] else "being written" if file["being_written"] else "without an end"
+        notes = [f"{file['messages']} messages", state]
+        if file["dropped"]:
+            notes.append(f"{file['dropped']} records were dropped")
+        if file["clock_jumps"]:
+            notes.append(f"the wall clock jumped {file['clock_jumps']} times")
+        if file["damage"]:
+            notes.append(file["damage"])
+        _line(f"{file['path']}: {', '.join(notes)}")
+    for policy in summary.policies:
+        _line(f"{policy.name} version {policy.version}  graph {policy.graph_sha256[:12] or 'not known'}")
+        span = policy.last_s - policy.first_s
+        _line(f"  {policy.episodes} episodes ({policy.ended} ended), {policy.decisions} decisions over {span:.1f} s")
+        if policy.endings:
+            _line(f"  endings: {', '.join(f'{word}: {count}' for word, count in policy.endings.items())}")
+        if policy.return_mean is not None:
+            _line(f"  mean return {policy.return_mean:.4g}")
+        if policy.latency_p50_ms is not None:
+            _line(f"  latency p50 {policy.latency_p50_ms:.3g} ms, p99 {policy.latency_p99_ms:.3g} ms")
+        _line(
+            f"  explored {policy.explored}, warnings {policy.warnings}, without an action {policy.without_action}, "
+            f"fallbacks {policy.fallbacks}, episodes with a gap {policy.gaps}"
+        )
+
+
+def _print_replay(report: ReplayReport, seconds: float) -> None:
+    _line(
+        f"{', '.join(report.policies)} replayed through {report.bundle}: {report.compared} decisions in {seconds:.1f} s"
+    )
+    if report.same_graph is not None:
+        _line(f"the graph is {'the recorded one' if report.same_graph else 'another than the recorded one'}")
+    _line(f"identical bit for bit: {report.identical} of {report.compared}")
+    _line(f"changed by more than {report.tolerance:g}: {report.changed} ({report.changed_share:.2%})")
+    if report.explored:
+        _line(
+            f"explored: {report.explored}, compared by their distributions' parameters, largest difference "
+            f"{report.largest_distribution_difference:.3g}"
+        )
+    if report.unsafe:
+        _line(f"the bundle's action is none of its space: {report.unsafe}")
+    if report.not_compared:
+        _line(f"not compared (no action, a gap, nothing to compare): {report.not_compared}")
+    if report.dropped:
+        _line(f"the recorder had dropped {report.dropped} records")
+    for title, count in report.other_policies.items():
+        _line(f"not looked at: {count} decisions of {title}")
+    for element in report.elements:
+        if element.largest:
+            _line(
+                f"  {element.name}: largest {element.largest:.4g} {element.unit}, mean {element.mean:.3g}, "
+                f"changed {element.changed}"
+            )
+    for moment in report.worst:
+        when = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(moment.time_s))
+        _line(
+            f"  {when} UTC, episode {moment.episode or '-'} step {moment.step}: {moment.element} "
+            f"{moment.recorded:.6g} -> {moment.replayed:.6g}"
+        )
+
+
+def _print_estimate(report: EstimateReport) -> None:
+    _line(f"{report.bundle} ({report.target}) from {report.episodes} episodes of {', '.join(report.policies)}")
+    assert report.recorded_return is not None and report.recorded_interval is not None
+    _line(f"recorded return {report.recorded_return:.5g}  {_interval(report.recorded_interval)}")
+    for reason, count in report.not_used.items():
+        _line(f"not used: {count} episodes {reason}")
+    for one in report.estimates:
+        _line(
+            f"{one.method}: {one.value:.5g}  {_interval(one.interval)}  effective episodes {one.effective_samples:.1f}"
+        )
+        _line(f"  {'holds' if one.supported else 'NOT SUPPORTED'}: {one.reason}")
+
+
+def _interval(interval: tuple[float, float]) -> str:
+    return f"(95% {interval[0]:.5g} to {interval[1]:.5g})"
+
+
+def _line(text: str) -> None:
+    terminal.output().print(text, markup=False, highlight=False, soft_wrap=True)

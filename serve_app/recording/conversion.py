@@ -1,0 +1,56 @@
+"""Checks that a recording's conversions share: one policy at a time, whole episodes, a folder that is new."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.recording.episodes import Episode, episodes
+from rlservo.serve_app.recording.reader import Recording
+
+
+def optional_package(name: str, purpose: str) -> ModuleType:
+    """Import a package that only a conversion needs; raise UsageError where it is missing."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        package = (error.name or name).partition(".")[0]
+        raise UsageError(f"{purpose} needs the Python package {package!r}: pip install {package}") from error
+
+
+def new_folder(out: Path) -> Path:
+    """Make the folder of a conversion; raise UsageError where it exists and holds something."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"{out} exists: give a new folder")
+    out.mkdir(parents=True, exist_ok=True)
+    return out
+
+
+def episodes_of_one(recording: Recording, name: str | None) -> Iterator[Episode]:
+    """Yield the episodes of one policy: `name`, or the only one.
+
+    Raises UsageError where the recording has several, or versions whose observations or actions differ.
+    """
+    chosen: Episode | None = None
+    for episode in episodes(recording):
+        if name is not None and episode.policy.contract.name != name:
+            continue
+        first = chosen or episode
+        spaces = [(one.policy.contract.observation_space, one.policy.contract.action_space) for one in (first, episode)]
+        if episode.policy.contract.name != first.policy.contract.name:
+            raise UsageError(
+                f"the recording has several policies ({first.policy.contract.name}, {episode.policy.contract.name}): "
+                "name one with --policy"
+            )
+        if spaces[0] != spaces[1]:
+            raise UsageError(
+                f"{first.policy.title} and {episode.policy.title} have other observations or actions: "
+                "convert their files one by one"
+            )
+        chosen = first
+        yield episode
+    if chosen is None:
+        raise UsageError(f"the recording has no decisions of {'any policy' if name is None else f'policy {name!r}'}")

@@ -1,0 +1,159 @@
+"""Recordings convert to what pyarrow, LeRobot's layout and minari load; they are summarised and drawn."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.recording.episodes import episodes
+from rlservo.serve_app.recording.lerobot_export import export_lerobot
+from rlservo.serve_app.recording.minari_export import PATH_VARIABLE, export_minari
+from rlservo.serve_app.recording.parquet_export import export_parquet
+from rlservo.serve_app.recording.plot import plot_episode
+from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.recording.recorded_policy import WithRecording
+from rlservo.serve_app.recording.recorder import Recorder
+from rlservo.serve_app.recording.summary import summarise_recording
+from rlservo.serve_app.runtime.policy import Policy
+
+
+def record(policy: WithRecording, lengths: list[int], *, explore: bool = False) -> None:
+    rng = np.random.default_rng(0)
+    size = policy.contract.observation_space.size
+    flat = policy.contract.observation_space.kind == "box"
+    for length in lengths:
+        policy.reset()
+        for step in range(length):
+            policy.act(rng.standard_normal(size).astype(np.float32) if flat else step % 5, explore=explore)
+            last = step == length - 1
+            final = (np.zeros(size, np.float32) if flat else 0) if last else None
+            policy.outcome(1.0, terminated=last, final_status="success" if last else None, final_obs=final)
+
+
+@pytest.fixture
+def run(ur5: Path, tmp_path: Path) -> Path:
+    with WithRecording(Policy.load(ur5), tmp_path / "run.mcap") as policy:
+        record(policy, [5, 7, 3])
+    return tmp_path / "run.mcap"
+
+
+def test_parquet_has_every_decision_and_the_contract(run: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    assert export_parquet(Recording(run), tmp_path / "run.parquet") == 15
+    table = parquet.read_table(tmp_path / "run.parquet")
+    recorded = list(episodes(Recording(run)))
+    obs = np.array(table.column("obs").to_pylist(), np.float32)
+    assert obs.tobytes() == np.concatenate([one.obs["obs"] for one in recorded]).tobytes()
+    actions = np.array(table.column("actions").to_pylist(), np.float32)
+    assert actions.tobytes() == np.concatenate([one.action["action"] for one in recorded]).tobytes()
+    assert table.column("rewards").to_pylist() == [1.0] * 15
+    assert np.flatnonzero(table.column("terminateds").to_pylist()).tolist() == [4, 11, 14]
+    assert len(set(table.column("eps_id").to_pylist())) == 3
+    assert table.column("own_actions").null_count == table.column("action_logp").null_count == 15
+    assert json.loads(table.schema.metadata[b"rlservo.contract"])["name"] == "ur5"
+    with pytest.raises(UsageError, match="exists"):
+        export_parquet(Recording(run), tmp_path / "run.parquet")
+
+
+def test_parquet_keeps_what_exploring_needs(policies: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    with WithRecording(Policy.load(policies / "gridworld"), tmp_path / "run.mcap") as policy:
+        record(policy, [20], explore=True)
+    export_parquet(Recording(tmp_path / "run.mcap"), tmp_path / "run.parquet")
+    table = parquet.read_table(tmp_path / "run.parquet")
+    logits = np.array(table.column("action_dist_inputs").to_pylist())
+    chosen = np.array(table.column("own_actions").to_pylist())
+    expected = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(table.column("action_logp").to_pylist(), expected[np.arange(20), chosen], rtol=1e-6)
+
+
+def test_lerobot_dataset_has_the_documented_layout(run: Path, tmp_path: Path) -> None:
+    """huggingface.co/docs/lerobot/lerobot-dataset-v3 and lerobot's `dataset_metadata.py`."""
+    parquet = pytest.importorskip("pyarrow.parquet")
+    pandas = pytest.importorskip("pandas")
+    assert export_lerobot(Recording(run), tmp_path / "set", task="reach") == (3, 15)
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    assert (info["codebase_version"], info["total_episodes"], info["total_frames"], info["fps"]) == ("v3.0", 3, 15, 10)
+    data = parquet.read_table(tmp_path / "set" / info["data_path"].format(chunk_index=0, file_index=0))
+    assert set(info["features"]) == set(data.column_names)
+    needed = {"timestamp", "frame_index", "episode_index", "index", "task_index", "action", "observation.state"}
+    assert needed <= set(data.column_names)
+    for key, feature in info["features"].items():
+        column = np.array(data.column(key).to_pylist())
+        assert list(column.shape[1:]) == ([] if feature["shape"] == [1] else feature["shape"])
+        assert feature["names"] is None or len(feature["names"]) == feature["shape"][0]
+        kind = data.schema.field(key).type
+        assert str(getattr(kind, "value_type", kind)) in (
+            feature["dtype"].replace("float32", "float"),
+            feature["dtype"],
+        )
+    assert data.column("index").to_pylist() == list(range(15))
+    np.testing.assert_allclose(data.column("timestamp").to_pylist()[:5], np.arange(5) / 10, rtol=1e-6)
+    listed = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [row["length"] for row in listed] == [5, 7, 3]
+    assert [(row["dataset_from_index"], row["dataset_to_index"]) for row in listed] == [(0, 5), (5, 12), (12, 15)]
+    assert listed[0]["tasks"] == ["reach"] and len(listed[0]["stats/action/mean"]) == 6
+    tasks = pandas.read_parquet(tmp_path / "set/meta/tasks.parquet")
+    assert tasks.loc["reach"].task_index == 0
+    stats = json.loads((tmp_path / "set/meta/stats.json").read_text())
+    assert stats["observation.state"]["count"] == [15] and len(stats["action"]["q99"]) == 6
+
+
+def test_minari_loads_its_dataset(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    minari = pytest.importorskip("minari")
+    identity, count = export_minari(Recording(run), tmp_path / "sets")
+    assert count == 3
+    monkeypatch.setenv(PATH_VARIABLE, str(tmp_path / "sets"))
+    dataset = minari.load_dataset(identity)
+    assert (dataset.total_episodes, dataset.total_steps) == (3, 15)
+    recorded = list(episodes(Recording(run)))
+    for theirs, ours in zip(dataset.iterate_episodes(), recorded, strict=True):
+        assert np.asarray(theirs.observations, np.float32)[:-1].tobytes() == ours.obs["obs"].tobytes()
+        assert np.asarray(theirs.actions, np.float32).tobytes() == ours.action["action"].tobytes()
+        assert len(theirs.observations) == len(ours) + 1 and theirs.terminations[-1]
+
+
+def test_conversion_of_several_policies_wants_a_name(policies: Path, tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        for name in ("ur5", "gridworld"):
+            record(WithRecording(Policy.load(policies / name), recorder), [4])
+    with pytest.raises(UsageError, match="name one with --policy"):
+        export_parquet(Recording(tmp_path / "run.mcap"), tmp_path / "run.parquet")
+    assert not list(tmp_path.glob(".*"))
+    assert export_parquet(Recording(tmp_path / "run.mcap"), tmp_path / "run.parquet", name="ur5") == 4
+    with pytest.raises(UsageError, match="no decisions of policy 'other'"):
+        export_lerobot(Recording(tmp_path / "run.mcap"), tmp_path / "set", name="other")
+
+
+def test_missing_package_is_said_in_a_sentence(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    for name, convert in (("pyarrow", export_parquet), ("minari", export_minari)):
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, name, None)
+            convert_: Callable[..., object] = convert
+            with pytest.raises(UsageError, match=f"pip install {name}"):
+                convert_(Recording(run), tmp_path / "out")
+
+
+def test_summary_counts_what_is_there(run: Path) -> None:
+    (policy,) = summarise_recording(Recording(run)).policies
+    assert (policy.episodes, policy.ended, policy.decisions, policy.gaps) == (3, 3, 15, 0)
+    assert policy.return_mean == 5.0 and policy.endings == {"success": 3}
+    assert policy.latency_p50_ms is not None and len(policy.graph_sha256) == 64
+
+
+def test_plot_draws_an_episode(run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from PIL import Image
+
+    assert len(plot_episode(Recording(run), 1, tmp_path / "episode.png")) == 7
+    with Image.open(tmp_path / "episode.png") as picture:
+        assert picture.size[0] > 500 and len(picture.convert("RGB").getcolors(10**6) or []) > 10
+    with pytest.raises(UsageError, match="no episode 3"):
+        plot_episode(Recording(run), 3, tmp_path / "episode.png")
