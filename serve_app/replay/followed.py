@@ -70,14 +70,20 @@ class Follower:
 
         Raises OtherContractError where its observations or actions are others than the bundle's.
         """
+        wanted = self.contract.name if name is None else name
+        found = False
         for episode in episodes(recording):
             recorded = episode.policy
-            own = self.contract.name if name is None else name
-            if recorded.contract.name != own and (name is not None or not _is_only(recording, recorded)):
+            if recorded.contract.name != wanted:
                 self.skipped[recorded.title] = self.skipped.get(recorded.title, 0) + len(episode)
                 continue
+            found = True
             self._check(recorded)
             yield self._follow(episode)
+        names = {policy.contract.name for policy in recording.policies}
+        if not found and name is None and len(names) == 1:
+            self.skipped.clear()
+            yield from self.follow(recording, names.pop())
 
     def _follow(self, episode: Episode) -> Followed:
         policy = self._policy_of(episode.policy)
@@ -212,7 +218,3 @@ def _end_of_memory(episode: Episode, before: State | None, last: dict[str, NDArr
     if not episode.id or (not episode.begins and before is None and last is None):
         return 0
     return len(episode) if episode.gap is None else episode.gap
-
-
-def _is_only(recording: Recording, recorded: PolicyFormat) -> bool:
-    return {policy.contract.name for policy in recording.policies} == {recorded.contract.name}
