@@ -45,7 +45,7 @@ def _leaf(
     if isinstance(leaf, MultiDiscreteSpec):
         parts = np.split(inputs, np.cumsum(leaf.nvec)[:-1], axis=-1)
         choices = own.reshape(rows, -1).astype(np.int64)
-        return np.sum([_chosen(part, choices[:, i]) for i, part in enumerate(parts)], axis=0)
+        return np.asarray(np.sum([_chosen(part, choices[:, i]) for i, part in enumerate(parts)], axis=0))
     mean, log_std = np.split(inputs, 2, axis=-1)
     value = own.reshape(rows, -1).astype(np.float64)
     jacobian = np.zeros_like(value)
