@@ -48,7 +48,7 @@ def test_metadata_installs_no_developers_tools_and_has_no_placeholder(wheel: Pat
         text = archive.read(next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))).decode()
     head, _, readme = text.partition("\n\n")
     (everything,) = [line for line in head.splitlines() if line.endswith('extra == "all"')]
-    assert everything == 'Requires-Dist: rlservo[client,serve,sim,train]; extra == "all"'
+    assert everything == 'Requires-Dist: rlservo[client,record,serve,sim,train]; extra == "all"'
     assert "<this repository>" not in readme
 
 
@@ -68,7 +68,8 @@ def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -
         assert f"\n{heavy}==" not in f"\n{listed}"
     loaded = run(str(python), "-c", "import rlservo; print(rlservo.__version__, rlservo.Policy.load, rlservo.rollout)")
     assert loaded.returncode == 0, loaded.stderr
-    for name, extra in (("PolicyClient", "client"), ("StreamClient", "client"), ("export_checkpoint", "train")):
+    extras = {"PolicyClient": "client", "StreamClient": "client", "Recorder": "record", "export_checkpoint": "train"}
+    for name, extra in extras.items():
         missing = run(str(python), "-c", f"from rlservo import {name}").stderr
         assert f"pip install 'rlservo[{extra}]'" in missing.splitlines()[-1], missing
     program = "import sys; print(*sorted(name for name in sys.modules if 'rlservo' in name), 'typing' in sys.modules)"

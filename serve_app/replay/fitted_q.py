@@ -3,7 +3,8 @@
 The value of an action in a state is a weighted sum of fixed features of both (and of the step, since episodes have a
 time limit), fitted by least squares to the reward and the value of what the bundle would do next, again and again, each
 time within what can be earned in the steps that are left. The same model is fitted to the recorded policy, whose return
-is known: what it gets wrong there is taken off and added to the interval. Where that is much, or where the bundle's
+is known: what it gets wrong there is taken off and added to the interval. Two sets of features are fitted, and the
+interval spans both. Where they disagree, where they get the recorded return wrong by much, or where the bundle's
 actions are unlike the recorded ones, nothing is claimed.
 """
 
@@ -22,6 +23,7 @@ RESAMPLES = 30
 SETTLED = 1e-4  # of the values' scale: fitting ends when they move by less
 MOST_ROWS = 6_000
 FARTHEST = 0.05  # the share of the bundle's actions that may be unlike recorded ones
+FARTHEST_MODELS = 0.25  # of the recorded returns' deviation, between two models' estimates
 LARGEST_ERROR = 4.0  # of the recorded policy's fitted return, in its standard errors
 
 Episode = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
@@ -50,33 +52,38 @@ def fitted_q(episodes: Sequence[Episode], gamma: float, rng: np.random.Generator
     rewards, obs, actions, others = (np.concatenate(column).astype(np.float64) for column in zip(*kept, strict=True))
     share = (steps / longest)[:, None]
     recorded, chosen = (np.concatenate([obs, one, share], axis=1) for one in (actions, others))
-    basis = _basis(recorded, rng)
-    phi, other = basis(recorded), basis(chosen)
     first = steps == 0
     last = np.append(first[1:], True)
-    model = _Model(phi, other, rewards, first, last, longest - 1 - steps, gamma)
-
     returns = np.zeros(len(kept))
     np.add.at(returns, of_episode, rewards * gamma**steps)
-    fitted, again = model.values(np.ones(len(phi)))
-    known = float(returns.mean())
-    samples = np.zeros(RESAMPLES)
-    for index in range(RESAMPLES):
-        counts = rng.multinomial(len(kept), np.full(len(kept), 1 / len(kept))).astype(np.float64)
-        one, two = model.values(counts[of_episode])
-        samples[index] = one - two + float(counts @ returns) / len(kept)
-    wider = abs(again - known)  # what the model is known to get wrong
-    value = known + fitted - again
-    inside = _inside(phi, other)
-    error = float(returns.std()) / np.sqrt(len(kept))
-    doubt = None
+    known, spread = float(returns.mean()), float(returns.std())
+    draws = rng.multinomial(len(kept), np.full(len(kept), 1 / len(kept)), RESAMPLES).astype(np.float64)
+
+    values: list[float] = []
+    samples: list[NDArray[np.float64]] = []
+    doubts: list[str] = []
+    inside = 1.0
+    for products in (True, False):
+        basis = _basis(recorded, rng, products=products)
+        phi, other = basis(recorded), basis(chosen)
+        model = _Model(phi, other, rewards, first, last, longest - 1 - steps, gamma)
+        fitted, again = model.values(np.ones(len(phi)))
+        values.append(known + fitted - again)
+        wider = abs(again - known)  # what the model is known to get wrong
+        resampled = np.array([np.subtract(*model.values(counts[of_episode])) for counts in draws])
+        resampled += draws @ returns / len(kept)
+        samples += [resampled - wider, resampled + wider]
+        inside = min(inside, _inside(phi, other))
+        if wider > LARGEST_ERROR * spread / np.sqrt(len(kept)):
+            doubts.append(f"the fitted value gives the recorded return as {again:.4g}, and it was {known:.4g}")
+    value = float(np.mean(values))
     if inside < 1 - FARTHEST:
-        doubt = f"{1 - inside:.0%} of the bundle's actions are unlike any that were recorded"
-    elif wider > LARGEST_ERROR * error:
-        doubt = f"the fitted value gives the recorded return as {again:.4g}, and it was {known:.4g}"
-    elif not returns.min() <= value <= returns.max():
-        doubt = f"the estimate {value:.4g} is beyond every recorded return"
-    return Fit(value, np.concatenate([samples - wider, samples + wider]), inside, doubt)
+        doubts.append(f"{1 - inside:.0%} of the bundle's actions are unlike any that were recorded")
+    if abs(values[0] - values[1]) > FARTHEST_MODELS * spread:
+        doubts.append(f"two models of the value differ: {values[0]:.4g} and {values[1]:.4g}")
+    if not returns.min() <= value <= returns.max():
+        doubts.append(f"the estimate {value:.4g} is beyond every recorded return")
+    return Fit(value, np.concatenate(samples), inside, doubts[0] if doubts else None)
 
 
 @dataclass(frozen=True)
@@ -99,20 +106,21 @@ class _Model:
         weighted = self.phi * weights[:, None]
         gram = weighted.T @ self.phi
         solve = np.linalg.solve(gram + RIDGE * np.trace(gram) / size * np.eye(size), weighted.T)
-        bounds = float(self.rewards.min()), float(self.rewards.max())
+        # An episode may end at any step and earn nothing from there on.
+        bounds = min(float(self.rewards.min()), 0.0), max(float(self.rewards.max()), 0.0)
         starts = weights * self.first
         found = []
         for successors in (self.other, self.phi):
             coefficients = np.zeros(size)
-            moved, before = np.inf, np.inf
+            value, before = 0.0, np.inf
             following = np.concatenate([successors[1:], np.zeros((1, size))])
             for _ in range(int(self.left.max()) + 1):
                 to_come = np.clip(following @ coefficients, bounds[0] * self.left, bounds[1] * self.left)
                 coefficients = solve @ (self.rewards + self.gamma * np.where(self.last, 0.0, to_come))
                 value = float(starts @ (successors @ coefficients)) / float(starts.sum())
-                moved, before = abs(value - before), value
-                if moved <= SETTLED * max(abs(value), 1e-9):
+                if abs(value - before) <= SETTLED * max(abs(value), 1e-9):
                     break
+                before = value
             found.append(value)
         return found[0], found[1]
 
@@ -129,14 +137,14 @@ def _within(episodes: Sequence[Episode], rows: int) -> list[Episode]:
     return kept
 
 
-def _basis(rows: NDArray[np.float64], rng: np.random.Generator) -> Basis:
-    """Return features of state, action and step: squares and products, or random waves where those are too many."""
+def _basis(rows: NDArray[np.float64], rng: np.random.Generator, *, products: bool) -> Basis:
+    """Return features of state, action and step: squares and products where those are few enough, or random waves."""
     mean, scale = rows.mean(axis=0), rows.std(axis=0)
     varies = scale > 1e-6 * np.maximum(1.0, np.abs(mean))
     mean, scale = mean[varies], scale[varies]
     size = int(varies.sum())
     upper = np.triu_indices(size)
-    products = 1 + size + len(upper[0]) <= LARGEST_BASIS
+    products = products and 1 + size + len(upper[0]) <= LARGEST_BASIS
     frequencies = rng.standard_normal((size, WAVES)) / np.sqrt(size)
     phases = rng.uniform(0, 2 * np.pi, WAVES)
 
