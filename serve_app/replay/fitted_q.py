@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 LARGEST_BASIS = 200
 WAVES = 150  # random Fourier features (Rahimi, Recht 2007), where squares and products would be too many
-RIDGE = 1e-8  # relative to the features' own scale
+RIDGE = 1e-3  # relative to the features' own scale
 RESAMPLES = 30
 SETTLED = 1e-4  # of the values' scale: fitting ends when they move by less
 MOST_ROWS = 6_000

@@ -119,7 +119,7 @@ def linear_world(episodes: int, rng: Rng, noise: float, shift: float) -> tuple[l
 
 def test_fitted_q_finds_the_return_of_a_policy_inside_the_data() -> None:
     rng = np.random.default_rng(0)
-    made, truth = linear_world(200, rng, noise=0.3, shift=0.3)
+    made, truth = linear_world(200, rng, noise=0.5, shift=0.2)
     one = fitted_estimate(made, 1.0, rng)
     assert one.supported, one.reason
     assert one.interval[0] <= truth <= one.interval[1]
