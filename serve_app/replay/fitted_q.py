@@ -24,6 +24,8 @@ SETTLED = 1e-4  # of the values' scale: fitting ends when they move by less
 MOST_ROWS = 6_000
 FARTHEST = 0.05  # the share of the bundle's actions that may be unlike recorded ones
 FARTHEST_MODELS = 0.25  # of the recorded returns' deviation, between two models' estimates
+FARTHEST_RETURN = 2.0  # of the recorded returns' deviation, from their mean to the estimate
+WIDER = 1.5  # than the bootstrap's spread, which knows of no model's error: so measured (docs/recording.md)
 LARGEST_ERROR = 4.0  # of the recorded policy's fitted return, in its standard errors
 
 Episode = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
@@ -81,9 +83,10 @@ def fitted_q(episodes: Sequence[Episode], gamma: float, rng: np.random.Generator
         doubts.append(f"{1 - inside:.0%} of the bundle's actions are unlike any that were recorded")
     if abs(values[0] - values[1]) > FARTHEST_MODELS * spread:
         doubts.append(f"two models of the value differ: {values[0]:.4g} and {values[1]:.4g}")
-    if not returns.min() <= value <= returns.max():
-        doubts.append(f"the estimate {value:.4g} is beyond every recorded return")
-    return Fit(value, np.concatenate(samples), inside, doubts[0] if doubts else None)
+    if not returns.min() <= value <= returns.max() or abs(value - known) > FARTHEST_RETURN * spread:
+        doubts.append(f"the estimate {value:.4g} is far from the recorded returns, {known:.4g} +- {spread:.4g}")
+    resampled = value + WIDER * (np.concatenate(samples) - value)
+    return Fit(value, resampled, inside, doubts[0] if doubts else None)
 
 
 @dataclass(frozen=True)
