@@ -128,6 +128,7 @@ def candidates_of_the_study() -> list[Candidate]:
         Candidate("the recorded policy", linear(BEHAVIOUR), False),
         Candidate("gain 1.1", linear(1.1), False),
         Candidate("gain 1.3", linear(1.3), False),
+        Candidate("gain 1.6", linear(1.6), False),
         Candidate("gain 2", linear(2.0), False),
         Candidate("gain 4", linear(4.0), False),
         Candidate("gain 1, leaning", linear(1.0, 0.2), False),
