@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-pytest_plugins = ["bundles", "servers"]
+pytest_plugins = ["bundles", "checkpoints", "servers"]
 
 ROBO_GYM = ["robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1"]
 # What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and
