@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,24 +15,12 @@ from rlservo.serve_app.runtime.policy import Policy
 pytestmark = pytest.mark.slow
 
 
-HALVES = (  # about as long each, at the same time: most of it is processes that start
-    ["Float64", "Promises32", "Camera", "Endless"],
-    ["Crashing", "Crashing runner", "Crashing for good"],
-)
-
-
 @pytest.fixture(scope="module")
 def edges(tmp_path_factory: pytest.TempPathFactory, run_helper: Any) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("edges")
-
-    def train(names: list[str]) -> dict[str, Any]:
-        out = run_helper("train_edges.py", str(folder), *names, folder=folder)
-        found: dict[str, Any] = json.loads(out.splitlines()[-1])
-        return found
-
-    with ThreadPoolExecutor() as pool:
-        first, second = pool.map(train, HALVES)
-    return folder, first | second
+    out = run_helper("train_edges.py", str(folder), folder=folder)
+    found: dict[str, Any] = json.loads(out.splitlines()[-1])
+    return folder, found
 
 
 @pytest.mark.parametrize("name", ["Float64", "Promises32"])
