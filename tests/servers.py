@@ -1,11 +1,9 @@
-"""Servers for tests: an application on uvicorn, `rlservo serve`, and Pythons for other clients."""
+"""Servers for tests: an application on uvicorn, and `rlservo serve`."""
 
 from __future__ import annotations
 
 import contextlib
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -90,26 +88,3 @@ def live_server(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
         stop.set()
         thread.join(60)
     assert not thread.is_alive()
-
-
-@pytest.fixture(scope="session")
-def client_environment(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """Install packages that cannot share our environment into one of their own; gives its Python, or skips."""
-    made: dict[tuple[str, ...], Path] = {}
-
-    def install(*packages: str) -> Path:
-        if packages not in made:
-            made[packages] = new(*packages)
-        return made[packages]
-
-    def new(*packages: str) -> Path:
-        folder = tmp_path_factory.mktemp("client")
-        commands = [[sys.executable, "-m", "venv", str(folder)]]
-        commands.append([str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", *packages])
-        for command in commands:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-            if done.returncode != 0:
-                pytest.skip(f"{', '.join(packages)} cannot be installed here: {done.stderr.strip()[-300:]}")
-        return folder / "bin" / "python"
-
-    return install

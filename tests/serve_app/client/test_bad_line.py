@@ -132,18 +132,8 @@ class FaultyLine:
 
 
 @pytest.fixture(scope="module")
-def real_ur5(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The UR5 policy that ships with the project."""
-    from rlservo.export.commands.export import export_checkpoint
-
-    root = tmp_path_factory.mktemp("real")
-    export_checkpoint(ROOT / "examples" / "checkpoints" / "ur5_positioning", root, name="ur5", notify=lambda line: None)
-    return root
-
-
-@pytest.fixture(scope="module")
-def store(recurrent: Path, real_ur5: Path) -> PolicyStore:
-    return PolicyStore.load([recurrent, real_ur5])
+def store(recurrent: Path, shipped: Path) -> PolicyStore:
+    return PolicyStore.load([recurrent, shipped / "ur5"])
 
 
 @pytest.fixture(scope="module")
