@@ -73,22 +73,3 @@ def test_run_that_needs_more_than_this_machine_has_is_not_resumed(script: str, r
     ended = run_here(f"{script}.py", "--resume", str(tmp_path), home=tmp_path)
     assert ended.code == 2
     assert re.search(r"40\d CPUs asked for .*; this machine has \d+ CPUs?: go on where there are as many", ended.err)
-
-
-@pytest.mark.slow
-def test_cluster_that_cannot_hold_the_run_refuses_it_and_one_that_grows_says_what_it_waits_for(
-    run_helper: Any, tmp_path: Path
-) -> None:
-    answer = json.loads(run_helper("train_without_room.py", str(tmp_path), folder=tmp_path).splitlines()[-1])
-    assert answer["refused"]["code"] == 2
-    assert re.search(
-        r"error: 3 CPUs asked for \(3 processes with 1 CPU each\); the cluster at [\d.:]+ has 1 CPU: give --num-cpus 0",
-        answer["refused"]["said"],
-    )
-    assert "run: " not in answer["refused"]["said"]
-    assert answer["grew"]["code"] == 0, answer
-    line = "waiting for 3 CPUs (3 processes with 1 CPU each): the cluster has 1 CPU, 1 of them free; Ctrl-C stops"
-    assert answer["grew"]["said"].count(line) >= 1
-    assert answer["grew"]["after_s"] >= 9.0
-    assert answer["interrupted"]["code"] == 130
-    assert "stopped; go on with" in answer["interrupted"]["said"]
