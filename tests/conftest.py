@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-pytest_plugins = ["bundles", "environments", "servers"]
+pytest_plugins = ["checkpoints", "bundles", "environments", "servers"]
 
 # Files whose tests share what is costly to make, by the name of it. The tests of any other file share that file's own.
 TOGETHER = {

@@ -149,13 +149,15 @@ def test_each_folder_is_small_and_complete(name: str) -> None:
 def test_training_again_leaves_a_curve_and_a_checkpoint_that_exports(
     tmp_path: Path, run_script: Any, run_here: Any
 ) -> None:
-    done = run_script("train_shipped.py", "cartpole_dqn", "--set", "stop.env_steps=3000", home=tmp_path)
+    changes = ("stop.env_steps=400", "steps_per_iteration=300", "training.num_steps_sampled_before_learning_starts=200")
+    arguments = [word for change in changes for word in ("--set", change)]
+    done = run_script("train_shipped.py", "cartpole_dqn", *arguments, home=tmp_path)
     assert done.code == 0, done.out + done.err
     run = tmp_path / "runs" / "cartpole_dqn"
-    assert len((run / "curve.csv").read_text().splitlines()) == 3  # 2,000 steps an iteration
+    assert len((run / "curve.csv").read_text().splitlines()) == 3  # 300 steps an iteration
     assert (run / "curve.png").exists()
-    arguments = ("cartpole_dqn", "--checkpoint", str(run / "checkpoint"), "--episodes", "3")
-    measured = run_here("evaluate_shipped.py", *arguments, home=tmp_path)
+    judged = ("cartpole_dqn", "--checkpoint", str(run / "checkpoint"), "--episodes", "3")
+    measured = run_here("evaluate_shipped.py", *judged, home=tmp_path)
     assert measured.code == 0, measured.err
     assert "| anywhere | 3 |" in measured.out
 

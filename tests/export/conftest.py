@@ -1,22 +1,15 @@
-"""Real checkpoints for the export tests, trained by RLlib in a process and a Ray cluster of their own, and kept."""
+"""What the export tests share beside the trained checkpoints of `tests/checkpoints.py`."""
 
 from __future__ import annotations
 
-import os
-import secrets
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from cache import cached, versions
+from checkpoints import APP
 from rlservo.export.graph.one_thread import one_thread
-
-ZOO = Path(__file__).resolve().parents[1] / "zoo"
-APP = ZOO / "app"
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -36,38 +29,6 @@ def notices() -> list[str]:
 def app() -> Path:
     """The folder with the user's own code that some of the checkpoints need."""
     return APP
-
-
-def trained(script: str) -> Path:
-    """Return the folder that a training script fills."""
-
-    def train(folder: Path) -> None:
-        # With the token in its environment Ray writes none to the user's home.
-        environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
-        command = [sys.executable, "-W", "ignore", str(ZOO / script), str(folder)]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=580)
-        assert done.returncode == 0, done.stderr[-3000:]
-
-    made_of = [ZOO, str(ZOO), versions("ray", "torch", "gymnasium", "numpy")]  # pickles name the code's own folder
-    return cached(script.removesuffix(".py"), made_of, train)
-
-
-@pytest.fixture(scope="session")
-def zoo() -> Path:
-    """A folder of checkpoints `<name>/` and what the environment saw, `<name>.npz`. Not to be written to."""
-    return trained("train_zoo.py")
-
-
-@pytest.fixture(scope="session")
-def wide_zoo() -> Path:
-    """The same for spaces, recurrent policies, connectors and algorithms of every kind."""
-    return trained("train_wide_zoo.py")
-
-
-@pytest.fixture(scope="session")
-def old_zoo() -> Path:
-    """The same for RLlib's old API stack."""
-    return trained("train_old_zoo.py")
 
 
 @pytest.fixture

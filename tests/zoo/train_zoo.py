@@ -138,11 +138,23 @@ def ray_for_training() -> Iterator[None]:
     """Start a cluster of one core with a folder of its own: a short path, a socket's may have 107 characters."""
     torch.set_num_threads(1)  # these networks are so small that a second thread only costs
     with tempfile.TemporaryDirectory(prefix="zoo-", dir="/tmp", ignore_cleanup_errors=True) as folder:
-        ray.init(num_cpus=1, include_dashboard=False, _temp_dir=folder, configure_logging=False)
         try:
+            start_ray(folder)
             yield
         finally:
             ray.shutdown()
+
+
+def start_ray(folder: str, attempts: int = 3) -> None:
+    """Start Ray; on a busy machine it may miss its own 30 s (ray 2.60), so it is tried again."""
+    for attempt in range(1, attempts + 1):
+        try:
+            ray.init(num_cpus=1, include_dashboard=False, _temp_dir=folder, configure_logging=False)
+            return
+        except Exception:  # Ray raises plain Exception, RuntimeError, and its own
+            ray.shutdown()
+            if attempt == attempts:
+                raise
 
 
 def main(out: Path, only: list[str]) -> None:
