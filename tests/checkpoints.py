@@ -33,6 +33,14 @@ def trained(script: str) -> Path:
     return cached(script.removesuffix(".py"), TRAINED_WITH, train)
 
 
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that need these checkpoints."""
+    for item in items:
+        if {"zoo", "wide_zoo", "old_zoo"} & set(getattr(item, "fixturenames", ())):
+            item.add_marker("trained")
+
+
 @pytest.fixture(scope="session")
 def zoo() -> Path:
     """A folder of checkpoints `<name>/` and what the environment saw, `<name>.npz`. Not to be written to."""
