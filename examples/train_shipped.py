@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import logging
-import os
 import resource
 import shutil
 import sys
@@ -27,12 +25,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-# Said before Ray is imported, so that it holds for every process of the cluster that is started here.
-os.environ.setdefault("RAY_AUTH_MODE", "token")
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-
+import shared.ray_settings as ray_settings  # before Ray  # isort: skip
 import evaluate_shipped
-import ray
 import shared.resources as resources
 import torch
 import yaml
@@ -41,10 +35,11 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.tune.registry import get_trainable_cls
-from shared.training_run import main_with_sentences
+from shared.training_run import main_with_sentences, ray_session
 
 from rlservo import Policy, export_checkpoint
 
+assert ray_settings
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 MILESTONE = 0.95  # the success rate whose time is printed
 SUMS = ("episodes", "judged", "return", "length", "success")
@@ -284,12 +279,8 @@ def main() -> None:
     # Checkpoints hold functions of this file. Pickled by value, they load where it does not exist.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
     torch.set_num_threads(1)
-    # Never another cluster that runs on this machine.
-    ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-    try:
+    with ray_session(num_cpus=1):
         rows = train(settings, seed, folder)
-    finally:
-        ray.shutdown()
     draw(rows, f"{args.name}, {settings['algorithm']}, seed {seed}", folder / "curve.png")
     print(f"best checkpoint: {folder / 'checkpoint'}")
     if args.install:

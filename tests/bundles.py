@@ -7,12 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
-import secrets
-import shutil
-import subprocess
-import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -27,6 +21,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from cache import cached, versions
+from checkpoints import APP, TRAINED_WITH
 from rlservo.export.contract import bundle as bundle_files
 from rlservo.export.contract.contract import (
     BakedStep,
@@ -342,34 +337,19 @@ SHIPPED = {  # by the name they are served under
 
 
 @pytest.fixture(scope="session")
-def recurrent() -> Path:
+def recurrent(wide_zoo: Path) -> Path:
     """A repository of three LSTM policies, trained for one iteration by RLlib and exported. Not to be written to.
 
     lstm_box: 3 numbers to a Box; lstm_previous: sees its last actions and rewards; act_nested: nested both ways.
     """
-    zoo = Path(__file__).resolve().with_name("zoo")
-    trained_with = [zoo, *RECURRENT, versions("ray", "torch", "gymnasium", "numpy")]
-
-    def train(out: Path) -> None:
-        folder = Path(tempfile.mkdtemp(prefix="zoo-"))  # a short path: Ray's sockets live below it
-        environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
-        command = [sys.executable, "-W", "ignore", str(zoo / "train_wide_zoo.py"), str(folder), *RECURRENT]
-        try:
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
-            assert done.returncode == 0, done.stderr[-3000:]
-            for name in RECURRENT:
-                shutil.copytree(folder / name, out / name)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
 
     def export(out: Path) -> None:
         from rlservo.export.commands.export import export_checkpoint
 
-        trained = cached("recurrent-checkpoints", trained_with, train)
         for name in RECURRENT:
-            export_checkpoint(trained / name, out, name=name, app_dir=zoo / "app", notify=lambda line: None)
+            export_checkpoint(wide_zoo / name, out, name=name, app_dir=APP, notify=lambda line: None)
 
-    return cached("recurrent-policies", [*trained_with, *PRODUCT, EXPORTED_WITH], export)
+    return cached("recurrent-policies", [*RECURRENT, *TRAINED_WITH, *PRODUCT, EXPORTED_WITH], export)
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -41,11 +40,8 @@ needs_wrk = pytest.mark.skipif(shutil.which("wrk") is None, reason="wrk is not i
 
 
 @pytest.fixture(scope="module")
-def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
-    out = tmp_path_factory.mktemp("policies")
-    command = [sys.executable, "-m", "rlservo.deploy.cli", "export", str(UR5), "--out", str(out), "--name", "ur5"]
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
-    return case_of(out / "ur5", UR5)
+def case(shipped: Path) -> Case:
+    return case_of(shipped / "ur5", UR5)
 
 
 @pytest.fixture(scope="module")

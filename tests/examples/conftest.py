@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
+import io
 import os
+import runpy
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,11 +47,32 @@ def run_script(script: str, *arguments: str, home: Path) -> Ended:
     return Ended(done.returncode, done.stdout, done.stderr)
 
 
-def run_helper(script: str, *arguments: str, folder: Path, given: str = "") -> str:
-    """Run a script of the tests' own and return its last line, a JSON document."""
+def run_here(script: str, *arguments: str, home: Path) -> Ended:
+    """Run a script in this process, for what starts no Ray: to import RLlib takes longer than that."""
+    out, err, code, before = io.StringIO(), io.StringIO(), 0, dict(os.environ)
+    try:
+        with contextlib.ExitStack() as stack:
+            patch = stack.enter_context(pytest.MonkeyPatch.context())
+            patch.setattr(sys, "argv", command(script, *arguments)[1:])
+            patch.chdir(home)
+            stack.enter_context(contextlib.redirect_stdout(out))
+            stack.enter_context(contextlib.redirect_stderr(err))
+            stack.enter_context(warnings.catch_warnings(action="ignore"))
+            os.environ.update(environment(home))
+            runpy.run_path(str(EXAMPLES / script), run_name="__main__")
+    except SystemExit as end:
+        assert end.code is None or isinstance(end.code, int), end.code
+        code = end.code or 0
+    finally:  # a script sets what Ray is to see
+        os.environ.clear()
+        os.environ.update(before)
+    return Ended(code, out.getvalue(), err.getvalue())
+
+
+def run_helper(script: str, *arguments: str, folder: Path) -> str:
+    """Run a script of the tests' own and return its output; the last line is a JSON document."""
     done = subprocess.run(
         [sys.executable, "-W", "ignore", str(HERE / script), *arguments],
-        input=given,
         capture_output=True,
         text=True,
         timeout=550,
@@ -70,16 +94,9 @@ def run_helper_fixture() -> Callable[..., str]:
     return run_helper
 
 
-@pytest.fixture(scope="session")
-def refusals(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, list[list[str]]], list[Ended]]:
-    """Return a function that runs a script's `main` with many wrong command lines in one process."""
-
-    def run(script: str, arguments: list[list[str]]) -> list[Ended]:
-        folder = tmp_path_factory.mktemp("refused")
-        out = run_helper("run_many.py", script, folder=folder, given=json.dumps(arguments))
-        return [Ended(**one) for one in json.loads(out.splitlines()[-1])]
-
-    return run
+@pytest.fixture(scope="session", name="run_here")
+def run_here_fixture() -> Callable[..., Ended]:
+    return run_here
 
 
 @dataclass(frozen=True)

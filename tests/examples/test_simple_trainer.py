@@ -6,7 +6,6 @@ import csv
 import json
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -150,10 +149,9 @@ WRONG: list[tuple[str, str]] = [
 
 
 @pytest.mark.slow
-def test_wrong_arguments_are_refused_in_a_sentence_before_anything_starts(refusals: Callable[..., Any]) -> None:
-    for (arguments, sentence), ended in zip(
-        WRONG, refusals("simple_trainer", [one.split() for one, _ in WRONG]), strict=True
-    ):
+def test_wrong_arguments_are_refused_in_a_sentence_before_anything_starts(run_here: Any, tmp_path: Path) -> None:
+    for arguments, sentence in WRONG:
+        ended = run_here("simple_trainer.py", *arguments.split(), home=tmp_path)
         last = ended.err.strip().splitlines()[-1]
         assert ended.code == 2, f"{arguments}: {ended}"
         assert re.search(sentence, last), f"{arguments}: {last}"

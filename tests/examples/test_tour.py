@@ -39,7 +39,7 @@ def _offscreen() -> bool:
     return bool(find_library("EGL") or find_library("OSMesa"))
 
 
-def test_unknown_stop_is_refused_in_a_sentence(tmp_path: Path, run_script: Any) -> None:
-    ended = run_script("tour.py", "atari", home=tmp_path)
+def test_unknown_stop_is_refused_in_a_sentence(tmp_path: Path, run_here: Any) -> None:
+    ended = run_here("tour.py", "atari", home=tmp_path)
     assert ended.code == 2
     assert "atari is no stop of the tour: expected cartpole, frozenlake, ur5" in ended.err

@@ -65,18 +65,19 @@ def test_verify_reports_success_where_the_environment_tells(
 
 @pytest.mark.parametrize(("name", "action"), [("lstm_box", "box"), ("act_nested", "nested"), ("previous", "discrete")])
 def test_verify_drives_recurrent_and_nested_policies(
-    wide_zoo: Path, app: Path, tmp_path: Path, notices: list[str], spaces: str, name: str, action: str
+    wide_zoo: Path, recurrent: Path, app: Path, tmp_path: Path, notices: list[str], spaces: str, name: str, action: str
 ) -> None:
-    exported = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append)
-    assert exported.contract.provenance.env_config["action"] == action
-    result = verify_bundle(
-        exported.path, wide_zoo / name, env_id=spaces, episodes=3, app_dir=app, notify=notices.append
-    )
+    if (recurrent / name).exists():
+        bundle = Path(shutil.copytree(recurrent / name / "1", tmp_path / name / "1"))
+    else:
+        bundle = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append).path
+    assert read_contract(bundle).provenance.env_config["action"] == action
+    result = verify_bundle(bundle, wide_zoo / name, env_id=spaces, episodes=3, app_dir=app, notify=notices.append)
     evaluation = result.evaluation
     assert evaluation is not None and evaluation.episodes == 3 and evaluation.return_bundle != 0.0
     assert evaluation.return_bundle == pytest.approx(evaluation.return_checkpoint, rel=1e-4)
-    assert load_bundle(exported.path).contract.evaluations == (evaluation,)
-    assert not [file for file in exported.path.iterdir() if file.name.startswith(".")]
+    assert load_bundle(bundle).contract.evaluations == (evaluation,)
+    assert not [file for file in bundle.iterdir() if file.name.startswith(".")]
 
 
 def test_verify_catches_another_checkpoint(zoo: Path, tmp_path: Path, notices: list[str]) -> None:
@@ -187,9 +188,12 @@ ROBOT_NAMES = [f"{joint}_joint_{what}" for joint in ("shoulder_pan", "shoulder_l
 
 @pytest.mark.parametrize("name", ["act_nested", "lstm_previous", "image", "obs_tuple"])
 def test_the_report_of_any_policy_fits_a_terminal_and_breaks_no_name(
-    wide_zoo: Path, app: Path, tmp_path: Path, notices: list[str], name: str
+    wide_zoo: Path, recurrent: Path, app: Path, tmp_path: Path, notices: list[str], name: str
 ) -> None:
-    contract = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append).contract
+    if (recurrent / name).exists():
+        contract = read_contract(recurrent / name / "1")
+    else:
+        contract = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append).contract
     file = io.StringIO()
     Console(width=80, file=file).print(contract_report(contract))
     shown = file.getvalue()
