@@ -7,7 +7,6 @@ there whole or not at all.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import datetime
 import logging
 import shutil
@@ -165,7 +164,7 @@ def _export(
             except AgentsDifferError as error:
                 if not name_all:
                     raise
-                queue[:0] = [dataclasses.replace(files, agent_id=agent) for agent in error.agents]
+                queue[:0] = [locate_checkpoint(files.root, files.module_id, agent) for agent in error.agents]
         _publish(written)
     return [result for _, result in written]
 

@@ -192,7 +192,7 @@ class _LoopPolicy:
         self.contract = contract.model_copy(update=spaces)
         self._recipe = recipe
         self._start_loop = start_loop
-        self.reset()
+        self._loop, self._begins = start_loop(), True
 
     def act(self, obs: Any, *, explore: bool = False, seed: int | None = None, reward: float = 0.0) -> Any:  # noqa: ARG002
         spaces = self._recipe.observation_leaves

@@ -163,8 +163,7 @@ class NewStackLoop:
         own = columns.pop(Columns.ACTIONS)
         action = columns.pop(Columns.ACTIONS_FOR_ENV, own)
         self._last += [
-            (map_tree(lambda leaf, row=row: leaf[row], own), {key: values[row] for key, values in columns.items()})
-            for row in range(len(episodes))
+            (_pick(own, row), {key: values[row] for key, values in columns.items()}) for row in range(len(episodes))
         ]
         actions = {name: np.asarray(leaf) for name, leaf in named_leaves(action, "action").items()}
         return {**actions, **outputs}
@@ -186,6 +185,10 @@ class NewStackLoop:
         for leaf, tensor in zip(self._recipe.network_state, next_state, strict=True):
             outputs[f"state_out.{leaf.name}"] = tensor.numpy().copy()
         return outputs
+
+
+def _pick(tree: Tree, row: int) -> Tree:
+    return map_tree(lambda leaf: leaf[row], tree)
 
 
 def _rows(space: Any, inputs: Inputs, count: int) -> list[Any]:

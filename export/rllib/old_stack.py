@@ -113,7 +113,7 @@ class OldStackLoop:
                 columns |= {SampleBatch.REWARDS: 0.0, SampleBatch.TERMINATEDS: False, SampleBatch.TRUNCATEDS: False}
             items.append(AgentConnectorDataType(env, AGENT, columns))
         processed = policy.agent_connectors(items)
-        batch = concat_samples([item.data.sample_batch for item in processed])
+        batch: Any = concat_samples([item.data.sample_batch for item in processed])
         if "state_in_0" in batch:
             batch[SampleBatch.SEQ_LENS] = np.ones(len(envs), np.int32)
         network_obs = np.asarray(batch[SampleBatch.OBS])
