@@ -57,13 +57,13 @@ def export(
     with terminal.errors().status("importing") as status, ExitStack() as fetching:
         with needs_extra("train"):
             from rlservo.export.checkpoints.experiment import best_checkpoint
-            from rlservo.export.checkpoints.remote import fetched
+            from rlservo.export.checkpoints.remote import fetch
             from rlservo.export.commands.export import LOADING_RUNS_CODE, export_all_modules, export_checkpoint
             from rlservo.export.commands.report import export_report, peak_memory_mb
 
         if metric is not None:
             note(LOADING_RUNS_CODE.format(path=checkpoint))
-            local = fetching.enter_context(fetched(checkpoint, status.update))
+            local = fetching.enter_context(fetch(checkpoint, status.update))
             best = best_checkpoint(local, metric, mode.value, app_dir=app_dir, notify=note)
             note(f"{best.path} has the {mode.value} {metric}: {best.score:g}")
             checkpoint = str(best.path)

@@ -20,14 +20,15 @@ MAY_IMPORT: dict[str, set[str]] = {
     "export/rllib": {"export/contract", "export/checkpoints", "export/recipe"},
     "export/graph": {"export/contract", "export/recipe"},
     "export/proof": {"export/contract", "export/recipe"},
-    "export/commands": {
-        "export/contract", "export/checkpoints", "export/recipe", "export/rllib", "export/graph", "export/proof",
-    },
     "serve_app/interface.py": {"export/contract"},
     "serve_app/runtime": {"export/contract", "serve_app/interface.py"},
     "serve_app/wire": {"export/contract"},
     "serve_app/client": {"export/contract", "serve_app/interface.py", "serve_app/wire"},
     "serve_app/rollout": {"export/contract", "serve_app/interface.py"},
+    "export/commands": {
+        "export/contract", "export/checkpoints", "export/recipe", "export/rllib", "export/graph", "export/proof",
+        "serve_app/rollout",
+    },
     "serve_app/versions": {"export/contract", "serve_app/interface.py", "serve_app/runtime"},
     "serve_app/episodes": {"export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/wire"},
     "serve_app/server": {
@@ -61,7 +62,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "httpcore": ("serve_app/client/deadline_backend.py", "serve_app/client/http_transport.py"),
     "websockets": ("serve_app/client/websocket_connection.py", "serve_app/ray_serve/http_connections.py"),
     "pickle": ("export/checkpoints/unpickle.py",),
-    "onnxruntime": ("export/contract/onnx_session.py", "serve_app/runtime/"),
+    "onnxruntime": ("export/contract/ort_session.py", "serve_app/runtime/"),
     "asyncio": (
         "serve_app/versions/", "serve_app/episodes/", "serve_app/server/", "serve_app/protocols/",
         "serve_app/ray_serve/",

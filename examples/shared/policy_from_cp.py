@@ -103,7 +103,7 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
                 f"the policy in {path} has {_named(ours)} for its {side} space, {env.spec.id} has {_named(theirs)}: it "
                 "was trained for another environment"
             )
-    loop = restored.loop()
+    loop = restored.start_loop()
     low, high = (np.asarray(side, np.float64) for side in (env.action_space.low, env.action_space.high))
     transform = leaf_transform(recipe.action_space, recipe.transform)
 

@@ -1,10 +1,11 @@
-"""Every error a user of rlservo can meet, in one tree.
+"""Tree of the errors that a user of rlservo can meet.
 
 One table in `serve_app/protocols/http_errors.py` maps these to status codes, and one handler in `deploy/cli.py` maps
 them to exit codes.
 
     RlservoError                  error
     ├── CheckpointError           checkpoint-unreadable    not a checkpoint, damaged, or its code cannot be imported
+    │   ├── AgentsDifferError     checkpoint-unreadable    its agents need a bundle each: one has to be named
     │   └── UnsupportedError      checkpoint-unsupported   readable, but cannot be exported faithfully
     ├── ParityError               parity-failed            the exported graph differs from RLlib's own actions
     ├── BundleError               bundle-invalid           missing, truncated or malformed bundle
@@ -32,7 +33,7 @@ them to exit codes.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 
@@ -51,6 +52,14 @@ class CheckpointError(RlservoError):
     """The path holds no checkpoint that can be read."""
 
     code = "checkpoint-unreadable"
+
+
+class AgentsDifferError(CheckpointError):
+    """A module treats its `agents` differently, and none of them was named."""
+
+    def __init__(self, message: str, agents: Sequence[str]) -> None:
+        super().__init__(message, {"agents": list(agents)})
+        self.agents = tuple(agents)
 
 
 class UnsupportedError(CheckpointError):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rlservo.export.contract.bundle import CONTRACT_FILE, CONTRACT_KEY, GOLDEN_FILE, ONNX_FILE, Bundle
 from rlservo.export.contract.contract import REWARD, Contract, embedded_contract
 from rlservo.export.contract.errors import BundleError, BundleTamperedError, GoldenMismatchError, first_line
-from rlservo.export.contract.onnx_session import open_session
+from rlservo.export.contract.ort_session import open_ort_session
 from rlservo.export.contract.scores import split_scores
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, LeafSpec, MultiDiscreteSpec, leaf_specs
 from rlservo.serve_app.runtime.exploration import distribution_size
@@ -114,7 +114,7 @@ def _quoted(names: Sequence[str]) -> str:
 def open_graph(bundle: Bundle, threads: int) -> onnxruntime.InferenceSession:
     with bundle.verified_copy(ONNX_FILE) as file:
         try:
-            return open_session(file, threads)
+            return open_ort_session(file, threads)
         except Exception as error:  # onnxruntime's own exceptions share no base but Exception
             sentence = first_line(error).replace(str(file), bundle.onnx.name)
             raise BundleError(f"{bundle.onnx} is not a graph onnxruntime can run: {sentence}") from error
