@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.interface import ActingPolicy
 from rlservo.serve_app.rollout.environment import make_env
+from rlservo.serve_app.rollout.episode import run_episode
 from rlservo.serve_app.rollout.report import RolloutReport
-from rlservo.serve_app.rollout.video import rgb_frame
+from rlservo.serve_app.rollout.video import FilmedEnv
 
 Trace: TypeAlias = list[float]  # distance to the target [m] before each action of one episode
 Frame: TypeAlias = NDArray[np.uint8]  # (height, width, 3)
@@ -50,14 +51,7 @@ def film(policy: ActingPolicy, env_id: str, *, seed: int, note: Callable[[str], 
         return []
     frames: list[Frame] = []
     try:
-        obs, _ = env.reset(seed=seed)
-        policy.reset()
-        frames.append(rgb_frame(env))
-        ended = False
-        while not ended:
-            obs, _, terminated, truncated, _ = env.step(policy.act(obs))
-            frames.append(rgb_frame(env))
-            ended = terminated or truncated
+        run_episode(FilmedEnv(env, frames.append), policy, index=0, seed=seed)
     except UsageError as error:
         note(f"no pictures of the robots: {error.message}")
         return []

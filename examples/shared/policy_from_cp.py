@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from rlservo.export.commands.export import LOADING_RUNS_CODE
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.rollout.control_loop import success_of
 from rlservo.serve_app.rollout.environment import check_fit, make_env
+from rlservo.serve_app.rollout.episode import success_of
 from rlservo.serve_app.runtime.policy import Policy
 from shared.help_text import DefaultsFormatter
 

@@ -46,6 +46,11 @@ class RlservoError(Exception):
         self.message = message
         self.details: dict[str, Any] = dict(details or {})
 
+    def prefix(self, place: str) -> None:
+        """Put where it happened in front of the message; the error stays what it is, for a bare `raise`."""
+        self.message = f"{place}: {self.message}"
+        self.args = (self.message,)
+
 
 class CheckpointError(RlservoError):
     """The path holds no checkpoint that can be read."""

@@ -11,19 +11,15 @@ from typing import Any, Literal
 import numpy as np
 from rich.table import Table
 
+from rlservo.serve_app.rollout.episode import Episode
+
 Rate = Literal["max", "real"]
 
 
 @dataclass(frozen=True)
-class EpisodeRow:
-    """One finished episode."""
+class EpisodeRow(Episode):
+    """One finished episode, and the time spent in its `act` calls."""
 
-    index: int
-    seed: int | None
-    steps: int
-    episode_return: float
-    success: bool | None  # None: the environment does not say
-    final_status: str | None
     latency_p50_ms: float
     latency_max_ms: float
 

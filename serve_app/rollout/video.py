@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
 from rlservo.export.contract.errors import UsageError
+
+if TYPE_CHECKING:
+    import gymnasium as gym
 
 
 class VideoFile:
@@ -58,13 +62,31 @@ class VideoFile:
         self.close()
 
 
-def rgb_frame(env: Any) -> NDArray[np.uint8]:
+class FilmedEnv:
+    """An environment whose picture goes to `add` after each reset and step."""
+
+    def __init__(self, env: gym.Env[Any, Any], add: Callable[[NDArray[np.uint8]], object]) -> None:
+        self._env = env
+        self._add = add
+
+    def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
+        result = self._env.reset(seed=seed)
+        self._add(rgb_frame(self._env))
+        return result
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        result = self._env.step(action)
+        self._add(rgb_frame(self._env))
+        return result
+
+
+def rgb_frame(env: gym.Env[Any, Any]) -> NDArray[np.uint8]:
     """Return `env.render()` as (height, width, 3) uint8.
 
     Raises UsageError when the environment cannot draw: no GL library, no display, or no `rgb_array` mode.
     """
     try:
-        frame = env.render()
+        frame: Any = env.render()
     except Exception as error:  # GL libraries raise ImportError, AttributeError, RuntimeError and mujoco.FatalError
         raise UsageError(
             f"the environment cannot draw a picture ({type(error).__name__}: {str(error)[:200]}). For MuJoCo without a "
