@@ -15,19 +15,17 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from typing_extensions import Self
 
 from rlservo.deploy.demo.picture import Robot, RobotRun, Trace, draw_picture, film
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.interface import Observation
+from rlservo.serve_app.interface import ActingPolicy, Observation
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.rollout.control_loop import rollout
 
@@ -99,7 +97,7 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
     )
 
 
-class _Recorder:
+class _Recorder(ActingPolicy):
     """Passes every call on to the policy and notes the observations, episode by episode."""
 
     def __init__(self, policy: PolicyClient, traces: list[Trace]) -> None:
@@ -120,14 +118,6 @@ class _Recorder:
 
     def close(self) -> None:
         self._policy.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _command(console: Console, *words: str) -> None:

@@ -13,6 +13,7 @@ them to exit codes.
     ├── UnknownPolicyError        unknown-policy
     │   └── UnknownVersionError   unknown-version
     ├── RequestError              bad-request              the request itself is malformed
+    │   ├── StateNeededError      bad-request              ... and must carry state, which it does not
     │   ├── MediaTypeError        wrong-media-type
     │   └── TooLargeError         too-large
     ├── ObservationError          bad-observation          shape, dtype, non-finite or misnamed element
@@ -106,6 +107,23 @@ class RequestError(RlservoError):
     code = "bad-request"
 
 
+class StateNeededError(RequestError):
+    """The policy remembers its episode, and the request carries nothing of it.
+
+    A client may not know that before: a limit on the step of its actions is set on the server. For clients it is a
+    `bad-request` with these details.
+    """
+
+    DETAILS: ClassVar[Mapping[str, str]] = {"send": "state"}
+
+    def __init__(self, message: str, details: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message, {**(details or {}), **self.DETAILS})
+
+    @classmethod
+    def is_described_by(cls, details: Mapping[str, Any]) -> bool:
+        return details.items() >= cls.DETAILS.items()
+
+
 class MediaTypeError(RequestError):
     """The body is not of a type this endpoint reads."""
 
@@ -152,6 +170,7 @@ class UnavailableError(RlservoError):
     """The server is not ready, over capacity, or out of reach."""
 
     code = "unavailable"
+    retry_after_s: float | None = None  # [s] after which the server wants to be asked again, where it said so
 
 
 class OverloadedError(UnavailableError):

@@ -11,12 +11,10 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
-from typing_extensions import Self
 
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import (
@@ -53,7 +51,7 @@ class LinkCounts:
     fallback: int = 0  # steps that got the fallback's action
 
 
-class WithFallback:
+class WithFallback(ActingPolicy):
     """A policy that always has an action in time, for as long as what it wraps keeps its deadline.
 
     ```python
@@ -137,14 +135,6 @@ class WithFallback:
         """Close the wrapped policy."""
         self._policy.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def _fall_back(self, error: DeadlineError | UnavailableError | SessionLostError) -> Any:
         self._count(error)
         if self._fallback_is("stop"):
@@ -157,8 +147,8 @@ class WithFallback:
         if now - self._said_at >= LOG_EVERY_S:
             self._said_at = now
             logger.warning("fallback (%s), %d times so far: %s", self.name, self.counts.fallback, error.message)
-        if isinstance(self._policy, _Told):  # a limit on the step counts from what the robot really does
-            self._policy.commanded(_copy(action))
+        if isinstance(self._policy, LastActionPolicy):  # a limit on the step counts from what the robot really does
+            self._policy.set_last_action(_copy(action))
         return _copy(action)
 
     def _fallback_is(self, word: str) -> bool:
@@ -176,10 +166,10 @@ class WithFallback:
 
 
 @runtime_checkable
-class _Told(Protocol):
+class LastActionPolicy(Protocol):
     """A client whose server may remember the last action."""
 
-    def commanded(self, action: Any) -> None: ...
+    def set_last_action(self, action: Any) -> None: ...
 
 
 def _zero(contract: Contract) -> Any:

@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import Self
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.interface import Closeable
 
 if TYPE_CHECKING:
     import gymnasium as gym
 
 
-class VideoFile:
+class VideoFile(Closeable):
     """An mp4 file that grows frame by frame; nothing is created before the first one. A context manager."""
 
     def __init__(self, path: str | Path, *, fps: float) -> None:
@@ -52,14 +51,6 @@ class VideoFile:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 class FilmedEnv:
