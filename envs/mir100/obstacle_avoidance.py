@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
 
 from rlservo.envs.checks import InvalidResetError
 from rlservo.envs.mir100.navigation import Mir100Navigation
 from rlservo.envs.mir100.parameters import LENGTH, WIDTH
+from rlservo.envs.mir100.simulation import ROOM_VIEW
 from rlservo.envs.mir100.worlds import LAB_6X8, Pose
 
 SAFETY_RADIUS = 0.40  # [m], of a corner of the robot from a cube's centre
@@ -98,7 +98,7 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
     WORLD = LAB_6X8.name
     LASER_COUNT = 16
     SUCCESS_REWARD = 100.0
-    VIEW: ClassVar[dict[str, Any]] = {"lookat": (0.0, 0.0, 0.0), "distance": 9.5, "azimuth": 180.0, "elevation": -55.0}
+    VIEW = ROOM_VIEW
 
     def _random_start(self) -> Pose:
         x = self.np_random.uniform(-2.0, 2.0)

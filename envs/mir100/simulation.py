@@ -1,7 +1,7 @@
 """The simulated robot: put it somewhere, command velocities, let a control cycle pass, read pose, lasers and contacts.
 
-It follows robo-gym's robot server and the diff_drive_controller below it. It knows nothing of observations, rewards or
-Gymnasium. Poses are x, y [m] and yaw [rad] of base_link in the map frame.
+It follows robo-gym's robot server and the diff_drive_controller below it. Poses are x, y [m] and yaw [rad] of base_link
+in the map frame.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ TIMEOUT_SUBSTEPS = round(COMMAND_TIMEOUT_S / TIMESTEP)
 LINEAR_INCREMENT = MAX_LINEAR_ACCELERATION * TIMESTEP  # [m/s] a substep
 HALF_STEP = TIMESTEP / 2  # [s]
 ANGULAR_INCREMENT = MAX_ANGULAR_ACCELERATION * TIMESTEP  # [rad/s] a substep
+# Of a camera: the whole room from above.
+ROOM_VIEW: dict[str, Any] = {"lookat": (0.0, 0.0, 0.0), "distance": 9.5, "azimuth": 180.0, "elevation": -55.0}
 
 Vector = NDArray[np.float64]
 

@@ -95,7 +95,7 @@ class RobotService:
         if not self._gui:
             return
         try:
-            self._robot.show()
+            self._robot.camera.show()
         except Exception as error:  # whatever a display can do; the robot goes on without a window
             log.warning("no window: %s", error)
             self._gui = False

@@ -18,7 +18,7 @@ from rlservo.envs.ur.object_paths import object_path
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
 from rlservo.envs.ur.rs_modes import ROS_ORDER, positions_in_list, state_length
 from rlservo.envs.ur.server_state import state_dict, state_list
-from rlservo.envs.ur.simulation import SETTLE_CYCLES, URSimulation
+from rlservo.envs.ur.simulation import SETTLE_CYCLES, VIEW, URSimulation
 
 INITIAL_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad], until the first SetState
 ROS_JOINTS = [JOINTS[index] for index in ROS_ORDER]
@@ -39,12 +39,12 @@ class URRobot:
             objects=settings.object_names,
             table=settings.table,
         )
+        self.camera = Camera(self.simulation.model, self.simulation.data, **VIEW)
         self._turned = settings.reference_frame == "base"
         self._to_base_link = np.array([-1.0, -1.0, 1.0] if self._turned else [1.0, 1.0, 1.0])
         self._rng = np.random.default_rng(settings.seed)
         self._float_params: dict[str, float] = {}
         self._string_params: dict[str, str] = {}
-        self._camera: Camera | None = None
         self.simulation.place(INITIAL_JOINTS)
 
     @property
@@ -94,20 +94,6 @@ class URRobot:
         self.simulation.hold()
         for _ in range(cycles):
             self.simulation.advance()
-
-    def show(self) -> None:
-        """Show the arm in a window, or refresh it."""
-        if self._camera is None:
-            sim = self.simulation
-            self._camera = Camera(
-                sim.model, sim.data, lookat=(0.0, 0.05, 0.42), distance=2.3, azimuth=145.0, elevation=-18.0
-            )
-        self._camera.show()
-
-    def close(self) -> None:
-        """Close the window."""
-        if self._camera is not None:
-            self._camera.close()
 
     def _wanted_joints(self, wanted: RobotState) -> NDArray[np.float64]:
         names = [f"{joint}_joint_position" for joint in JOINTS]
