@@ -66,7 +66,7 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
     repository = out / "policies"
     shutil.rmtree(repository, ignore_errors=True)  # the only thing here that an earlier run would get in the way of
     out.mkdir(parents=True, exist_ok=True)
-    started = time.monotonic()
+    start = time.monotonic()
 
     console.rule("1  export: RLlib checkpoint to policy bundle")
     for robot in ROBOTS:
@@ -92,9 +92,7 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
     picture = draw_picture(out / "demo.png", runs)
     console.rule("4  result")
     console.print(_table(runs))
-    console.print(
-        f"picture: {picture}   bundles: {repository}   {time.monotonic() - started:.0f} s in all", markup=False
-    )
+    console.print(f"picture: {picture}   bundles: {repository}   {time.monotonic() - start:.0f} s in all", markup=False)
 
 
 class _Recorder(ActingPolicy):
@@ -123,9 +121,9 @@ class _Recorder(ActingPolicy):
 def _command(console: Console, *words: str) -> None:
     """Show and run one rlservo command; its output goes to the terminal."""
     _show(console, *words)
-    done = subprocess.run([sys.executable, "-m", "rlservo.deploy.cli", *words])
-    if done.returncode != 0:
-        raise RlservoError(f"`rlservo {words[0]}` ended with exit code {done.returncode}")
+    result = subprocess.run([sys.executable, "-m", "rlservo.deploy.cli", *words])
+    if result.returncode != 0:
+        raise RlservoError(f"`rlservo {words[0]}` ended with exit code {result.returncode}")
 
 
 def _show(console: Console, *words: str) -> None:

@@ -64,9 +64,9 @@ def draw_picture(file: Path, runs: list[RobotRun]) -> Path:
     """Write the picture as PNG and return its path."""
     from matplotlib.figure import Figure  # the object interface: no window system, no global state
 
-    filmed = any(run.frames for run in runs)
-    columns = 4 if filmed else 1
-    figure = Figure(figsize=(4.0 * columns + (1.5 if filmed else 4.0), 3.6 * len(runs)), layout="constrained")
+    has_frames = any(run.frames for run in runs)
+    columns = 4 if has_frames else 1
+    figure = Figure(figsize=(4.0 * columns + (1.5 if has_frames else 4.0), 3.6 * len(runs)), layout="constrained")
     grid = figure.add_gridspec(len(runs), columns, width_ratios=[1, 1, 1, 1.3][-columns:])
     for row, run in enumerate(runs):
         for column, frame in enumerate(run.frames):

@@ -120,20 +120,20 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
             self.simulation.place(start, target=target, cubes=self._random_cubes())
             if self._failure() is None:
                 return
-        touched = " and ".join(self.simulation.touched())
+        contacts = " and ".join(self.simulation.contacts())
         raise InvalidResetError(
             f"reset option 'start_pose' is {[round(value, 3) for value in start]}: the robot "
-            f"{f'touches {touched}' if touched else f'is within {MIN_READING} m of something'} there, "
+            f"{f'touches {contacts}' if contacts else f'is within {MIN_READING} m of something'} there, "
             f"wherever the cubes stand; expected a pose inside the room, clear of the walls"
         )
 
     def _failure(self) -> str | None:
-        failed = (
+        is_failure = (
             self.simulation.in_collision
             or float(self.simulation.scan.min()) < MIN_READING
             or self._corner_is_near_a_cube()
         )
-        return "collision" if failed else None
+        return "collision" if is_failure else None
 
     def _corner_is_near_a_cube(self) -> bool:
         x, y, yaw = self.simulation.pose

@@ -37,9 +37,9 @@ class Mir100Robot:
         """Return the 1,030 numbers; the original has no names for them."""
         return RobotState(values=self.simulation.state().tolist())
 
-    def set_state(self, wanted: RobotState) -> int:
+    def set_state(self, target: RobotState) -> int:
         """Put target and robot at rest, and cubes where there are any and they are given; it counts as two cycles."""
-        values = wanted.values
+        values = target.values
         if not (len(values) == STATE_LENGTH or ROBOT.stop <= len(values) <= CUBES.start):
             raise ValueError(
                 f"the state has {len(values)} elements: expected {STATE_LENGTH}, or {ROBOT.stop} to {CUBES.start} "

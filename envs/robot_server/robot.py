@@ -38,7 +38,7 @@ class Robot(Protocol):
         """Return the state of this moment."""
         ...
 
-    def set_state(self, wanted: RobotState) -> int:
+    def set_state(self, target: RobotState) -> int:
         """Reset the robot and what is around it. Return how many cycles that took."""
         ...
 

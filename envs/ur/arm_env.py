@@ -152,10 +152,10 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Command the joints, let one cycle pass, and judge the outcome."""
-        given = check_action(action, self._actions, self._elements)
+        values = check_action(action, self._actions, self._elements)
         self._steps += 1
         command = np.empty(6)  # all joints
-        command[self._free] = given
+        command[self._free] = values
         command[self._fixed] = self._fixed_values()[self._fixed]
         self.simulation.command(self._to_joint_positions(command))
         self.simulation.advance()
@@ -217,11 +217,11 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     def _place_arm(self, options: Mapping[str, Any]) -> Vector:
         """Put the arm where the options say and return that."""
-        given = options.get("joint_positions")
-        return self._place_arm_at(np.array(self.START_JOINTS) if given is None else self._check_joints(given))
+        values = options.get("joint_positions")
+        return self._place_arm_at(np.array(self.START_JOINTS) if values is None else self._check_joints(values))
 
-    def _check_joints(self, given: Any) -> Vector:
-        joints = as_vector("joint_positions", given, 6)
+    def _check_joints(self, values: Any) -> Vector:
+        joints = as_vector("joint_positions", values, 6)
         for joint, position, limit in zip(JOINTS, joints, POSITION_LIMITS, strict=True):
             if abs(position) > limit:
                 raise InvalidResetError(

@@ -122,8 +122,8 @@ class BasicAvoidanceURSim(URArmEnv):
         if position is not None:
             self._start_object("fixed_position", dict(zip("xyz", as_vector("fixed_object_position", position, 3))))  # noqa: B905
             return
-        given = any(name in options for name in ("z_amplitude", "z_offset"))
-        for _ in range(1 if given else REDRAWS):
+        is_given = any(name in options for name in ("z_amplitude", "z_offset"))
+        for _ in range(1 if is_given else REDRAWS):
             wave = {
                 "x": OBJECT_X,
                 "y": OBJECT_Y,
@@ -131,7 +131,7 @@ class BasicAvoidanceURSim(URArmEnv):
                 "z_amplitude": self._drawn_or_given(options, "z_amplitude", Z_AMPLITUDE_RANGE),
                 "z_offset": self._drawn_or_given(options, "z_offset", Z_OFFSET_RANGE),
             }
-            if self._start_object("triangle_wave", wave, refuse=given):
+            if self._start_object("triangle_wave", wave, refuse=is_given):
                 return
         raise InvalidResetError(f"{REDRAWS} random motions of the ball all hit the arm at the given joint positions")
 

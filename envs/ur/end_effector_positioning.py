@@ -118,15 +118,15 @@ class EndEffectorPositioningURSim(URArmEnv):
         return observation
 
     def _observation_bounds(self) -> tuple[Vector, Vector]:
-        unbounded = np.full(6, np.inf)
-        high = np.concatenate([unbounded[:3], np.full(6, POSITION_BOUND), unbounded, unbounded, np.full(6, 1.01)])
+        infinite = np.full(6, np.inf)
+        high = np.concatenate([infinite[:3], np.full(6, POSITION_BOUND), infinite, infinite, np.full(6, 1.01)])
         return -high, high
 
     # -- a new episode
 
     def _place_arm(self, options: Mapping[str, Any]) -> Vector:
-        given = options.get("joint_positions")
-        centre = np.array(START_JOINTS) if given is None else as_vector("joint_positions", given, 6)
+        joints_option = options.get("joint_positions")
+        centre = np.array(START_JOINTS) if joints_option is None else as_vector("joint_positions", joints_option, 6)
         if options.get("continue_on_success") and self._success_joints is not None:
             centre, randomize = self._success_joints, False
         else:
@@ -135,8 +135,8 @@ class EndEffectorPositioningURSim(URArmEnv):
         if not randomize:
             return self._place_arm_at(centre)
         for _ in range(REDRAWS):
-            drawn = self.np_random.uniform(centre - START_RANGE, centre + START_RANGE)
-            joints: Vector = np.clip(drawn, -LIMITS, LIMITS)
+            draw = self.np_random.uniform(centre - START_RANGE, centre + START_RANGE)
+            joints: Vector = np.clip(draw, -LIMITS, LIMITS)
             if not self.simulation.place(joints):
                 return joints
         raise InvalidResetError(f"{REDRAWS} random starts around the given joint positions all collide")

@@ -50,13 +50,13 @@ def excerpt(content: bytes) -> str:
 
 def _classes() -> dict[str, type[RlservoError]]:
     """Return every error class by its code, as the wire names it."""
-    found: dict[str, type[RlservoError]] = {}
-    waiting: list[type[RlservoError]] = [RlservoError]
-    while waiting:
-        kind = waiting.pop(0)
-        found.setdefault(kind.code, kind)  # a class comes before those that inherit its code
-        waiting += kind.__subclasses__()
-    return found
+    classes: dict[str, type[RlservoError]] = {}
+    queue: list[type[RlservoError]] = [RlservoError]
+    while queue:
+        kind = queue.pop(0)
+        classes.setdefault(kind.code, kind)  # a class comes before those that inherit its code
+        queue += kind.__subclasses__()
+    return classes
 
 
 def _class_of_status(status: int) -> type[RlservoError]:

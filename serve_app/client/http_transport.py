@@ -89,7 +89,7 @@ class Transport:
             self._headers.append((b"authorization", f"Api-Key {api_key}".encode()))
         self._backend = DeadlineBackend()
         self._pool = _connection_pool(self.url, self._backend)
-        self._closed = False
+        self._is_closed = False
 
     @property
     def reconnects(self) -> int:
@@ -106,7 +106,7 @@ class Transport:
 
     def close(self) -> None:
         """Close the connections. A call after that raises UsageError."""
-        self._closed = True
+        self._is_closed = True
         self._pool.close()
 
     def _call(
@@ -117,7 +117,7 @@ class Transport:
         Raises DeadlineError when the answer did not come in time (never retried: the server may still be at work),
         UnavailableError when the server cannot be reached or stays at 503, and else the error the server names.
         """
-        if self._closed:
+        if self._is_closed:
             raise UsageError("the client is closed: make a new one")
         url = "/".join((self.url, *(quote(part, safe="") for part in path)))
         scheme, host, port, prefix = self._address
@@ -153,9 +153,9 @@ class Transport:
     ) -> tuple[int, Sequence[tuple[bytes, bytes]], bytes]:
         """Return (status, headers, body) of one attempt."""
         remaining = deadline - time.monotonic()
-        late = DeadlineError(f"{self.url} did not answer within {budget:g} s", {"timeout_s": budget})
+        timeout_error = DeadlineError(f"{self.url} did not answer within {budget:g} s", {"timeout_s": budget})
         if remaining <= 0:
-            raise late
+            raise timeout_error
         headers = self._headers
         if body is not None:
             headers = [*headers, (b"content-type", b"application/json"), (b"content-length", b"%d" % len(body))]
@@ -169,7 +169,7 @@ class Transport:
                 for chunk in response.iter_stream():
                     content += chunk
                     if time.monotonic() > deadline:
-                        raise late
+                        raise timeout_error
                     if len(content) > MAX_REPLY_BYTES:
                         raise TooLargeError(
                             f"{self.url} answered more than {MAX_REPLY_BYTES >> 20} MiB: is it rlservo?"
@@ -177,7 +177,7 @@ class Transport:
             finally:
                 response.close()  # an unread rest closes the connection: a late answer cannot meet the next request
         except (httpcore.ReadTimeout, httpcore.WriteTimeout) as error:
-            raise late from error
+            raise timeout_error from error
         except httpcore.ConnectTimeout as error:
             raise UnavailableError(f"{self.url} cannot be reached within {budget:g} s", {"url": self.url}) from error
         except FAILURES as error:
@@ -188,7 +188,7 @@ class Transport:
         finally:
             self._backend.deadline = None
         if time.monotonic() > deadline:
-            raise late
+            raise timeout_error
         return response.status, response.headers, content
 
     def _parse(self, content: bytes, url: str, status: int) -> Any:

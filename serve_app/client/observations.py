@@ -20,8 +20,8 @@ def encode_observation(obs: Observation, contract: Contract) -> tuple[Any, tuple
     if isinstance(space, DictSpec | TupleSpec):
         return _encode_part(obs, space, "obs")
     if isinstance(obs, Mapping):
-        named = {str(name): _finite_array(value, f"element {name!r}") for name, value in obs.items()}
-        return named, next((value.shape[:1] for value in named.values()), ())
+        elements = {str(name): _finite_array(value, f"element {name!r}") for name, value in obs.items()}
+        return elements, next((value.shape[:1] for value in elements.values()), ())
     array = _finite_array(obs, "")
     batch = array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
     return array, batch
@@ -48,8 +48,8 @@ def _finite_array(value: ArrayLike, where: str) -> NDArray[Any]:
     except ValueError as error:
         raise ObservationError(f"the observation is ragged: expected numbers in one shape ({error})") from error
     if array.dtype.kind not in "fiub":
-        got = type(value).__name__ if array.dtype.kind == "O" else array.dtype.name
-        raise ObservationError(f"the observation{where and f', {where},'} holds {got}, expected numbers")
+        kind = type(value).__name__ if array.dtype.kind == "O" else array.dtype.name
+        raise ObservationError(f"the observation{where and f', {where},'} holds {kind}, expected numbers")
     array = array.astype(array.dtype.newbyteorder("="), copy=False)  # orjson takes the machine's own byte order only
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         first = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])

@@ -91,7 +91,7 @@ def _part(action: Any, name: str, contract: Contract) -> Any:
 
 
 def _decode_leaf(action: Any, batch: tuple[int, ...], name: str, space: LeafSpec, contract: Contract) -> NDArray[Any]:
-    expected = (*batch, *space.shape)
+    shape = (*batch, *space.shape)
     what = f"action for {contract.name!r}" if name == "action" else f"{name} for {contract.name!r}"
     try:
         array = np.asarray(action)
@@ -99,11 +99,11 @@ def _decode_leaf(action: Any, batch: tuple[int, ...], name: str, space: LeafSpec
         array = np.asarray(None)
     if array.dtype.kind not in "fiu" and array.size:
         raise ActionError(f"the server's {what} is {str(action)[:80]}, expected numbers")
-    if array.shape != expected:
-        raise ActionError(f"the server's {what} has shape {array.shape}, expected {expected}")
+    if array.shape != shape:
+        raise ActionError(f"the server's {what} has shape {array.shape}, expected {shape}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ActionError(f"the server's {what} has an element that is not finite")
-    typed = array.astype(space.dtype)
-    if typed.dtype.kind in "iu" and not np.array_equal(typed, array):
+    converted = array.astype(space.dtype)
+    if converted.dtype.kind in "iu" and not np.array_equal(converted, array):
         raise ActionError(f"the server's {what} is {str(action)[:80]}, expected {space.dtype}")
-    return typed
+    return converted

@@ -206,13 +206,13 @@ class StreamClient(RemotePolicy):
 
 def _first_of_chunk(chunks: Any, contract: Contract, batch: tuple[int, ...]) -> Any:
     """Return the action without the chunk axis of each leaf: ours are chunks of one. Raises ActionError."""
-    found: dict[str, Any] = {}
+    leaves: dict[str, Any] = {}
     try:
         for name, chunk in action_leaves(contract.action_space, chunks).items():
             array = np.asarray(chunk)
             if array.ndim <= len(batch) or array.shape[len(batch)] != 1:
                 raise ActionError(f"the server's {name} has shape {array.shape}: expected a chunk of one action")
-            found[name] = array[:, 0] if batch else array[0]
+            leaves[name] = array[:, 0] if batch else array[0]
     except (RequestError, ValueError) as error:
         raise ActionError(f"the server's action for {contract.name!r} cannot be read: {error}") from error
-    return build_action(contract.action_space, found)
+    return build_action(contract.action_space, leaves)

@@ -22,7 +22,7 @@ except ModuleNotFoundError as missing:
     raise UsageError("the WebSocket client needs websockets: pip install 'rlservo[client]'") from missing
 
 MAX_FRAME_BYTES = 64 << 20  # far above any action or contract
-READ_BYTES = 65536
+RECEIVE_BYTES = 65536
 
 
 class WebSocket:
@@ -53,7 +53,7 @@ class WebSocket:
             self._protocol.send_request(request)
             self._flush(deadline)
             while not self._protocol.handshake_exc and self._protocol.state.name == "CONNECTING":
-                self._read(deadline)
+                self._receive_bytes(deadline)
             failure = self._protocol.handshake_exc
             if isinstance(failure, InvalidStatus):
                 raise HandshakeError(failure.response.status_code, bytes(failure.response.body or b""))
@@ -95,7 +95,7 @@ class WebSocket:
                 if message is not None:
                     return message
             try:
-                self._read(deadline)
+                self._receive_bytes(deadline)
                 self._events += self._protocol.events_received()
                 self._flush(deadline)  # the answer to a ping, or to a close
             except TimeoutError:
@@ -128,9 +128,9 @@ class WebSocket:
         content = b"".join(self._pieces)
         return content.decode("utf-8", "replace") if self._text else content
 
-    def _read(self, deadline: float) -> None:
+    def _receive_bytes(self, deadline: float) -> None:
         self._socket.settimeout(_remaining(deadline))
-        data = self._socket.recv(READ_BYTES)
+        data = self._socket.recv(RECEIVE_BYTES)
         self.last_receive_at = time.monotonic()
         if data:
             self._protocol.receive_data(data)

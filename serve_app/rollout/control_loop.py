@@ -67,9 +67,9 @@ def rollout(
         check_fit(contract, env, arguments)
         control_rate_hz = control_rate_of(env, arguments, contract)
         if control_rate_hz is None and (rate == "real" or video is not None):
-            wanted = "rate 'real'" if rate == "real" else "a video"
+            purpose = "rate 'real'" if rate == "real" else "a video"
             raise UsageError(
-                f"{wanted} needs a control rate, and neither {env_id} (describe(), render_fps) nor the policy's "
+                f"{purpose} needs a control rate, and neither {env_id} (describe(), render_fps) nor the policy's "
                 "contract states one"
             )
         pacer = _Pacer(control_rate_hz if rate == "real" else None)
@@ -156,13 +156,13 @@ class _Pacer:
         now = time.perf_counter()
         if self._due is None:
             self._due = now
-        late = now - self._due
+        delay_s = now - self._due
         periods = 1
-        if late < 0:
-            time.sleep(-late)
-        elif late > 0:
+        if delay_s < 0:
+            time.sleep(-delay_s)
+        elif delay_s > 0:
             self.overruns += 1
-            periods += int(late * self.rate_hz)  # whole periods gone by are skipped, never caught up in a burst
+            periods += int(delay_s * self.rate_hz)  # whole periods gone by are skipped, never caught up in a burst
         self._due += periods / self.rate_hz  # from the schedule, not from now: that would drift
 
 

@@ -63,17 +63,18 @@ def run_episode(
     draws = np.random.default_rng(seed)  # one seed per exploring action; unused otherwise
     policy.reset()
     obs, _ = _call(env.reset, index, 0, seed=seed)
-    steps, total, reward, ended = 0, 0.0, 0.0, False
+    steps, total, reward, is_over = 0, 0.0, 0.0, False
     info: Mapping[str, Any] = {}
-    while not ended:
-        earned = {REWARD: reward} if has_reward else {}
+    while not is_over:
+        action_seed = int(draws.integers(2**31)) if explore else None
+        reward_input = {REWARD: reward} if has_reward else {}
         try:
-            action = policy.act(obs, explore=explore, seed=int(draws.integers(2**31)) if explore else None, **earned)
+            action = policy.act(obs, explore=explore, seed=action_seed, **reward_input)
         except RlservoError as error:
             error.prefix(f"episode {index}, step {steps}")
             raise
-        obs, given, terminated, truncated, info = _call(env.step, index, steps, _command(action))
-        reward, ended, steps = float(given), terminated or truncated, steps + 1
+        obs, gain, terminated, truncated, info = _call(env.step, index, steps, _command(action))
+        reward, is_over, steps = float(gain), terminated or truncated, steps + 1
         total += reward
     status = info.get("final_status")
     return Episode(index, seed, steps, total, success_of(info), None if status is None else str(status))
@@ -87,9 +88,9 @@ def success_of(info: Mapping[str, Any]) -> bool | None:
     return None if status is None else status == "success"
 
 
-def _call(method: Callable[..., Any], index: int, step: int, *arguments: Any, **named: Any) -> Any:
+def _call(method: Callable[..., Any], index: int, step: int, *arguments: Any, **options: Any) -> Any:
     try:
-        return method(*arguments, **named)
+        return method(*arguments, **options)
     except UsageError as error:
         error.prefix(f"episode {index}, step {step}")
         raise

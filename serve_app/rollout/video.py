@@ -85,6 +85,6 @@ def rgb_frame(env: gym.Env[Any, Any]) -> NDArray[np.uint8]:
         ) from error
     array = np.asarray(frame)
     if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
-        got = type(frame).__name__ if array.ndim == 0 else f"{array.dtype} {array.shape}"
-        raise UsageError(f"the environment's rgb_array picture is {got}, expected uint8 (height, width, 3)")
+        description = type(frame).__name__ if array.ndim == 0 else f"{array.dtype} {array.shape}"
+        raise UsageError(f"the environment's rgb_array picture is {description}, expected uint8 (height, width, 3)")
     return array
