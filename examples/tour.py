@@ -65,7 +65,7 @@ def main() -> None:
     try:
         for stop in args.stops or stops:
             stops[stop](settings)
-    except training_run.Interrupted:
+    except training_run.InterruptError:
         raise KeyboardInterrupt from None  # a tour begins anew
 
 
