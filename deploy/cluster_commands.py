@@ -50,12 +50,12 @@ def print_environment(
 
     Example: `eval "$(rlservo cluster env)" && ray start --head`
     """
-    given = {"stream_idle_s": stream_idle_s, "max_connections_per_address": max_connections_per_address}
+    options = {"stream_idle_s": stream_idle_s, "max_connections_per_address": max_connections_per_address}
     with terminal.needs_extra("serve"):
         from rlservo.serve_app.ray_serve.environment import cluster_environment
     variables = cluster_environment(
         haproxy_folder.expanduser().absolute(),
-        settings={name: value for name, value in given.items() if value is not None},
+        settings={name: value for name, value in options.items() if value is not None},
         one_machine=one_machine,
     )
     write = _export if format is Format.sh else _assign
@@ -98,12 +98,12 @@ def check(
     """
     with terminal.needs_extra("serve"):
         from rlservo.serve_app.ray_serve.cluster_check import check_cluster
-    found: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = []
     for each in check_cluster(address, configuration=config, own=own or (), on_wait=terminal.note):
-        found.append({"check": each.name, "ok": each.ok, "message": each.message})
+        results.append({"check": each.name, "ok": each.ok, "message": each.message})
         if not as_json:
             print(f"{'ok     ' if each.ok else 'PROBLEM'}  {each.name}: {each.message}", flush=True)
-    is_well = all(each["ok"] for each in found)
+    is_well = all(each["ok"] for each in results)
     if as_json:
-        terminal.print_json({"ok": is_well, "checks": found})
+        terminal.print_json({"ok": is_well, "checks": results})
     raise typer.Exit(0 if is_well else 1)

@@ -51,7 +51,7 @@ def export(
     Examples: `rlservo export examples/checkpoints/ur5_positioning --out policies`,
     `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
     """
-    started = time.perf_counter()
+    start = time.perf_counter()
     if all_modules and (module_id is not None or agent_id is not None):
         raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
     with terminal.errors().status("importing") as status, ExitStack() as fetching:
@@ -92,7 +92,7 @@ def export(
                 progress=status.update,
             )
             results = [one]
-    cost = {"seconds": round(time.perf_counter() - started, 2), "peak_memory_mb": round(peak_memory_mb())}
+    cost = {"seconds": round(time.perf_counter() - start, 2), "peak_memory_mb": round(peak_memory_mb())}
     if as_json:
         documents = [
             {"path": str(result.path), "contract": result.contract.model_dump(mode="json"), **cost}
@@ -134,14 +134,14 @@ def inspect(
     """
     from rlservo.export.contract.bundle import load_bundle
 
-    loaded = load_bundle(bundle)
+    contents = load_bundle(bundle)
     if as_json:
-        print_json(loaded.contract.model_dump(mode="json"))
+        print_json(contents.contract.model_dump(mode="json"))
     else:
         from rlservo.export.commands.report import contract_report
 
-        terminal.output().print(contract_report(loaded.contract))
-        terminal.output().print(f"{loaded.path}: all hashes match", markup=False, highlight=False, soft_wrap=True)
+        terminal.output().print(contract_report(contents.contract))
+        terminal.output().print(f"{contents.path}: all hashes match", markup=False, highlight=False, soft_wrap=True)
 
 
 def verify(

@@ -106,12 +106,12 @@ def key(
     """
     from rlservo.serve_app.server.api_keys import new_key
 
-    made, line = new_key(label, admin=admin)
+    secret, line = new_key(label, admin=admin)
     if as_json:
-        print_json({"key": made, "line": line})
+        print_json({"key": secret, "line": line})
         return
     note("the key, for the client; it is not kept anywhere and not shown again:")
-    print(made)
+    print(secret)
     note("the line, for the server's key file (RLSERVO_API_KEYS_FILE):")
     print(line)
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.interface import ActingPolicy
 from rlservo.serve_app.rollout.environment import make_env
+from rlservo.serve_app.rollout.episode import run_episode
 from rlservo.serve_app.rollout.report import RolloutReport
-from rlservo.serve_app.rollout.video import rgb_frame
+from rlservo.serve_app.rollout.video import FilmedEnv
 
 Trace: TypeAlias = list[float]  # distance to the target [m] before each action of one episode
 Frame: TypeAlias = NDArray[np.uint8]  # (height, width, 3)
@@ -54,15 +55,8 @@ def film(policy: ActingPolicy, env_id: str, *, seed: int, steps: int, note: Call
         return []
     frames: list[Frame] = []
     try:
-        obs, _ = env.reset(seed=seed)
-        policy.reset()
-        frames.append(rgb_frame(env))
-        step, ended = 0, False
-        while not ended:
-            obs, _, terminated, truncated, _ = env.step(policy.act(obs))
-            step, ended = step + 1, terminated or truncated
-            if ended or step == steps // 2:
-                frames.append(rgb_frame(env))
+        drawn = FilmedEnv(env, frames.append, steps={0, steps // 2, steps})
+        run_episode(drawn, policy, index=0, seed=seed)
     except UsageError as error:
         note(f"no pictures of the robots: {error.message}")
         return []
@@ -75,9 +69,9 @@ def draw_picture(file: Path, runs: list[RobotRun]) -> Path:
     """Write the picture as PNG and return its path."""
     from matplotlib.figure import Figure  # the object interface: no window system, no global state
 
-    filmed = any(run.frames for run in runs)
-    columns = 4 if filmed else 1
-    figure = Figure(figsize=(4.0 * columns + (1.5 if filmed else 4.0), 3.6 * len(runs)), layout="constrained")
+    has_frames = any(run.frames for run in runs)
+    columns = 4 if has_frames else 1
+    figure = Figure(figsize=(4.0 * columns + (1.5 if has_frames else 4.0), 3.6 * len(runs)), layout="constrained")
     grid = figure.add_gridspec(len(runs), columns, width_ratios=[1, 1, 1, 1.3][-columns:])
     for row, run in enumerate(runs):
         for column, frame in enumerate(run.frames):

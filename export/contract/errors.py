@@ -14,6 +14,7 @@ them to exit codes.
     ├── UnknownPolicyError        unknown-policy
     │   └── UnknownVersionError   unknown-version
     ├── RequestError              bad-request              the request itself is malformed
+    │   ├── StateNeededError      bad-request              ... and must carry state, which it does not
     │   ├── MediaTypeError        wrong-media-type
     │   └── TooLargeError         too-large
     ├── ObservationError          bad-observation          shape, dtype, non-finite or misnamed element
@@ -46,6 +47,11 @@ class RlservoError(Exception):
         super().__init__(message)
         self.message = message
         self.details: dict[str, Any] = dict(details or {})
+
+    def prefix(self, place: str) -> None:
+        """Put where it happened in front of the message; the error stays what it is, for a bare `raise`."""
+        self.message = f"{place}: {self.message}"
+        self.args = (self.message,)
 
 
 class CheckpointError(RlservoError):
@@ -110,6 +116,23 @@ class RequestError(RlservoError):
     code = "bad-request"
 
 
+class StateNeededError(RequestError):
+    """The policy remembers its episode, and the request carries nothing of it.
+
+    A client may not know that before: a limit on the step of its actions is set on the server. For clients it is a
+    `bad-request` with these details.
+    """
+
+    DETAILS: ClassVar[Mapping[str, str]] = {"send": "state"}
+
+    def __init__(self, message: str, details: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message, {**(details or {}), **self.DETAILS})
+
+    @classmethod
+    def is_described_by(cls, details: Mapping[str, Any]) -> bool:
+        return details.items() >= cls.DETAILS.items()
+
+
 class MediaTypeError(RequestError):
     """The body is not of a type this endpoint reads."""
 
@@ -156,6 +179,7 @@ class UnavailableError(RlservoError):
     """The server is not ready, over capacity, or out of reach."""
 
     code = "unavailable"
+    retry_after_s: float | None = None  # [s] after which the server wants to be asked again, where it said so
 
 
 class OverloadedError(UnavailableError):

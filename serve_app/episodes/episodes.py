@@ -12,12 +12,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError
+from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
 from rlservo.serve_app.episodes.carried_state import NOTHING, Carried, carry
 from rlservo.serve_app.episodes.sessions import Session, SessionId, Sessions, shown
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import (
-    NEEDS,
     NEEDS_LAST,
     NEEDS_STATE,
     Decision,
@@ -87,9 +86,9 @@ class Episodes:
             return self._on_stream(asked, stream)
         policy = asked.choose()
         if policy.contract.state:
-            raise RequestError(f"policy '{name}' {NEEDS_STATE}", NEEDS)
+            raise StateNeededError(f"policy '{name}' {NEEDS_STATE}")
         if policy.limited and episode.last_action is None:
-            raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
+            raise StateNeededError(f"policy '{name}' {NEEDS_LAST}")
         return _timed(policy, asked).decision(policy, None)
 
     def policy_of(
@@ -121,7 +120,7 @@ class Episodes:
                     "version in the address"
                 )
         if policy.limited and not carried.begins and carried.last_action is None and episode.last_action is None:
-            raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
+            raise StateNeededError(f"policy '{name}' {NEEDS_LAST}")
         taken = _timed(policy, asked, carried)
         carries = bool(policy.contract.state) or policy.limited
         return taken.decision(policy, EpisodeNote(state=carry(policy, taken.step)) if carries else None)

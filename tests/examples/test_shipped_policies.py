@@ -122,7 +122,7 @@ def test_the_recurrent_policy_needs_its_memory(bundles: dict[str, Path]) -> None
 def test_each_card_states_what_was_measured(name: str) -> None:
     folder = SHIPPED / name
     card = (folder / "README.md").read_text(encoding="utf-8")
-    figures = [evaluate_shipped.Measured(**one) for one in card_figures(name)]
+    figures = [evaluate_shipped.Evaluation(**one) for one in card_figures(name)]
     table = card.partition(evaluate_shipped.BEGIN)[2].partition(evaluate_shipped.END)[0].strip()
     assert table == evaluate_shipped.render(figures)
     assert {(one.episodes, one.seed) for one in figures} == {(evaluate_shipped.EPISODES, evaluate_shipped.SEED)}

@@ -53,9 +53,9 @@ def test_traces_are_whole_episodes_of_what_was_sent_to_the_environment(
     sweep: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    from shared.episode_traces import read_traces
+    from shared.episode_traces import load_traces
 
-    episodes = list(read_traces(sweep.home / "traces"))
+    episodes = list(load_traces(sweep.home / "traces"))
     ended = [one for one in episodes if one.ended]
     assert len(ended) > 10
     for one in ended:
@@ -202,7 +202,7 @@ def test_search_space_reads_values_and_ranges(trainer: Any, tmp_path: Path) -> N
 
     file = tmp_path / "space.yaml"
     file.write_text("lr: {loguniform: [1e-5, 1e-3]}\ngamma: [0.9, 0.99]\nminibatch_size: {choice: [64, 128]}\n")
-    space = search_space.read_search_space(file)
+    space = search_space.load_search_space(file)
     assert space["gamma"] == {"grid_search": [0.9, 0.99]}
     assert 1e-5 <= space["lr"].sample() <= 1e-3
     assert space["minibatch_size"].sample() in (64, 128)
@@ -214,4 +214,4 @@ def test_search_space_reads_values_and_ranges(trainer: Any, tmp_path: Path) -> N
     ):
         file.write_text(wrong)
         with pytest.raises(search_space.UsageError, match=sentence):
-            search_space.read_search_space(file)
+            search_space.load_search_space(file)

@@ -38,7 +38,7 @@ pytestmark = [pytest.mark.serve, pytest.mark.slow]
 def commands(language: str = "sh") -> list[str]:
     """Return the lines of the document's blocks, wherever they are indented to."""
     found = re.findall(rf"^ *```{language}\n(.*?)^ *```", DOCUMENT, re.MULTILINE | re.DOTALL)
-    return [line.strip() for block in found for line in block.splitlines() if line.strip()]
+    return [line.strip() for block in found for line in re.sub(r"\\\n\s*", "", block).splitlines() if line.strip()]
 
 
 @pytest.fixture(scope="module")

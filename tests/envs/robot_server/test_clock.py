@@ -114,27 +114,27 @@ def test_client_that_thinks_within_the_cycle_keeps_the_rate_and_late_one_is_not_
     wall = Wall()
     monkeypatch.setattr("rlservo.envs.robot_server.clock.time", wall)
     clock = Clock("real", 0.05)
-    Clock.wait(clock.passed(1))
+    Clock.wait(clock.count_cycles(1))
     began = wall.monotonic()
     for _ in range(10):
         wall.sleep(0.03)
-        Clock.wait(clock.passed(1))
+        Clock.wait(clock.count_cycles(1))
     assert wall.monotonic() - began == pytest.approx(0.5)
     wall.sleep(0.2)  # late: the next cycle is a whole one, not what is left of a schedule
     began = wall.monotonic()
-    assert clock.missed() == 0
-    Clock.wait(clock.passed(1))
+    assert clock.count_missed_cycles() == 0
+    Clock.wait(clock.count_cycles(1))
     assert wall.monotonic() - began == pytest.approx(0.05)
 
 
 def test_long_silence_is_simulated_for_a_minute_at_most() -> None:
     clock = Clock("real", 0.1)
-    assert clock.missed() == 0  # nothing has begun
-    clock.passed(1)
+    assert clock.count_missed_cycles() == 0  # nothing has begun
+    clock.count_cycles(1)
     assert clock._due is not None
     clock._due -= 3.0
-    assert clock.missed() == pytest.approx(29, abs=1)
-    assert clock.missed() == 0  # counted once
+    assert clock.count_missed_cycles() == pytest.approx(29, abs=1)
+    assert clock.count_missed_cycles() == 0  # counted once
     clock._due -= 3600.0
-    assert clock.missed() == 600
-    assert clock.missed() == 0
+    assert clock.count_missed_cycles() == 600
+    assert clock.count_missed_cycles() == 0

@@ -399,7 +399,7 @@ def test_the_client_is_told_what_was_commanded_instead(line: FaultyLine) -> None
     for fallback in ("hold", "zero", [0.1, 0.2, 0.3, 0.4, 0.5]):
         inner = connected(StreamClient, line, deadline_ms=150.0)
         told: list[Any] = []
-        inner.commanded = told.append  # type: ignore[method-assign, assignment]
+        inner.set_last_action = told.append  # type: ignore[method-assign, assignment]
         with WithFallback(inner, fallback) as policy:  # type: ignore[arg-type]
             policy.act(seen[0])
             assert told == []

@@ -309,8 +309,8 @@ def test_an_action_that_came_too_late_is_not_what_the_next_one_is_measured_from(
         with kind(limited.url, "ur5", server_state=True) as client:
             used = client.act(up)
             # What a late reply leaves behind: the server has gone on, the robot has not.
-            client._last, unseen = client._last, client.act(down)
-            client._last, client._unsure = used.tolist(), True
+            unseen = client.act(down)
+            client.set_last_action(used)
             assert np.abs(unseen - used).max() > 0
             np.testing.assert_allclose(client.act(down), unseen, rtol=1e-5, atol=1e-6)
 
@@ -328,14 +328,14 @@ def test_what_the_robot_was_commanded_instead_is_what_the_next_step_is_measured_
             client.reset()
             used = client.act(np.ones(size, np.float32))
             instead = np.where(used > 0, -1.0, 1.0).astype(np.float32)
-            client.commanded(instead)
+            client.set_last_action(instead)
             after = client.act(np.ones(size, np.float32))
             assert np.abs(after - instead).max() == pytest.approx(LIMIT, rel=1e-3)
             again = client.act(np.ones(size, np.float32))  # said once: from here the server knows
             assert np.abs(again - after).max() == pytest.approx(LIMIT, rel=1e-3)
             # Two observations have no last action of this shape: it is not sent, and nothing else is in its way.
             client.reset()
-            client.commanded(instead)
+            client.set_last_action(instead)
             assert client.act(np.ones((2, size), np.float32)).shape[0] == 2
             if server_state:
                 client.reset()
