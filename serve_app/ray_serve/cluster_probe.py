@@ -107,7 +107,7 @@ def look(names: list[str], folders: list[str], haproxy: str) -> dict[str, Any]:
         with open(script) as file:  # noqa: PTH123
             words = shlex.split(file.read())
         gone = [word for word in words if word.startswith("/") and not os.path.exists(word)]  # noqa: PTH110
-        if not any(word.endswith("haproxy_wrapper.py") for word in words):
+        if not any(word.endswith("/haproxy/wrapper.py") for word in words):
             found["haproxy"] = f"{script} is not the wrapper that rlservo writes"
         elif gone or not os.access(script, os.X_OK):
             found["haproxy"] = f"{script} cannot run: {', '.join(gone) or 'it is not executable'} is missing"

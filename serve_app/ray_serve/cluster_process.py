@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.serve_app.ray_serve import ray_parts
-from rlservo.serve_app.ray_serve.processes import SERVER_LOG, cut_log, describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, cut_log
 from rlservo.serve_app.server.admin_key import remove_key
 
 LOOK_S = 0.5  # between looks at whether Ray's own processes live

@@ -13,7 +13,7 @@ nobody reads.
 
 `install` puts subclasses in place of the classes that uvicorn chooses, in each of Serve's processes that serves HTTP
 (`ingress.py`). One timer a connection looks at its phases; a request costs two assignments. In front of the replicas
-HAProxy has time-outs of its own (`haproxy_wrapper.py`).
+HAProxy has time-outs of its own (`haproxy/configuration.py`).
 """
 
 from __future__ import annotations

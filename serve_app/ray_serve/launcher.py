@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import queue
-import re
 import secrets
 import signal
 import subprocess
@@ -26,10 +25,11 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.contract.errors import UnavailableError, UsageError
-from rlservo.serve_app.ray_serve import haproxy_wrapper as haproxy_script
 from rlservo.serve_app.ray_serve import loopback_ports
 from rlservo.serve_app.ray_serve.environment import ray_environment
-from rlservo.serve_app.ray_serve.processes import SERVER_LOG, check_port, describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
+from rlservo.serve_app.ray_serve.processes import check_port, describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, last_fault
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
@@ -42,11 +42,6 @@ logger = logging.getLogger(__name__)
 START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 30.0
 ENDED_S = 5.0  # from the end of a process's reports to its own
-# In Python's and Ray's logs: a level, an exception's last line, what a raylet's end is told as.
-FAULT = re.compile(
-    r"^(?:\[.*\] *)?(?:ERROR|CRITICAL|FATAL)\b|^\w[\w.]*(?:Error|Exception)\b|\bC? *Check failed\b|terminated\b"
-)
-COLOURS = re.compile(r"\x1b\[[\d;]*m")
 MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
@@ -164,7 +159,7 @@ def _wait_ready(child: subprocess.Popen[bytes], folder: Path, events: queue.Simp
         event = events.get(timeout=START_TIMEOUT_S)
     except queue.Empty:
         raise UnavailableError(
-            f"the server was not ready within {START_TIMEOUT_S:g} s: {_last_fault(folder)}"
+            f"the server was not ready within {START_TIMEOUT_S:g} s: {last_fault(folder / SERVER_LOG)}"
         ) from None
     if event in (STOP, STOP_NOW):
         raise KeyboardInterrupt
@@ -298,7 +293,7 @@ def _check_ray() -> None:
 
 def _haproxy_binary() -> str | None:
     """Return the HAProxy that Ray Serve would use, or None."""
-    return haproxy_script.find_binary() if importlib.util.find_spec("jinja2") is not None else None
+    return find_binary() if importlib.util.find_spec("jinja2") is not None else None
 
 
 def _shown_host(host: str) -> str:
@@ -311,14 +306,4 @@ def _cause_of_end(child: subprocess.Popen[bytes], folder: Path) -> str:
     """Return how the cluster's process ended, with the last fault in its log, if there is one."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         child.wait(ENDED_S)
-    return f"its main process {describe_end(child.poll())}; {_last_fault(folder)}"
-
-
-def _last_fault(folder: Path) -> str:
-    """Return the last line of the log that tells of a fault; most lines tell of what went well."""
-    with contextlib.suppress(OSError):
-        lines = (folder / SERVER_LOG).read_text(errors="replace").splitlines()
-        faults = [line.strip() for line in lines if FAULT.search(line)]
-        if faults:
-            return f"its log says: {COLOURS.sub('', faults[-1])[:500]}"
-    return "its log tells of no fault"
+    return f"its main process {describe_end(child.poll())}; {last_fault(folder / SERVER_LOG)}"

@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from rlservo.serve_app.ray_serve.environment import HAPROXY_BINARY, cluster_environment
-from rlservo.serve_app.ray_serve.haproxy_wrapper import find_binary
+from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
 from rlservo.serve_app.ray_serve.processes import MARK, end_marked, free_ports, remove_folder
 
 ROOT = Path(__file__).resolve().parents[2]

