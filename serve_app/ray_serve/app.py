@@ -180,7 +180,7 @@ class PolicyServer(InferenceService):
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Tell Serve's autoscaler how busy this replica is, for `autoscaling.by_load`."""
-        return {BUSY: self._load.busy()}
+        return {BUSY: self._load.measure()}
 
     async def check_health(self) -> None:
         """Tell Serve's controller that the event loop turns and the policies are there; if not, it replaces us."""

@@ -1,4 +1,4 @@
-"""Ray Serve's own HTTP paths and gRPC methods, which know no keys: nobody answers them.
+"""Closed endpoints: Ray Serve's own HTTP paths and gRPC methods, which check no keys and so are answered to nobody.
 
 `/-/routes` and `ListApplications` tell what is deployed. `/-/healthz` and `Healthz` are what HAProxy's health checks
 ask: where the server has a secret for those checks (`rlservo serve` makes one), only they are answered. For everybody

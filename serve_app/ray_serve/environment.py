@@ -59,7 +59,7 @@ HAPROXY = {
     # for as long, not for Ray's two minutes; ports of replicas that are gone are used again after those.
     "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
     "RAY_SERVE_PORT_QUARANTINE_S": "150",
-    "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "2",  # three looks in vain, and a dead proxy is replaced
+    "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "2",  # three failures, and a dead proxy is replaced
     "RAY_SERVE_HAPROXY_HEALTH_CHECK_INTER": "1s",  # and as long for the answer; after two in vain it is left
     # For a client that sends no more of a body, or reads no more of a reply; not for one that waits. Ray's is
     # an hour. `haproxy/configuration.py` has the other phases' time-outs.
@@ -89,7 +89,7 @@ def cluster_environment(
 ) -> dict[str, str]:
     """Write HAProxy's wrapper into the folder; return the variables that `ray start` needs on a node of a cluster.
 
-    `settings` are those of `PROXY_SETTINGS`; what is not given comes from RLSERVO_* variables, if they are set. Raises
+    `settings` are those of `PROXY_SETTINGS`; others come from RLSERVO_* variables, if they are set. Raises
     UsageError where HAProxy or a setting is not usable.
     """
     chosen = ServerSettings.from_environment(settings)
@@ -156,7 +156,7 @@ def ray_environment(
 def _replica_ports(port: int) -> dict[str, str]:
     """Return where replicas listen: below the ports of outgoing connections, and not where another server's do.
 
-    Ray's own range is the same for every cluster of a machine: a proxy that has not yet been told that a replica is
+    Ray's own range is the same for every cluster of a machine: a proxy that does not yet know that a replica is
     gone would ask the other server's that took its port. And gRPC servers of two clusters share a port without a word
     (ray 2.60 means to forbid it, in a form that gRPC does not read), so that each gets some of the other's requests.
     """

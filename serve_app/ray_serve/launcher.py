@@ -49,8 +49,8 @@ STOP, STOP_NOW = "stop", "stop now"
 
 
 @dataclass(frozen=True)
-class Served:
-    """What `serve_policies` tells when requests are answered."""
+class RunningServer:
+    """Addresses and policies of a server that answers requests."""
 
     url: str
     policies: tuple[tuple[str, str], ...]  # (name, default version)
@@ -70,7 +70,7 @@ def serve_policies(
     served: Mapping[str, Any] | None = None,
     admin_key_file: Path | None = None,
     on_start: Callable[[], None] | None = None,
-    on_ready: Callable[[Served], None] | None = None,
+    on_ready: Callable[[RunningServer], None] | None = None,
     stop: threading.Event | None = None,
 ) -> None:
     """Serve the policies at or below `dirs` until Ctrl-C, SIGTERM or `stop`; return when everything is shut down.
@@ -81,8 +81,8 @@ def serve_policies(
     A second Ctrl-C ends everything at once. In the main thread this takes over SIGINT and SIGTERM (and SIGHUP, unless
     it is ignored, as under nohup) for as long as it runs; in another thread only `stop` ends it.
 
-    `on_start` is told when all that can be checked before has been. Raises UsageError or BundleError before that,
-    UnavailableError when the start fails.
+    `on_start` is called after all checks, before any process starts; `on_ready` when requests are answered. Raises
+    UsageError or BundleError before `on_start`, UnavailableError when the start fails.
     """
     if replicas < 1:
         raise UsageError(f"replicas must be 1 or more, got {replicas}")
@@ -133,7 +133,7 @@ def serve_policies(
         _wait_ready(child, folder, events)
         if on_ready is not None:
             grpc = None if grpc_port is None else f"{_shown_host(host)}:{grpc_port}"
-            on_ready(Served(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc, key_file))
+            on_ready(RunningServer(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc, key_file))
         event = events.get()
         if isinstance(event, Mapping):
             cause = event.get("died") or _cause_of_end(child, folder)

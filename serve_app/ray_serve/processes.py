@@ -25,7 +25,7 @@ MARK = "RLSERVO_LAUNCH"
 # Where `free_ports` looks: above those Ray gives its workers, below those of replicas (`launcher.py`, 30000 and up)
 # and those of outgoing connections (Linux: 32768 and up).
 PORTS = range(20_000, 30_000)
-QUIET_S = 0.3  # without a sign of a marked process, before the last of them counts as gone
+QUIET_S = 0.3  # without any marked process, before the last of them counts as gone
 
 
 def check_port(host: str, port: int) -> None:
@@ -137,7 +137,7 @@ def end_marked(mark: str, session: int | None = None, *, timeout_s: float = 10.0
         for pid in left:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.kill(pid, signal.SIGKILL)
-        # One empty look proves nothing: in the middle of an exec a process shows no environment at all.
+        # One empty result proves nothing: in the middle of an exec a process shows no environment at all.
         if left:
             quiet_since = None
         elif quiet_since is None:

@@ -10,7 +10,7 @@ from pathlib import Path
 SERVER_LOG = "server.log"
 LOG_BYTES = 4 << 20  # [bytes] of this log, and of each log of Ray's
 KEPT_BYTES = 4096  # of a log that is cut
-# In Python's and Ray's logs: a level, an exception's last line, how a raylet's end is told.
+# In Python's and Ray's logs: a level, an exception's last line, a raylet's end.
 FAULT = re.compile(
     r"^(?:\[.*\] *)?(?:ERROR|CRITICAL|FATAL)\b|^\w[\w.]*(?:Error|Exception)\b|\bC? *Check failed\b|terminated\b"
 )

@@ -1,4 +1,4 @@
-"""Installation of the wrapper: the HAProxy to run, and the script that Ray is given in its place."""
+"""Installation of the wrapper: finds HAProxy, and writes the script that Ray runs in its place."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def main(folder: str, binary: str, *arguments: str) -> NoReturn:
         if configuration.knows_replicas(text):
             known.write_text(text)
         elif were_kept and "-sf" not in arguments and known.exists():
-            # The first HAProxy of an actor that has taken another's place, and has not yet heard of any replica.
+            # The first HAProxy of an actor that replaces another one, and knows no replica yet.
             text = known.read_text()
         else:
             known.unlink(missing_ok=True)
