@@ -61,10 +61,10 @@ def serve(
     `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`
     """
     with needs_extra("serve"):
-        from rlservo.serve_app.ray_serve.launcher import Served, serve_policies
+        from rlservo.serve_app.ray_serve.launcher import RunningServer, serve_policies
         from rlservo.serve_app.wire.admin_key_file import key_file
 
-    def ready(served: Served) -> None:
+    def ready(served: RunningServer) -> None:
         for name, default in served.policies:
             terminal.output().print(
                 f"{served.url}/v1/policies/{name}  (version {default})", highlight=False, soft_wrap=True

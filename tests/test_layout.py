@@ -41,7 +41,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "serve_app/ray_serve": {
         "export/contract", "serve_app/versions", "serve_app/server", "serve_app/protocols", "serve_app/wire",
     },
-    "envs": set(),
+    "envs": {"serve_app/wire"},
     "deploy": {"envs", "export", "serve_app"},
     "export/__init__.py": set(),
     "serve_app/__init__.py": set(),
@@ -57,7 +57,10 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "torch": ("export/graph/", "export/proof/", "export/rllib/"),
     "mujoco": ("envs/",),
     "grpc": ("envs/robot_server/", "serve_app/protocols/", "serve_app/ray_serve/"),
-    "google.protobuf": ("envs/robot_server/", "serve_app/protocols/oip_messages.py", "serve_app/protocols/oip_grpc.py"),
+    "google.protobuf": (
+        "envs/robot_server/", "serve_app/protocols/oip_grpc.py", "serve_app/wire/protobuf_messages.py",
+    ),
+    "google.protobuf.message_factory": ("serve_app/wire/protobuf_messages.py",),
     "httpx": (),
     "httpcore": ("serve_app/client/deadline_backend.py", "serve_app/client/http_transport.py"),
     "websockets": ("serve_app/client/websocket_connection.py", "serve_app/ray_serve/http_connections.py"),

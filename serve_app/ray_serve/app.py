@@ -100,7 +100,7 @@ def _serve_limit(settings: ServerSettings) -> int:
     # A line per request costs more than the policy; below this level Serve makes one all the same and drops it (5%).
     logging_config={"enable_access_log": False, "log_level": "WARNING"},
     # A replica that hangs is gone after three checks in vain, 8 s at most; Serve's own 30 s a check would be minutes.
-    # HAProxy leaves it alone before that, after two of its own (`haproxy_wrapper.py`). It has no end in order:
+    # HAProxy leaves it alone before that, after two of its own (`haproxy/configuration.py`). It has no end in order:
     # RAY_SERVE_FORCE_STOP_UNHEALTHY_REPLICAS.
     health_check_period_s=1,
     health_check_timeout_s=2,
@@ -180,7 +180,7 @@ class PolicyServer(InferenceService):
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Tell Serve's autoscaler how busy this replica is, for `autoscaling.by_load`."""
-        return {BUSY: self._load.busy()}
+        return {BUSY: self._load.measure()}
 
     async def check_health(self) -> None:
         """Tell Serve's controller that the event loop turns and the policies are there; if not, it replaces us."""

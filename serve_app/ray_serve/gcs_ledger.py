@@ -1,7 +1,7 @@
 """Ledger of plans in Ray's own key-value store (the GCS), shared by all replicas.
 
 It lives as long as the cluster does: a replica, the controller or the proxy may die and come back. Writing under a
-number fails when the number is taken, which is all the agreement between replicas that is needed.
+number fails when it is in use, which is all the agreement between replicas that is needed.
 """
 
 from __future__ import annotations

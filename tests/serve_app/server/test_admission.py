@@ -179,7 +179,7 @@ def test_a_wait_in_the_queue_counts_from_the_beginning_of_the_burst() -> None:
 
 
 def test_the_proxy_says_in_json_that_no_replica_is_there(tmp_path: Path) -> None:
-    """What else is mended in its configuration, and in Ray's own: test_haproxy_wrapper.py."""
+    """What else is changed in its configuration, and in Ray's own: test_haproxy_wrapper.py."""
     ray_environment(tmp_path, haproxy="/bin/true", mark="test")
     answer_file = tmp_path / "503.http"
     head, _, body = answer_file.read_bytes().partition(b"\r\n\r\n")

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from rlservo.export.contract.errors import LateError
-from rlservo.serve_app.ray_serve.haproxy_wrapper import clock
+from rlservo.serve_app.ray_serve.haproxy.configuration import clock
 from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.request_age import SETTLE_S, STAMP_HEADER, Age
 
