@@ -23,7 +23,6 @@ from rlservo.serve_app.versions.policy_store import (
     Decision,
     EpisodeNote,
     PolicyStore,
-    take_notices,
 )
 from rlservo.serve_app.wire.state_names import BELONGS_TO
 
@@ -238,24 +237,20 @@ def _owner(store: PolicyStore, name: str, version: str | None, identity: str) ->
 
 
 @dataclass(frozen=True, slots=True)
-class _Taken:
-    """A step, and what there is to say of it."""
+class _Timed:
+    """A step, and how long it took."""
 
     step: Step
     milliseconds: float
-    notices: tuple[str, ...]
 
     def decision(self, policy: Policy, note: EpisodeNote | None) -> Decision:
-        contract = policy.contract
-        return Decision(
-            self.step.action, contract.name, contract.version, self.milliseconds, self.step.batch, self.notices, note
-        )
+        contract, step = policy.contract, self.step
+        return Decision(step.action, contract.name, contract.version, self.milliseconds, step.batch, step.notices, note)
 
 
-def _timed(policy: Policy, asked: _Asked, carried: Carried = NOTHING, *, session: Session | None = None) -> _Taken:
+def _timed(policy: Policy, asked: _Asked, carried: Carried = NOTHING, *, session: Session | None = None) -> _Timed:
     """Take a step from what the client carries, or from a session's memory."""
     episode = asked.episode
-    policy.notices.clear()
     started = time.perf_counter()
     step = policy.step(
         asked.obs,
@@ -267,5 +262,4 @@ def _timed(policy: Policy, asked: _Asked, carried: Carried = NOTHING, *, session
         explore=asked.explore,
         seed=asked.seed,
     )
-    taken_ms = (time.perf_counter() - started) * 1e3
-    return _Taken(step, taken_ms, take_notices(policy))
+    return _Timed(step, (time.perf_counter() - started) * 1e3)

@@ -63,7 +63,7 @@ class Session:
         if seq is None or self.seq is None or seq > self.seq:
             return None
         if seq == self.seq:
-            if self.policy.fingerprint(self.policy.read(obs)[0]) == self.asked:
+            if self.policy.fingerprint(self.policy.parse(obs).arrays) == self.asked:
                 return self.answer
             raise SessionError(
                 f"request {seq} of its session was answered already, for another observation: give every request a "

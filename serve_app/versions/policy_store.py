@@ -23,7 +23,7 @@ from rlservo.export.contract.errors import (
     UnknownVersionError,
     UsageError,
 )
-from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec, leaf_specs
+from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
@@ -263,20 +263,17 @@ class PolicyStore:
         batcher = self._batchers.get(policy)
         if batcher is None:
             return _act(policy, obs)
-        policy.notices.clear()
         started = time.perf_counter()
-        feed, batch = policy.read(obs)
-        notices = take_notices(policy)
-        read_ms = (time.perf_counter() - started) * 1e3
-        single = len(next(iter(feed.values()))) == 1  # also a batch of one: the Open Inference Protocol has no other
+        feed, batch, notices = policy.parse(obs)
+        parse_ms = (time.perf_counter() - started) * 1e3
+        rows = len(next(iter(feed.values())))
+        single = rows == 1  # also a batch of one: the Open Inference Protocol has no other
         computed = await batcher.compute(feed, check) if single else batcher.compute_now(feed)
         started = time.perf_counter()
         action = policy.action(computed.outputs, batch=batch)
-        infer_ms = read_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
-        space = policy.contract.action_space
+        infer_ms = parse_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
         version = policy.contract.version
-        sharers = computed.requests
-        return Decision(action, name, version, infer_ms, batch_of(action, space), notices, sharers=sharers)
+        return Decision(action, name, version, infer_ms, rows if batch else None, notices, sharers=computed.requests)
 
     def close(self) -> None:
         """Close every policy; what is waiting to be computed with others is computed."""
@@ -326,15 +323,11 @@ def _newest(versions: Mapping[str, Policy]) -> PolicyPlan:
 
 
 def _act(policy: Policy, obs: Observation, explore: bool = False, seed: int | None = None) -> Decision:
-    if policy.notices:
-        policy.notices.clear()
     started = time.perf_counter()
-    action = policy.act(obs, explore=explore, seed=seed)
+    step = policy.step(obs, explore=explore, seed=seed)
     infer_ms = (time.perf_counter() - started) * 1e3
     contract = policy.contract
-    notices = take_notices(policy) if policy.notices else ()
-    batch = batch_of(action, contract.action_space)
-    return Decision(action, contract.name, contract.version, infer_ms, batch, notices)
+    return Decision(step.action, contract.name, contract.version, infer_ms, step.batch, step.notices)
 
 
 def _draw(name: str, session: str | None, needs_session: bool) -> float:
@@ -356,21 +349,6 @@ NEEDS_LAST = (
 )
 NEEDS: dict[str, Any] = {"send": "state"}
 """Details of both refusals: a client that did not know that it has to carry something learns it from them."""
-
-
-def batch_of(action: Any, space: SpaceSpec) -> int | None:
-    """Return how many actions a batch holds; None for a single one. The first leaf tells."""
-    while isinstance(space, DictSpec | TupleSpec):
-        key: Any = next(iter(space.spaces)) if isinstance(space, DictSpec) else 0
-        action, space = action[key], space.spaces[key]
-    return len(action) if action.ndim > len(space.shape) else None
-
-
-def take_notices(policy: Policy) -> tuple[str, ...]:
-    """Return what the policy noticed since it was last asked."""
-    taken = tuple(policy.notices)
-    policy.notices.clear()
-    return taken
 
 
 def load_policy(

@@ -81,13 +81,13 @@ def test_observations_at_home_show_no_drift_and_those_that_moved_show_which_elem
     rng = np.random.default_rng(0)
     for _ in range(200):
         for _ in range(EVERY):
-            drift.see((MEAN + STD * rng.standard_normal((32, 27))).astype(np.float32))
+            drift.add((MEAN + STD * rng.standard_normal((32, 27))).astype(np.float32))
     assert drift.looks == 200
     assert np.abs(drift.shift).max() < 0.1 and np.abs(drift.spread - 1).max() < 0.1
     moved = MEAN + 3 * STD * (np.arange(27) == 4)
     for _ in range(3000):
         for _ in range(EVERY):
-            drift.see((moved + STD * 2 * rng.standard_normal((4, 27))).astype(np.float32))
+            drift.add((moved + STD * 2 * rng.standard_normal((4, 27))).astype(np.float32))
     assert drift.shift[4] == pytest.approx(3, abs=0.3)
     assert np.abs(np.delete(drift.shift, 4)).max() < 0.3
     assert drift.spread == pytest.approx(2, abs=0.3)
@@ -99,7 +99,7 @@ def test_an_element_that_never_moved_in_training_gives_a_finite_drift(filtered: 
     still = step.model_copy(update={"values": {**step.values, "std": [0.0] * 27}})
     drift = Drift.of(contract.model_copy(update={"baked_in": (still,)}))
     assert drift is not None
-    drift.see(np.full((1, 27), 1e30, np.float32))
+    drift.add(np.full((1, 27), 1e30, np.float32))
     assert np.isfinite(drift.shift).all() and np.isfinite(drift.spread).all()
 
 
