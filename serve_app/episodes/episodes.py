@@ -110,7 +110,7 @@ class Episodes:
             policy = _owner(store, name, version, carried.belongs_to)
         else:
             policy = asked.choose()
-            if stream is not None and _is_loaded(store, stream.policy) and version is None:
+            if stream is not None and store.has(stream.policy) and version is None:
                 policy = stream.policy
             if carried.arrays and policy.contract.state and not store.is_certain(name, version):
                 raise RequestError(
@@ -182,7 +182,7 @@ class Episodes:
         name, version = asked.name, asked.version
         own = session.policy.contract.version
         which = "this stream's episode" if session_id is None else f"session '{shown(session_id)}'"
-        if not _is_loaded(asked.store, session.policy):
+        if not asked.store.has(session.policy):
             if session_id is not None:
                 self.sessions.end(name, session_id, lost=True)
             raise SessionLostError(
@@ -211,11 +211,6 @@ class _Asked:
     def choose(self) -> Policy:
         """Return the policy for whoever is with none yet."""
         return self.store.choose(self.name, self.version, self.session)
-
-
-def _is_loaded(store: PolicyStore, policy: Policy) -> bool:
-    name, version = policy.contract.name, policy.contract.version
-    return name in store.names and version in store.versions(name) and store.get(name, version) is policy
 
 
 def _owner(store: PolicyStore, name: str, version: str | None, identity: str) -> Policy:

@@ -19,7 +19,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 ZEROS = np.zeros(27, np.float32)
 OUTSIDE = np.where(np.arange(27) == 3, np.float32(1.5), ZEROS)
@@ -138,7 +138,7 @@ def test_a_served_policy_has_its_options_and_says_what_they_did(
 ) -> None:
     folder = bounded().path
     options = {"ur5": PolicyOptions(out_of_bounds="clip", max_action_step=0.1), "*": PolicyOptions()}
-    store = PolicyStore.load([folder], options=options)
+    store = load_store(folder, options=options)
     free = bounded(out_of_bounds="accept")
     with served(create_app(lambda: store, ServerSettings())) as port, httpx.Client() as client:
 

@@ -25,8 +25,8 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.drift import EVERY, Drift
 from rlservo.serve_app.server.request_log import LOGGER, configure
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack
+from stores import load_store
 
 MEAN, STD = np.linspace(-2, 2, 27), np.linspace(0.5, 3, 27)
 DASHBOARD = Path(__file__).resolve().parents[3] / "deploy" / "grafana.json"
@@ -113,7 +113,7 @@ def test_a_policy_without_a_filter_has_no_drift(ur5: Path, filtered: Path) -> No
 def test_drift_of_served_requests_is_a_metric_per_element(
     filtered: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
-    store = PolicyStore.load([filtered])
+    store = load_store(filtered)
     with served(create_app(lambda: store, ServerSettings(), replica="r")) as port:
         obs = MEAN + 2 * STD * (np.arange(27) == 7)
         for _ in range(3 * EVERY):
@@ -132,7 +132,7 @@ def test_the_log_says_what_happened_and_values_only_when_asked(
 ) -> None:
     settings = ServerSettings(log_file=str(log_file), log_requests=True, log_values=values)
     configure(settings, replica="r9")
-    store = PolicyStore.load([ur5])
+    store = load_store(ur5)
     with served(create_app(lambda: store, settings)) as port:
         obs = [SECRET] * 27
         assert post(port, "/v1/policies/ur5/act", {"obs": obs}, x_request_id="cell-7/1")[0] == 200
@@ -161,7 +161,7 @@ def test_requests_on_streams_are_logged_like_others(
 ) -> None:
     settings = ServerSettings(log_file=str(log_file), log_requests=True)
     configure(settings)
-    store = PolicyStore.load([ur5])
+    store = load_store(ur5)
     with served(create_app(lambda: store, settings)) as port:
         address = f"ws://127.0.0.1:{port}/v1/policies/ur5"
 
@@ -200,7 +200,7 @@ def test_requests_on_streams_are_logged_like_others(
 def test_the_dashboard_asks_for_metrics_that_exist(
     filtered: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
-    store = PolicyStore.load([filtered])
+    store = load_store(filtered)
     with served(create_app(lambda: store, ServerSettings(), replica="r")) as port:
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27})[0] == 200
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0]})[0] == 422
