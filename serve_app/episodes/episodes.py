@@ -2,7 +2,7 @@
 
 It comes with the request and returns with the reply (`state`), or stays here: under a session's id, or with a stream.
 One of them must be said: a recurrent policy that silently began anew with every request would act wrongly and look
-right. A memory goes to the version that it is of, and to no other. Whatever is refused leaves it where it was.
+right. A recurrent state goes to the version that it is of, and to no other. Whatever is refused leaves it where it was.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
-from rlservo.serve_app.episodes.carried_state import NOTHING, Carried, carry
+from rlservo.serve_app.episodes.carried_state import NO_STATE, CarriedState, carry
 from rlservo.serve_app.episodes.sessions import Session, SessionId, Sessions, shown
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import (
@@ -22,7 +22,6 @@ from rlservo.serve_app.versions.policy_store import (
     Decision,
     EpisodeNote,
     PolicyStore,
-    take_notices,
 )
 from rlservo.serve_app.wire.state_names import BELONGS_TO
 
@@ -32,7 +31,7 @@ class Episode:
     """What a request says of the episode it belongs to."""
 
     state: Mapping[str, Any] | None = None
-    """The memory that the client carries (see `carried_state.py`); empty at an episode's start. None: it carries
+    """Recurrent state that the client carries (see `carried_state.py`); empty at an episode's start. None: it carries
     none."""
 
     session_id: SessionId | None = None
@@ -67,29 +66,29 @@ class Episodes:
         """Decide. `stream` is the session of the stream that the request came on; `session` is whose request it is.
 
         Raises SessionError, SessionLostError, RequestError, UnavailableError where nothing more can be remembered, and
-        what `Policy.step` raises; the memory has then not moved on.
+        what `Policy.step` raises; the recurrent state is then as before.
         """
         if episode.session_id is not None:
             session = str(episode.session_id)
             begun = self.sessions.peek(name, episode.session_id) is not None or (episode.reset and self._alone())
-            if begun or store.choose(name, version, session).episodic:
-                return self._in_session(_Asked(store, name, version, obs, episode, explore, seed, session), seq)
+            if begun or store.choose(name, version, session).is_stateful:
+                return self._in_session(_Request(store, name, version, obs, episode, explore, seed, session), seq)
             # There is nothing to remember: the id says only which requests belong together.
             episode = replace(episode, session_id=None, reset=False, end=False)
         if episode.end or (episode.reset and stream is None):
             word = "end" if episode.end else "reset"
             raise RequestError(f"'{word}' is for a session: send its 'session_id', too")
-        asked = _Asked(store, name, version, obs, episode, explore, seed, session)
+        request = _Request(store, name, version, obs, episode, explore, seed, session)
         if episode.state is not None:
-            return self._carried(asked, stream)
+            return self._carried(request, stream)
         if stream is not None:
-            return self._on_stream(asked, stream)
-        policy = asked.choose()
+            return self._on_stream(request, stream)
+        policy = request.choose()
         if policy.contract.state:
             raise StateNeededError(f"policy '{name}' {NEEDS_STATE}")
-        if policy.limited and episode.last_action is None:
+        if policy.has_step_limit and episode.last_action is None:
             raise StateNeededError(f"policy '{name}' {NEEDS_LAST}")
-        return _timed(policy, asked).decision(policy, None)
+        return _take_step(policy, request).decision(policy, None)
 
     def policy_of(
         self, store: PolicyStore, name: str, version: str | None, session_id: SessionId | None, identity: Any
@@ -101,16 +100,16 @@ class Episodes:
         own = store.find(name, identity) if type(identity) is str and version is None else None
         return own or store.get(name, version)
 
-    def _carried(self, asked: _Asked, stream: Session | None) -> Decision:
-        """Act from a memory that came with the request, for the version that it is of."""
-        store, name, version, episode = asked.store, asked.name, asked.version, asked.episode
+    def _carried(self, request: _Request, stream: Session | None) -> Decision:
+        """Act from a recurrent state that came with the request, by the version that it is of."""
+        store, name, version, episode = request.store, request.name, request.version, request.episode
         assert episode.state is not None
-        carried = Carried.read(episode.state)
-        if carried.belongs_to is not None:
-            policy = _owner(store, name, version, carried.belongs_to)
+        carried = CarriedState.parse(episode.state)
+        if carried.policy_identity is not None:
+            policy = _owner(store, name, version, carried.policy_identity)
         else:
-            policy = asked.choose()
-            if stream is not None and _is_loaded(store, stream.policy) and version is None:
+            policy = request.choose()
+            if stream is not None and store.has(stream.policy) and version is None:
                 policy = stream.policy
             if carried.arrays and policy.contract.state and not store.is_certain(name, version):
                 raise RequestError(
@@ -119,76 +118,77 @@ class Episodes:
                     f"last reply gave ('{BELONGS_TO}' in 'state', or the parameter 'state_policy'), or name the "
                     "version in the address"
                 )
-        if policy.limited and not carried.begins and carried.last_action is None and episode.last_action is None:
+        needs_last = policy.has_step_limit and not carried.is_empty
+        if needs_last and carried.last_action is None and episode.last_action is None:
             raise StateNeededError(f"policy '{name}' {NEEDS_LAST}")
-        taken = _timed(policy, asked, carried)
-        carries = bool(policy.contract.state) or policy.limited
-        return taken.decision(policy, EpisodeNote(state=carry(policy, taken.step)) if carries else None)
+        timed = _take_step(policy, request, carried)
+        carries = bool(policy.contract.state) or policy.has_step_limit
+        return timed.decision(policy, EpisodeNote(state=carry(policy, timed.step)) if carries else None)
 
-    def _on_stream(self, asked: _Asked, stream: Session) -> Decision:
-        """Act from the memory that the connection keeps."""
-        policy, begins = stream.policy, asked.episode.reset
+    def _on_stream(self, request: _Request, stream: Session) -> Decision:
+        """Act from the recurrent state that the connection keeps."""
+        policy, reset = stream.policy, request.episode.reset
         try:
-            self._check_version(asked, stream)
+            self._check_version(request, stream)
         except SessionError:
-            if not begins:
+            if not reset:
                 raise
-            policy = asked.choose()  # an episode begins: with what is there now
-        taken = _timed(policy, asked, session=Session(policy) if begins else stream)
-        rows = taken.step.rows if policy.episodic else 0
+            policy = request.choose()  # an episode begins: with what is there now
+        timed = _take_step(policy, request, session=Session(policy) if reset else stream)
+        rows = timed.step.rows if policy.is_stateful else 0
         if rows != stream.rows:
-            self.sessions.hold(stream, rows)
-        if begins:
+            self.sessions.reserve(stream, rows)
+        if reset:
             stream.begin(policy)
-        stream.keep(taken.step)
-        return taken.decision(policy, EpisodeNote(step=stream.steps))
+        stream.keep(timed.step)
+        return timed.decision(policy, EpisodeNote(step=stream.steps))
 
-    def _in_session(self, asked: _Asked, seq: int | None) -> Decision:
-        """Act from the memory that stands under the request's id; `seq` tells a request sent again."""
-        name, episode = asked.name, asked.episode
+    def _in_session(self, request: _Request, seq: int | None) -> Decision:
+        """Act from the recurrent state under the request's session id; `seq` tells a request sent again."""
+        name, episode = request.name, request.episode
         session_id = episode.session_id
         assert session_id is not None
         if episode.state is not None:
             raise RequestError("the request has a 'state' and a 'session_id': either you carry the state, or we do")
         if episode.reset:
-            policy = asked.choose()
+            policy = request.choose()
             if not self._alone():
                 raise SessionError(
                     "this server has several replicas, and requests of a session would reach any of them: send the "
                     "'state' along, use a WebSocket, or run one replica"
                 )
-            if policy.episodic and not episode.end:
+            if policy.is_stateful and not episode.end:
                 self.sessions.check_room(name, session_id)
             session = Session(policy)
         else:
             session = self.sessions.find(name, session_id)
-            self._check_version(asked, session, session_id)
-            repeated = session.repeated(seq, asked.obs)
+            self._check_version(request, session, session_id)
+            repeated = session.answer_again(seq, request.obs)
             if repeated is not None:
                 return repeated
-        taken = _timed(session.policy, asked, session=session)
+        timed = _take_step(session.policy, request, session=session)
         if episode.end:
             self.sessions.end(name, session_id)
         elif episode.reset:
-            self.sessions.put(name, session_id, session, taken.step.rows if session.policy.episodic else 0)
-        session.keep(taken.step)
-        decision = taken.decision(session.policy, EpisodeNote(session_id=session_id, step=session.steps))
+            self.sessions.put(name, session_id, session, timed.step.rows if session.policy.is_stateful else 0)
+        session.keep(timed.step)
+        decision = timed.decision(session.policy, EpisodeNote(session_id=session_id, step=session.steps))
         session.seq, session.answer = seq, decision
-        session.asked = b"" if seq is None else session.policy.fingerprint(taken.step.fed)
+        session.inputs_hash = b"" if seq is None else session.policy.fingerprint(timed.step.inputs)
         return decision
 
-    def _check_version(self, asked: _Asked, session: Session, session_id: SessionId | None = None) -> None:
+    def _check_version(self, request: _Request, session: Session, session_id: SessionId | None = None) -> None:
         """A session stays with the version it began with, for as long as that is loaded."""
-        name, version = asked.name, asked.version
+        name, version = request.name, request.version
         own = session.policy.contract.version
         which = "this stream's episode" if session_id is None else f"session '{shown(session_id)}'"
-        if not _is_loaded(asked.store, session.policy):
+        if not request.store.has(session.policy):
             if session_id is not None:
                 self.sessions.end(name, session_id, lost=True)
             raise SessionLostError(
                 f"{which} was with version {own} of policy '{name}', which is no longer loaded: begin an episode"
             )
-        if version is not None and asked.store.get(name, version) is not session.policy:
+        if version is not None and request.store.get(name, version) is not session.policy:
             raise SessionError(
                 f"{which} is with version {own} of policy '{name}', and the request names version {version[:32]}: "
                 "begin an episode with that one"
@@ -196,7 +196,7 @@ class Episodes:
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
+class _Request:
     """A request of an episode."""
 
     store: PolicyStore
@@ -211,11 +211,6 @@ class _Asked:
     def choose(self) -> Policy:
         """Return the policy for whoever is with none yet."""
         return self.store.choose(self.name, self.version, self.session)
-
-
-def _is_loaded(store: PolicyStore, policy: Policy) -> bool:
-    name, version = policy.contract.name, policy.contract.version
-    return name in store.names and version in store.versions(name) and store.get(name, version) is policy
 
 
 def _owner(store: PolicyStore, name: str, version: str | None, identity: str) -> Policy:
@@ -237,34 +232,31 @@ def _owner(store: PolicyStore, name: str, version: str | None, identity: str) ->
 
 
 @dataclass(frozen=True, slots=True)
-class _Taken:
-    """A step, and what there is to say of it."""
+class _TimedStep:
+    """A step, and how long it took."""
 
     step: Step
     milliseconds: float
-    notices: tuple[str, ...]
 
     def decision(self, policy: Policy, note: EpisodeNote | None) -> Decision:
-        contract = policy.contract
-        return Decision(
-            self.step.action, contract.name, contract.version, self.milliseconds, self.step.batch, self.notices, note
-        )
+        contract, step = policy.contract, self.step
+        return Decision(step.action, contract.name, contract.version, self.milliseconds, step.batch, step.notices, note)
 
 
-def _timed(policy: Policy, asked: _Asked, carried: Carried = NOTHING, *, session: Session | None = None) -> _Taken:
-    """Take a step from what the client carries, or from a session's memory."""
-    episode = asked.episode
-    policy.notices.clear()
+def _take_step(
+    policy: Policy, request: _Request, carried: CarriedState = NO_STATE, *, session: Session | None = None
+) -> _TimedStep:
+    """Take a step from what the client carries, or from a session's recurrent state."""
+    episode = request.episode
     started = time.perf_counter()
     step = policy.step(
-        asked.obs,
+        request.obs,
         before=None if session is None else session.state,
         last=None if session is None else session.last,
-        state=carried.arrays if carried.arrays or (policy.contract.state and not carried.begins) else None,
+        state=carried.arrays if carried.arrays or (policy.contract.state and not carried.is_empty) else None,
         last_action=carried.last_action if episode.last_action is None else episode.last_action,
         reward=episode.reward,
-        explore=asked.explore,
-        seed=asked.seed,
+        explore=request.explore,
+        seed=request.seed,
     )
-    taken_ms = (time.perf_counter() - started) * 1e3
-    return _Taken(step, taken_ms, take_notices(policy))
+    return _TimedStep(step, (time.perf_counter() - started) * 1e3)

@@ -26,7 +26,7 @@ from rlservo.serve_app.server.core import Core, StoreProvider
 from rlservo.serve_app.server.gauges import gauges_of
 from rlservo.serve_app.server.request_checks import PATH, Hosts, RequestChecks, check_path
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 
 CODES = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "wrong-media-type"}
 ACT_PATH = "/v1/policies/{name}/act"
@@ -39,7 +39,7 @@ def create_app(
     settings: ServerSettings,
     *,
     replica: str = "",
-    control: Control | None = None,
+    control: ReplicaVersions | None = None,
     alone: Callable[[], bool] = lambda: True,
     host: str = "127.0.0.1",
 ) -> PolicyApp:

@@ -107,7 +107,7 @@ class Stream:
             return
         self._core.metrics.stream(name, 1)
         idle = IdleTimer(self._core.settings.stream_idle_s)
-        session = Session(policy) if policy.episodic else None
+        session = Session(policy) if policy.is_stateful else None
         keep = KEEP in scope.get("query_string", b"").split(b"&")
         conversation = _Conversation(
             name,

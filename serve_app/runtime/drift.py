@@ -51,8 +51,8 @@ class Drift:
         labels = names if len(set(names)) == space.size else [label for _, label in iter_elements(space)]
         return cls(tuple(labels), mean, std)
 
-    def see(self, obs: NDArray[Any]) -> None:
-        """Take note of checked observations `[batch, ...]`, or do not: only some are looked at."""
+    def add(self, obs: NDArray[Any]) -> None:
+        """Count checked observations `[batch, ...]` in, or not: one in `EVERY` is looked at."""
         self._left -= 1
         if self._left:
             return

@@ -36,6 +36,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -133,7 +134,7 @@ class FaultyLine:
 
 @pytest.fixture(scope="module")
 def store(recurrent: Path, shipped: Path) -> PolicyStore:
-    return PolicyStore.load([recurrent, shipped / "ur5"])
+    return load_store(recurrent, shipped / "ur5")
 
 
 @pytest.fixture(scope="module")

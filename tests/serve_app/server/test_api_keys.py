@@ -22,8 +22,9 @@ from rlservo.serve_app.server.api_keys import Keys, Role, check_exposure, new_ke
 from rlservo.serve_app.server.request_checks import Hosts, RequestChecks
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.wire.loopback import is_loopback
+from stores import load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -67,7 +68,7 @@ def stream(port: int, **headers: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def store(ur5: Path) -> PolicyStore:
-    return PolicyStore.load([ur5])
+    return load_store(ur5)
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +164,7 @@ def test_probes_and_documentation_need_no_key(port: int) -> None:
 
 
 def test_administration_wants_an_admin_key_even_where_no_key_is_asked_for(
-    ur5: Path, controlled: Callable[..., AbstractContextManager[Control]], served: Serve
+    ur5: Path, controlled: Callable[..., AbstractContextManager[ReplicaVersions]], served: Serve
 ) -> None:
     with controlled(ur5) as control:
         lines = f"{CELL_LINE},{ADMIN_LINE}"
