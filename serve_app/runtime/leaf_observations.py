@@ -19,12 +19,7 @@ from numpy.typing import NDArray
 from rlservo.export.contract.errors import ObservationError, first_line
 from rlservo.export.contract.spaces import BoxSpec, LeafSpec, iter_elements
 from rlservo.serve_app.runtime.drift import Drift
-from rlservo.serve_app.runtime.observation_faults import (
-    describe_unequal,
-    describe_value,
-    first_non_number,
-    listed,
-)
+from rlservo.serve_app.runtime.observation_faults import describe, describe_unequal, first_non_number, list_names
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.rounding import rounding_slack
 
@@ -159,7 +154,7 @@ class LeafParser:
             self._refuse_names(obs)
         for name, value in zip(self._names, values, strict=True):
             if isinstance(value, str | bytes | Mapping) or value is None:
-                self._refuse(f"element '{name}' is {describe_value(value)}, not a number")
+                self._refuse(f"element '{name}' is {describe(value)}, not a number")
         try:
             array = np.asarray(values)
         except (ValueError, TypeError, OverflowError, RecursionError):
@@ -232,15 +227,15 @@ class LeafParser:
             label += f" ({self._names[index]})"
         what = f"element {label}" if where else "it"
         raise ObservationError(
-            f"policy '{self._policy}' cannot read {self._name}: {what} is {describe_value(value)}, not a number",
+            f"policy '{self._policy}' cannot read {self._name}: {what} is {describe(value)}, not a number",
             {"policy": self._policy, "index": list(where)},
         )
 
     def _refuse_names(self, obs: Mapping[str, Any]) -> NoReturn:
         missing = [name for name in self._names if name not in obs]
         unknown = [str(name) for name in obs if name not in self._names]
-        parts = [f"missing {listed(missing)}"] if missing else []
-        parts += [f"unknown {listed(unknown)}"] if unknown else []
+        parts = [f"missing {list_names(missing)}"] if missing else []
+        parts += [f"unknown {list_names(unknown)}"] if unknown else []
         raise ObservationError(
             f"policy '{self._policy}' expects {len(self._names)} named elements: {'; '.join(parts)}",
             {"policy": self._policy, "missing": missing[:100], "unknown": [name[:64] for name in unknown[:100]]},

@@ -49,26 +49,21 @@ def describe_unequal(lists: Sequence[Any]) -> str:
     return "its lists are not of equal length"
 
 
-def describe_value(value: Any) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, str):
-        return f"the string {value[:32]!r}{'...' if len(value) > 32 else ''}"
-    if isinstance(value, Mapping):
-        return "a map"
-    if isinstance(value, int):
-        return "an integer of more than 64 bits"
-    return f"a {type(value).__name__}"
-
-
-def listed(names: list[str]) -> str:
-    shown = ", ".join(repr(name[:64]) for name in names[:LISTED])
-    return shown if len(names) <= LISTED else f"{shown} and {len(names) - LISTED} more"
-
-
-def describe_part(value: Any) -> str:
+def describe(value: Any) -> str:
     if value is None:
         return "null"
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape}"
-    return {"dict": "a map", "list": "a list", "str": "a string"}.get(type(value).__name__, f"a {type(value).__name__}")
+    if isinstance(value, str):
+        return f"the string {value[:32]!r}{'...' if len(value) > 32 else ''}"
+    if isinstance(value, Mapping):
+        return "a map"
+    if isinstance(value, int) and not -(2**63) <= value < 2**64:
+        return "an integer of more than 64 bits"
+    kind = type(value).__name__
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
+
+
+def list_names(names: list[str]) -> str:
+    shown = ", ".join(repr(name[:64]) for name in names[:LISTED])
+    return shown if len(names) <= LISTED else f"{shown} and {len(names) - LISTED} more"

@@ -12,7 +12,7 @@ from rlservo.export.contract.errors import ObservationError
 from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec, leaf_specs
 from rlservo.serve_app.runtime.drift import Drift
 from rlservo.serve_app.runtime.leaf_observations import LeafParser
-from rlservo.serve_app.runtime.observation_faults import describe_part
+from rlservo.serve_app.runtime.observation_faults import describe
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 
 MOST_NOTICES = 16  # of a list of observations: its reply carries them
@@ -83,7 +83,7 @@ class ObservationParser:
         if isinstance(space, DictSpec):
             if not isinstance(value, Mapping):
                 self._refuse(
-                    path, f"expected a map with the keys {', '.join(sorted(space.spaces))}, got {describe_part(value)}"
+                    path, f"expected a map with the keys {', '.join(sorted(space.spaces))}, got {describe(value)}"
                 )
             missing = sorted(set(space.spaces) - set(value))
             unknown = sorted(str(key) for key in value if key not in space.spaces)
@@ -95,7 +95,7 @@ class ObservationParser:
                 self._collect(child, value[key], f"{path}.{key}", leaves)
         elif isinstance(space, TupleSpec):
             if not isinstance(value, list | tuple) or len(value) != len(space.spaces):
-                got = f"{len(value)} of them" if isinstance(value, list | tuple) else describe_part(value)
+                got = f"{len(value)} of them" if isinstance(value, list | tuple) else describe(value)
                 self._refuse(path, f"expected a list of its {len(space.spaces)} parts, got {got}")
             for index, child in enumerate(space.spaces):
                 self._collect(child, value[index], f"{path}.{index}", leaves)

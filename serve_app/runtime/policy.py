@@ -53,7 +53,7 @@ Network = Callable[[dict[str, NDArray[Any]]], dict[str, NDArray[Any]]]
 
 @dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
 class Step:
-    """What one step of an episode came to."""
+    """One step of an episode: the action, the next state, and what the network was given."""
 
     action: Any
     """In the action space's own form, a batch with its axis on every leaf."""
@@ -250,9 +250,9 @@ class Policy:
             last = self._step_limit.parse_last_action(given, rows, batch=batch)
         action, after = self._decide(feed, rows, before, explore, seed, reward)
         if self._step_limit and last is not None:
-            action, limited = self._step_limit.apply(action, last)
-            self._log(limited)
-            notices += limited
+            action, limit_notices = self._step_limit.apply(action, last)
+            self._log(limit_notices)
+            notices += limit_notices
             for name, check in self._action_checks.items():
                 check.check(action[name])
         space = self._contract.action_space
@@ -274,21 +274,22 @@ class Policy:
         return build_action(self._contract.action_space, own)
 
     def network(self) -> Network:
-        """Return the network: from what `parse` gives to the action's tensors by name, unchecked (`action` checks).
+        """Return the network: from what `parse` gives to the action's tensors by name (`build_action` checks them).
 
         It is onnxruntime's own `run`: what has been given to it is computed even when the policy is closed meanwhile.
         """
-        return _named(self._open().run, list(self._action_checks))
+        run, names = self._open().run, list(self._action_checks)
+        return lambda feed: dict(zip(names, run(names, feed), strict=True))
 
     def check_rows(self) -> None:
         """Raise BundleError where the network computes several observations otherwise than each by itself."""
         check_rows(self._bundle, self._open().run)
 
-    def fingerprint(self, fed: Mapping[str, NDArray[Any]]) -> bytes:
-        """Return what tells the observation of a feed (`parse`, `Step.inputs`) from others."""
+    def fingerprint(self, inputs: Mapping[str, NDArray[Any]]) -> bytes:
+        """Return a hash of the observation in the network's inputs (`parse`, `Step.inputs`)."""
         digest = hashlib.blake2b(digest_size=16)
         for name in self._observations.leaves:
-            digest.update(fed[name].tobytes())
+            digest.update(inputs[name].tobytes())
         return digest.digest()
 
     def clone(self) -> Policy:
@@ -376,16 +377,12 @@ class Policy:
         if seed is not None and seed < 0:
             raise RequestError(f"seed must be a non-negative integer, got {seed}")
         rng = self._rng if seed is None else np.random.default_rng(seed)
-        # Minus infinity is how a policy says 'not allowed'; where it is a mean, the guard refuses the action.
+        # Minus infinity is how a policy says 'not allowed'; where it is a mean, the action is refused.
         if np.isnan(inputs).any() or np.isposinf(inputs).any():
             raise ActionError(
                 f"policy '{self._contract.name}' gave a non-finite action distribution for this observation"
             )
         return sample_leaves(inputs, self._check_explores(), self._contract.action_space, rng)
-
-
-def _named(run: Run, names: list[str]) -> Network:
-    return lambda feed: dict(zip(names, run(names, feed), strict=True))
 
 
 def _refuse_closed(_names: list[str], _feed: Mapping[str, Any]) -> NoReturn:

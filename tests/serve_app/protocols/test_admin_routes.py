@@ -52,7 +52,7 @@ class Shelf:
     def newest(self) -> int:
         return max(self.plans, default=0)
 
-    def read(self, generation: int) -> bytes | None:
+    def fetch(self, generation: int) -> bytes | None:
         return self.plans.get(generation)
 
     def append(self, generation: int, content: bytes) -> bool:
