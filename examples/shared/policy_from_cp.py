@@ -92,8 +92,8 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
     from rlservo.export.rllib.restore import restore
 
     with user_code(app_dir) as folder:
-        policy = restore(locate_checkpoint(path, None), folder, print)
-    recipe = policy.recipe
+        restored = restore(locate_checkpoint(path, None), folder, print)
+    recipe = restored.recipe
     for side, ours, theirs in (
         ("observation", recipe.observation_space, env.observation_space),
         ("action", recipe.action_space, env.action_space),
@@ -103,7 +103,7 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
                 f"the policy in {path} has {_space_name(ours)} for its {side} space, {env.spec.id} has "
                 f"{_space_name(theirs)}: it was trained for another environment"
             )
-    loop = policy.loop()
+    loop = restored.loop()
     low, high = (np.asarray(side, np.float64) for side in (env.action_space.low, env.action_space.high))
     transform = leaf_transform(recipe.action_space, recipe.transform)
 
