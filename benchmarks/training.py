@@ -103,7 +103,7 @@ def main() -> None:
     rows: list[Row | Failed] = []
     print(f"PPO on {args.env}, {args.batch:,} steps an iteration, median of {args.iterations}\n{HEADER}", flush=True)
     until = time.monotonic() + 60.0 * args.minutes
-    with training_run.private_ray(num_cpus=max(args.runners) + 1):
+    with training_run.ray_session(num_cpus=max(args.runners) + 1):
         warm_up()
         configurations = list(itertools.product(args.runners, args.envs))
         for done, (runners, envs) in enumerate(configurations):

@@ -414,7 +414,7 @@ def main() -> None:
         run, _ = training_run.load_run(args.resume)
         if args.address is None and run.request:  # runs of before have none
             check_machine(run)
-        with training_run.private_ray(
+        with training_run.ray_session(
             num_cpus=ray_cores(run),
             num_gpus=run.num_gpus,
             address=args.address,
@@ -428,7 +428,7 @@ def main() -> None:
         config, run, swept = set_up(args)
         if args.address is None:
             check_machine(run, config, args.max_concurrent_trials)
-        with training_run.private_ray(
+        with training_run.ray_session(
             num_cpus=ray_cores(run),
             num_gpus=run.num_gpus,
             address=args.address,

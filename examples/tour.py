@@ -146,7 +146,7 @@ def cartpole(settings: Settings) -> None:
     config.callbacks(on_train_result=training_run.fill_return(RETURN, "max"))
     config.debugging(seed=415)
     run = Run("PPO", env_id, {}, 1)
-    with training_run.private_ray(num_cpus=1):
+    with training_run.ray_session(num_cpus=1):
         outcome = training_run.train(
             config,
             run,
@@ -280,7 +280,7 @@ def frozen_lake(settings: Settings) -> None:
     shutil.rmtree(log, ignore_errors=True)
     log.mkdir(parents=True)
     config.debugging(seed=1)
-    with training_run.private_ray(num_cpus=1), training_run.stopping(training_run.build(config)) as algorithm:
+    with training_run.ray_session(num_cpus=1), training_run.stopping(training_run.build(config)) as algorithm:
         steps, is_solved = 0, False  # one episode tells: without slipping, every episode of a policy is the same
         while not (is_solved and (settings.quick or steps >= EXPLORATION_STEPS)) and steps < 4 * EXPLORATION_STEPS:
             result = algorithm.train()

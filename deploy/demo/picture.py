@@ -42,8 +42,12 @@ class RobotRun:
     frames: list[Frame]
 
 
-def film(policy: ActingPolicy, env_id: str, *, seed: int, note: Callable[[str], object]) -> list[Frame]:
-    """Return the first, middle and last picture of one episode; none, with a note, where the machine cannot draw."""
+def film(policy: ActingPolicy, env_id: str, *, seed: int, steps: int, note: Callable[[str], object]) -> list[Frame]:
+    """Return the first, middle and last picture of an episode that had so many steps with this seed.
+
+    None, with a note, where the machine cannot draw. Only these are drawn: a picture costs more than a step and its
+    action together.
+    """
     try:
         env = make_env(env_id, {}, render=True)
     except UsageError as error:
@@ -51,13 +55,13 @@ def film(policy: ActingPolicy, env_id: str, *, seed: int, note: Callable[[str], 
         return []
     frames: list[Frame] = []
     try:
-        run_episode(FilmedEnv(env, frames.append), policy, index=0, seed=seed)
+        run_episode(FilmedEnv(env, frames.append, (0, steps // 2, steps)), policy, index=0, seed=seed)
     except UsageError as error:
         note(f"no pictures of the robots: {error.message}")
         return []
     finally:
         env.close()
-    return [frames[0], frames[len(frames) // 2], frames[-1]]
+    return frames
 
 
 def draw_picture(file: Path, runs: list[RobotRun]) -> Path:

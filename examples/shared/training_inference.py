@@ -163,7 +163,7 @@ def run(task: Task, parser: argparse.ArgumentParser) -> None:
         run, _ = training_run.load_run(args.resume)
         there = {"CPU": run.num_cpus or os.cpu_count() or 1, "GPU": training_run.local_gpus()}
         resources.check_room(run.request, Room("this machine", (there,)))
-        with training_run.private_ray(num_cpus=run.num_cpus, num_gpus=run.num_gpus):
+        with training_run.ray_session(num_cpus=run.num_cpus, num_gpus=run.num_gpus):
             outcome = training_run.resume(args.resume)
     else:
         training_run.check_storage(args.storage)
@@ -179,7 +179,7 @@ def run(task: Task, parser: argparse.ArgumentParser) -> None:
                 "explore": args.explore_during_inference,
             },
         )
-        with training_run.private_ray(num_cpus=args.num_cpus, num_gpus=gpus):
+        with training_run.ray_session(num_cpus=args.num_cpus, num_gpus=gpus):
             cpus = training_run.cores()
             config = algorithm_config(task, args, cpus, gpus)
             print(

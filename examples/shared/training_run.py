@@ -134,7 +134,7 @@ def default_config(algorithm: str, log_level: str = "ERROR") -> AlgorithmConfig:
 
 
 @contextlib.contextmanager
-def private_ray(
+def ray_session(
     *,
     num_cpus: int = 0,
     num_gpus: float = 0.0,

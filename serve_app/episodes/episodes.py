@@ -12,11 +12,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
+from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError
 from rlservo.serve_app.episodes.carried_state import NOTHING, Carried, carry
 from rlservo.serve_app.episodes.sessions import Session, SessionId, Sessions, shown
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import (
+    NEEDS,
     NEEDS_LAST,
     NEEDS_STATE,
     Decision,
@@ -86,9 +87,9 @@ class Episodes:
             return self._on_stream(asked, stream)
         policy = asked.choose()
         if policy.contract.state:
-            raise StateNeededError(f"policy '{name}' {NEEDS_STATE}")
+            raise RequestError(f"policy '{name}' {NEEDS_STATE}", NEEDS)
         if policy.limited and episode.last_action is None:
-            raise StateNeededError(f"policy '{name}' {NEEDS_LAST}")
+            raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
         return _timed(policy, asked).decision(policy, None)
 
     def policy_of(
@@ -120,7 +121,7 @@ class Episodes:
                     "version in the address"
                 )
         if policy.limited and not carried.begins and carried.last_action is None and episode.last_action is None:
-            raise StateNeededError(f"policy '{name}' {NEEDS_LAST}")
+            raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
         taken = _timed(policy, asked, carried)
         carries = bool(policy.contract.state) or policy.limited
         return taken.decision(policy, EpisodeNote(state=carry(policy, taken.step)) if carries else None)

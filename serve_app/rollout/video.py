@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,21 +54,31 @@ class VideoFile(Closeable):
 
 
 class FilmedEnv:
-    """An environment whose picture goes to `add` after each reset and step."""
+    """An environment whose picture goes to `add` after each reset and step, or after the given `steps` (0: the reset)."""
 
-    def __init__(self, env: gym.Env[Any, Any], add: Callable[[NDArray[np.uint8]], object]) -> None:
+    def __init__(
+        self, env: gym.Env[Any, Any], add: Callable[[NDArray[np.uint8]], object], steps: Collection[int] | None = None
+    ) -> None:
         self._env = env
         self._add = add
+        self._steps = steps
+        self._step = 0
 
     def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
         result = self._env.reset(seed=seed)
-        self._add(rgb_frame(self._env))
+        self._step = 0
+        self._draw()
         return result
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         result = self._env.step(action)
-        self._add(rgb_frame(self._env))
+        self._step += 1
+        self._draw()
         return result
+
+    def _draw(self) -> None:
+        if self._steps is None or self._step in self._steps:
+            self._add(rgb_frame(self._env))
 
 
 def rgb_frame(env: gym.Env[Any, Any]) -> NDArray[np.uint8]:

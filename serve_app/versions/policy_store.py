@@ -17,6 +17,7 @@ from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, find_bu
 from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import (
     BundleError,
+    RequestError,
     RlservoError,
     StateNeededError,
     UnknownPolicyError,
@@ -301,7 +302,7 @@ class PolicyStore:
     def _stateless(self, name: str, version: str | None, session: str | None) -> Policy:
         policy = self.choose(name, version, session)
         if policy.episodic:  # its memory belongs to one episode, and a server has many callers
-            raise StateNeededError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}")
+            raise RequestError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}", NEEDS)
         return policy
 
     def _versions(self, name: str) -> Mapping[str, Policy]:
@@ -354,6 +355,8 @@ NEEDS_LAST = (
     f"has a limit on the step from one action to the next: {CARRY}, or 'last_action' (in the Open Inference Protocol "
     f"an input, or 'sequence_start' for the first), or {SESSION}"
 )
+NEEDS = StateNeededError.DETAILS
+"""Details of both refusals: a client that did not know that it has to carry something learns it from them."""
 
 
 def batch_of(action: Any, space: SpaceSpec) -> int | None:

@@ -30,7 +30,7 @@ MEASURE = """
 import sys
 from pathlib import Path
 import training
-with training.training_run.private_ray(num_cpus=2):
+with training.training_run.ray_session(num_cpus=2):
     training.warm_up()
     rows = [training.measure("CartPole-v1", 1, 4, 1, 512, limit) for limit in (0.5, 200.0)]
 for row in rows:

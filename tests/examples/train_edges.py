@@ -43,7 +43,7 @@ RUNS = {
 def main(folder: Path, names: list[str]) -> None:
     training_run.pickle_by_value(simple_trainer, episode_traces)
     found = {}
-    with training_run.private_ray(num_cpus=2, app_dir=Path(__file__).parent / "app"):
+    with training_run.ray_session(num_cpus=2, app_dir=Path(__file__).parent / "app"):
         for name in names:
             more = RUNS[name]
             env = f"edge_environments:edge/{name.split()[0]}-v0"
