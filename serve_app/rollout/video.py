@@ -54,7 +54,7 @@ class VideoFile(Closeable):
 
 
 class FilmedEnv:
-    """An environment whose picture goes to `add` after each reset and step, or after the given `steps` (0: the reset)."""
+    """An environment that gives `add` its picture after each reset and step, or after `steps` alone (0: the reset)."""
 
     def __init__(
         self, env: gym.Env[Any, Any], add: Callable[[NDArray[np.uint8]], object], steps: Collection[int] | None = None
