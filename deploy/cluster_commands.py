@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -18,13 +17,6 @@ cluster = typer.Typer(
     help="Prepare a Ray cluster's nodes, and check them.",
     no_args_is_help=True,
 )
-
-
-class Format(str, Enum):
-    """For whom variables are printed."""
-
-    sh = "sh"
-    env_file = "env-file"
 
 
 @cluster.command("env")
@@ -41,7 +33,9 @@ def print_environment(
     one_machine: Annotated[
         bool, typer.Option("--one-machine", help="For ray start --head --node-ip-address 127.0.0.1: bind to loopback.")
     ] = False,
-    format: Annotated[Format, typer.Option(help="sh: to eval; env-file: for systemd and docker.")] = Format.sh,
+    format: Annotated[
+        Literal["sh", "env-file"], typer.Option(help="sh: to eval; env-file: for systemd and docker.")
+    ] = "sh",
 ) -> None:
     """Print the variables that `ray start` needs on every node.
 
@@ -58,7 +52,7 @@ def print_environment(
         settings={name: value for name, value in options.items() if value is not None},
         one_machine=one_machine,
     )
-    write = _export if format is Format.sh else _assign
+    write = _export if format == "sh" else _assign
     print("\n".join(write(name, value) for name, value in variables.items()))
 
 

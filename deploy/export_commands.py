@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.terminal import Json, needs_extra, note, print_json
 from rlservo.export.contract.errors import UsageError
-
-
-class Pick(str, Enum):
-    """Which end of a metric is the better one."""
-
-    max = "max"
-    min = "min"
 
 
 def export(
@@ -43,7 +35,9 @@ def export(
     metric: Annotated[
         str | None, typer.Option(help="Of a Tune trial or experiment, the checkpoint with the best of this metric.")
     ] = None,
-    mode: Annotated[Pick, typer.Option(help="Whether the best is the largest or the smallest.")] = Pick.max,
+    mode: Annotated[
+        Literal["max", "min"], typer.Option(help="Whether the best is the largest or the smallest.")
+    ] = "max",
     as_json: Json = False,
 ) -> None:
     """Turn an RLlib checkpoint into a policy bundle. It is proven equal to RLlib's own actions, or nothing is written.
@@ -64,8 +58,8 @@ def export(
         if metric is not None:
             note(LOADING_RUNS_CODE.format(path=checkpoint))
             local = fetching.enter_context(fetch(checkpoint, status.update))
-            best = best_checkpoint(local, metric, mode.value, app_dir=app_dir, notify=note)
-            note(f"{best.path} has the {mode.value} {metric}: {best.score:g}")
+            best = best_checkpoint(local, metric, mode, app_dir=app_dir, notify=note)
+            note(f"{best.path} has the {mode} {metric}: {best.score:g}")
             checkpoint = str(best.path)
         if all_modules:
             results = export_all_modules(

@@ -1,7 +1,6 @@
 """Domain randomisation: what a real robot adds to a simulator, drawn anew for each episode.
 
-A wrapper for every environment of this package. It knows nothing of tasks; payload needs a simulation that has
-`set_payload`, as the UR arms' have.
+A wrapper for every environment of this package; payload needs a simulation with `set_payload`, as the UR arms' have.
 """
 
 from __future__ import annotations

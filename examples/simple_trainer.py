@@ -227,11 +227,11 @@ def check_machine(run: Run, config: AlgorithmConfig | None = None, concurrent: i
     request = [bundle for bundle in (driver, *others) if any(bundle.values())]
     machine = Room("this machine", ({"CPU": os.cpu_count() or 1, "GPU": gpus},))
     resources.check_room(request, machine, config=config)
-    ray_has = Room("this machine", ({"CPU": session_cores(run), "GPU": math.ceil(run.num_gpus)},))
+    ray_has = Room("this machine", ({"CPU": ray_cores(run), "GPU": math.ceil(run.num_gpus)},))
     resources.check_room(run.request, ray_has, config=config, concurrent=concurrent)
 
 
-def session_cores(run: Run) -> int:
+def ray_cores(run: Run) -> int:
     """Return the cores a private Ray is started with: of as many trials at once as the machine holds."""
     return run.num_cpus * max(1, (os.cpu_count() or 1) // run.num_cpus)
 
@@ -415,7 +415,7 @@ def main() -> None:
         if args.address is None and run.request:  # runs of before have none
             check_machine(run)
         with training_run.ray_session(
-            num_cpus=session_cores(run),
+            num_cpus=ray_cores(run),
             num_gpus=run.num_gpus,
             address=args.address,
             log_level=run.rest["log_level"],
@@ -429,7 +429,7 @@ def main() -> None:
         if args.address is None:
             check_machine(run, config, args.max_concurrent_trials)
         with training_run.ray_session(
-            num_cpus=session_cores(run),
+            num_cpus=ray_cores(run),
             num_gpus=run.num_gpus,
             address=args.address,
             log_level=args.log_level,

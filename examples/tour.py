@@ -179,7 +179,7 @@ def algorithm_state(checkpoint: Path) -> None:
     """Rebuild the whole algorithm, read its weights here and in every env runner, and write them back."""
     from ray.rllib.algorithms.algorithm import Algorithm
 
-    with training_run.built(Algorithm.from_checkpoint(str(checkpoint))) as algorithm:
+    with training_run.stopping(Algorithm.from_checkpoint(str(checkpoint))) as algorithm:
         weights = algorithm.get_module().get_state()
         for name, array in weights.items():
             print(f"  {name:40} {np.shape(array)}")
@@ -226,9 +226,9 @@ def graph_outputs(bundle: Path, obs: Any) -> dict[str, Any]:
     """Return every output of the exported graph for one observation: action, distribution, value or Q-values."""
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(str(bundle / "policy.onnx"), providers=["CPUExecutionProvider"])
-    names = [output.name for output in session.get_outputs()]
-    return dict(zip(names, session.run(names, {"obs": np.asarray(obs)[None]}), strict=True))
+    ort_session = onnxruntime.InferenceSession(str(bundle / "policy.onnx"), providers=["CPUExecutionProvider"])
+    names = [output.name for output in ort_session.get_outputs()]
+    return dict(zip(names, ort_session.run(names, {"obs": np.asarray(obs)[None]}), strict=True))
 
 
 # FrozenLake: DQN with RLlib's own Python API, for its Q-values.
@@ -280,7 +280,7 @@ def frozen_lake(settings: Settings) -> None:
     shutil.rmtree(log, ignore_errors=True)
     log.mkdir(parents=True)
     config.debugging(seed=1)
-    with training_run.ray_session(num_cpus=1), training_run.built(training_run.build(config)) as algorithm:
+    with training_run.ray_session(num_cpus=1), training_run.stopping(training_run.build(config)) as algorithm:
         steps, is_solved = 0, False  # one episode tells: without slipping, every episode of a policy is the same
         while not (is_solved and (settings.quick or steps >= EXPLORATION_STEPS)) and steps < 4 * EXPLORATION_STEPS:
             result = algorithm.train()

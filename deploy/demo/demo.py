@@ -139,7 +139,7 @@ def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
     _show(console, *words)
     url = f"http://127.0.0.1:{port}"
     with log.open("wb") as stream:
-        # A session of its own: a Ctrl-C at the terminal reaches us alone, and we pass it on once.
+        # Not in our process group: a Ctrl-C at the terminal reaches us alone, and we pass it on once.
         server = subprocess.Popen(
             [sys.executable, "-m", "rlservo.deploy.cli", *words],
             stdout=stream,

@@ -55,8 +55,7 @@ def film(policy: ActingPolicy, env_id: str, *, seed: int, steps: int, note: Call
         return []
     frames: list[Frame] = []
     try:
-        drawn = FilmedEnv(env, frames.append, steps={0, steps // 2, steps})
-        run_episode(drawn, policy, index=0, seed=seed)
+        run_episode(FilmedEnv(env, frames.append, (0, steps // 2, steps)), policy, index=0, seed=seed)
     except UsageError as error:
         note(f"no pictures of the robots: {error.message}")
         return []

@@ -1,7 +1,4 @@
-"""robo-gym's server manager without ROS: starts robot servers, each a process of its own, and ends every one of them.
-
-The first half knows nothing of gRPC; the second is the service on the wire.
-"""
+"""robo-gym's server manager without ROS: starts robot servers, each a process of its own, and ends them all."""
 
 from __future__ import annotations
 

