@@ -104,7 +104,9 @@ def patch_configuration(text: str, replies: Path, *, limits: Limits | None = Non
         text = _replace(text, rf"^( *errorfile {status}) .*$", rf"\1 {replies / file}", f"the answer {status}")
     if "RAY_SERVE_HAPROXY_TIMEOUT_CONNECT_S" not in os.environ:
         text = _replace(text, r"^( *timeout connect) .*$", rf"\1 {CONNECT_TIMEOUT_MS}ms", "'timeout connect'")
-    text = _leave_hung_replicas(text) if knows_replicas(text) else _answer_without_replicas(text)
+    text = _leave_hung_replicas(text)
+    if not knows_replicas(text):
+        text = _answer_without_replicas(text)
     # What is put into a frontend last comes first: connections are bounded before requests are read and stamped.
     text = _stamp(text)
     text = _hide_serve(text, limits)
@@ -135,12 +137,11 @@ def inherit_sockets(text: str, listeners: list[str]) -> str:
 
 
 def listening_addresses(text: str) -> list[str]:
-    """Return where the frontends listen."""
-    return [
-        found[1]
-        for part in re.findall(_FRONTEND, text, re.MULTILINE)
-        if (found := re.search(_BIND, part, re.MULTILINE))
-    ]
+    """Return where the frontends listen. Raises TemplateError where one has no address, or several."""
+    found = [re.findall(_BIND, part, re.MULTILINE) for part in re.findall(_FRONTEND, text, re.MULTILINE)]
+    if [len(addresses) for addresses in found] != [1] * (1 + _has_grpc(text)):
+        raise _unknown_template(f"the frontends listen on {found}")
+    return [address for (address,) in found]
 
 
 def admin_socket(text: str) -> str | None:
@@ -165,11 +166,15 @@ def _replace(text: str, pattern: str, new: str | Callable[[re.Match[str]], str],
     """Replace the one match of a pattern, or the `times` there must be. Raises TemplateError for any other number."""
     text, count = re.subn(pattern, new, text, flags=re.MULTILINE)
     if count != times:
-        raise TemplateError(
-            f"Ray {_ray_version()} writes another HAProxy configuration than Ray 2.60: {what} is there {count} times, "
-            f"not {times}; install a Ray that this version of rlservo knows"
-        )
+        raise _unknown_template(f"{what} is there {count} times, not {times}")
     return text
+
+
+def _unknown_template(difference: str) -> TemplateError:
+    return TemplateError(
+        f"Ray {_ray_version()} writes another HAProxy configuration than Ray 2.60: {difference}; install a Ray that "
+        "this version of rlservo knows"
+    )
 
 
 def _count(pattern: str, text: str) -> int:
@@ -304,7 +309,7 @@ def _with_secret(request: bytes, secret: str) -> bytes:
     end = start + 9 + length
     head, block, rest = request[start + 3 : start + 9], request[start + 9 : end], request[end:]
     if head[0] != 1:
-        raise TemplateError(f"Ray {_ray_version()} checks the health of gRPC in another way than Ray 2.60")
+        raise _unknown_template("the gRPC health check begins with another frame")
     name, value = CHECK_HEADER.encode(), secret.encode()
     block += b"\x00%c%s%c%s" % (len(name), name, len(value), value)  # a literal header, without indexing
     return request[:start] + len(block).to_bytes(3, "big") + head + block + rest

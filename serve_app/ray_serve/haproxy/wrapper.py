@@ -22,10 +22,10 @@ def main(folder: str, binary: str, *arguments: str) -> NoReturn:
         known = file.with_name(watcher.KNOWN)
         error_replies.write_error_replies(Path(folder))  # it may have been installed by an earlier version
         text = file.read_text()
-        addresses = configuration.listening_addresses(text)
-        addresses, were_kept = listening_sockets.inherit_or_open(file.parent, addresses)
         try:
+            addresses = configuration.listening_addresses(text)
             text = configuration.patch_configuration(text, Path(folder))
+            addresses, were_kept = listening_sockets.inherit_or_open(file.parent, addresses)
             text = configuration.inherit_sockets(text, addresses)
         except configuration.TemplateError as error:
             sys.exit(str(error))

@@ -446,10 +446,22 @@ def test_replicas_under_another_name_are_an_error_and_not_left_as_ray_has_them(t
     more = re.sub(r"^( *server SERVE_)REPLICA(_.*)$", r"\g<0>\n\1WORKER\2", text, flags=re.MULTILINE)
     with pytest.raises(configuration.TemplateError, match="a replica is there 2 times, not 4"):
         configuration.patch_configuration(more, tmp_path)
+    with pytest.raises(configuration.TemplateError, match="a replica is there 0 times, not 2"):
+        configuration.patch_configuration(text.replace("server SERVE_REPLICA", "server REPLICA"), tmp_path)
     patched = configuration.patch_configuration(text, tmp_path)
     assert patched.count("on-marked-down shutdown-sessions") == patched.count("set-timeout server") == 2
+
+
+def test_a_frontend_that_listens_elsewhere_is_an_error(tmp_path: Path) -> None:
+    text = rendered(tmp_path, replicas=True, grpc=True)
+    addresses = configuration.listening_addresses(text)
+    assert addresses == ["127.0.0.1:24998", "127.0.0.1:24999"]
+    assert configuration.inherit_sockets(text, addresses).count("bind fd@") == 2
     with pytest.raises(configuration.TemplateError, match=r"'bind 127.0.0.1:1' is there 0 times, not 1"):
-        configuration.inherit_sockets(patched, ["127.0.0.1:1"])
+        configuration.inherit_sockets(text, ["127.0.0.1:1"])
+    for unknown in ("bind unix@/tmp/x", "bind 127.0.0.1:24998\n    bind 127.0.0.1:24997"):
+        with pytest.raises(configuration.TemplateError, match="the frontends listen on"):
+            configuration.listening_addresses(text.replace("bind 127.0.0.1:24998", unknown))
 
 
 @pytest.mark.parametrize("target", [None, "127.0.0.1:514"])
