@@ -28,8 +28,8 @@ ROOT = Path(__file__).resolve().parents[1]
 KEY, LINE = new_key("operator", admin=True)
 # The cluster has another value than `rlservo cluster env` gives.
 DIFFERENT, ITS_VALUE = "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S", "1"
-# [s] For slow bodies, and for a replica that ends and still answers somebody: neither limit is what is tested here, and
-# a busy machine takes longer than the usual ones to replace two replicas.
+# [s] For slow bodies, for requests that wait, for a replica that ends and still answers somebody: none of these limits
+# is what is tested here, and a busy machine stands still, or takes to replace two replicas, for longer than the usual.
 PATIENCE_S = 120
 Check: TypeAlias = tuple[str, bool, str]  # name, whether all is well, message
 
@@ -209,7 +209,7 @@ def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) 
     configuration = yaml.safe_load((ROOT / "deploy" / "serve.yaml").read_text())
     configuration["http_options"]["port"] = port
     configuration["grpc_options"]["port"] = grpc_port
-    settings = {"api_keys": LINE, "body_timeout_s": PATIENCE_S}
+    settings = {"api_keys": LINE, "body_timeout_s": PATIENCE_S, "max_queue_ms": 1000 * PATIENCE_S}
     configuration["applications"][0]["args"] = {
         "policies": [str(cluster_repository)], "replicas": 2, "settings": settings
     }  # fmt: skip

@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.serve, pytest.mark.slow, pytest.mark.random_order(disa
 ROOT = Path(__file__).resolve().parents[2]
 OBS = [round(0.01 * i, 2) for i in range(27)]
 CLIENTS = 4
-PAUSE_S = 0.002  # between a client's requests: the load is steady, and leaves the machine something
+PAUSE_S = 0.01  # between a client's requests: the load is steady, and leaves the machine something
 
 
 @dataclass
