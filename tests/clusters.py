@@ -127,7 +127,7 @@ class Cluster:
             return admin.replicas()
 
     def wait_for(
-        self, condition: Callable[[list[dict[str, Any]]], bool], timeout_s: float = 60
+        self, condition: Callable[[list[dict[str, Any]]], bool], timeout_s: float = 2 * PATIENCE_S
     ) -> list[dict[str, Any]]:
         """Wait until what every replica tells fulfils a condition."""
         deadline = time.monotonic() + timeout_s
@@ -153,7 +153,7 @@ class Cluster:
         messages = [found["message"], *(each["message"] for each in found["deployments"].values())]
         return found["status"], " ".join(messages)
 
-    def wait_for_status(self, wanted: str, timeout_s: float = 90) -> str:
+    def wait_for_status(self, wanted: str, timeout_s: float = 2 * PATIENCE_S) -> str:
         """Wait until the application has this status; return its messages."""
         deadline = time.monotonic() + timeout_s
         while (found := self.status())[0] != wanted:
@@ -246,8 +246,8 @@ def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) 
         made.before = made.check("--config", _configuration_without_policies(made.missing))
         made.deploy(serving("1"), by_command=True)
         made.while_starting = made.check("--own", DIFFERENT)[1]
-        made.wait_for(lambda seen: len(seen) == 2, timeout_s=240)
-        deadline = time.monotonic() + 60
+        made.wait_for(lambda seen: len(seen) == 2)
+        deadline = time.monotonic() + PATIENCE_S
         while (found := made.check("--own", DIFFERENT))[0] != 0:
             assert time.monotonic() < deadline, found
         made.running = found[1]
