@@ -28,8 +28,8 @@ ROOT = Path(__file__).resolve().parents[1]
 KEY, LINE = new_key("operator", admin=True)
 # The cluster has another value than `rlservo cluster env` gives.
 DIFFERENT, ITS_VALUE = "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S", "1"
-# [s] For slow bodies, and for a replica that ends and still answers somebody: neither limit is what is tested here, and
-# a busy machine takes longer than the usual ones to replace two replicas.
+# [s] For slow bodies, for requests that wait, for a replica that ends and still answers somebody: none of these limits
+# is what is tested here, and a busy machine stands still, or takes to replace two replicas, for longer than the usual.
 PATIENCE_S = 120
 Check: TypeAlias = tuple[str, bool, str]  # name, whether all is well, message
 
@@ -127,7 +127,7 @@ class Cluster:
             return admin.replicas()
 
     def wait_for(
-        self, condition: Callable[[list[dict[str, Any]]], bool], timeout_s: float = 60
+        self, condition: Callable[[list[dict[str, Any]]], bool], timeout_s: float = 2 * PATIENCE_S
     ) -> list[dict[str, Any]]:
         """Wait until what every replica tells fulfils a condition."""
         deadline = time.monotonic() + timeout_s
@@ -153,7 +153,7 @@ class Cluster:
         messages = [found["message"], *(each["message"] for each in found["deployments"].values())]
         return found["status"], " ".join(messages)
 
-    def wait_for_status(self, wanted: str, timeout_s: float = 90) -> str:
+    def wait_for_status(self, wanted: str, timeout_s: float = 2 * PATIENCE_S) -> str:
         """Wait until the application has this status; return its messages."""
         deadline = time.monotonic() + timeout_s
         while (found := self.status())[0] != wanted:
@@ -209,7 +209,7 @@ def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) 
     configuration = yaml.safe_load((ROOT / "deploy" / "serve.yaml").read_text())
     configuration["http_options"]["port"] = port
     configuration["grpc_options"]["port"] = grpc_port
-    settings = {"api_keys": LINE, "body_timeout_s": PATIENCE_S}
+    settings = {"api_keys": LINE, "body_timeout_s": PATIENCE_S, "max_queue_ms": 1000 * PATIENCE_S}
     configuration["applications"][0]["args"] = {
         "policies": [str(cluster_repository)], "replicas": 2, "settings": settings
     }  # fmt: skip
@@ -246,8 +246,8 @@ def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) 
         made.before = made.check("--config", _configuration_without_policies(made.missing))
         made.deploy(serving("1"), by_command=True)
         made.while_starting = made.check("--own", DIFFERENT)[1]
-        made.wait_for(lambda seen: len(seen) == 2, timeout_s=240)
-        deadline = time.monotonic() + 60
+        made.wait_for(lambda seen: len(seen) == 2)
+        deadline = time.monotonic() + PATIENCE_S
         while (found := made.check("--own", DIFFERENT))[0] != 0:
             assert time.monotonic() < deadline, found
         made.running = found[1]

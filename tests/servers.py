@@ -37,11 +37,12 @@ CONNECTIONS_PER_ADDRESS = 300
 LAUNCH = """
 import json, pathlib, sys
 from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.ray_serve.launcher import serve_policies
+from rlservo.serve_app.ray_serve import launcher
+launcher.START_TIMEOUT_S = 480  # a busy machine
 plan = json.loads(sys.argv[1])
 key_file = plan.pop("admin_key_file")
 try:
-    serve_policies(
+    launcher.serve_policies(
         **plan,
         admin_key_file=key_file and pathlib.Path(key_file),
         on_ready=lambda served: print("READY", served.url, flush=True),

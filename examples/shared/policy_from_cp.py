@@ -103,7 +103,7 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
                 f"the policy in {path} has {_space_name(ours)} for its {side} space, {env.spec.id} has "
                 f"{_space_name(theirs)}: it was trained for another environment"
             )
-    loop = policy.start_loop()
+    loop = restored.start_loop()
     low, high = (np.asarray(side, np.float64) for side in (env.action_space.low, env.action_space.high))
     transform = leaf_transform(recipe.action_space, recipe.transform)
 

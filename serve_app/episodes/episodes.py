@@ -17,7 +17,6 @@ from rlservo.serve_app.episodes.carried_state import NO_STATE, CarriedState, car
 from rlservo.serve_app.episodes.sessions import Session, SessionId, Sessions, shown
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import (
-    NEEDS,
     NEEDS_LAST,
     NEEDS_STATE,
     Decision,

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clusters import KEY, Cluster, serving
+from clusters import KEY, PATIENCE_S, Cluster, serving
 from rlservo.export.contract.errors import ConflictError, RefusedError, UnauthenticatedError
 from rlservo.serve_app.client.stream_client import StreamClient
 
@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.serve, pytest.mark.slow, pytest.mark.random_order(disa
 ROOT = Path(__file__).resolve().parents[2]
 OBS = [round(0.01 * i, 2) for i in range(27)]
 CLIENTS = 4
-PAUSE_S = 0.002  # between a client's requests: the load is steady, and leaves the machine something
+PAUSE_S = 0.01  # between a client's requests: the load is steady, and leaves the machine something
 
 
 @dataclass
@@ -70,7 +70,7 @@ def loaded(cluster: Cluster, path: str = "/v1/policies/ur5/act") -> Iterator[Loa
         return json.loads(content)["version"], ""
 
     def client() -> None:
-        connection = http.client.HTTPConnection("127.0.0.1", cluster.port, timeout=20)
+        connection = http.client.HTTPConnection("127.0.0.1", cluster.port, timeout=60)
         while not stop.is_set():
             began = time.monotonic()
             version, failure = once(connection)
@@ -177,7 +177,7 @@ def half_sent(cluster: Cluster) -> Iterator[Callable[[], list[int]]]:
         f"content-type: application/json\r\ncontent-length: {len(body)}\r\n\r\n"
     ).encode()
     with contextlib.ExitStack() as stack:
-        lines = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=20)) for port in ports]
+        lines = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=60)) for port in ports]
         for line in lines:
             line.sendall(head + body[:10])
 
@@ -196,7 +196,7 @@ def test_a_rolling_update_of_settings_costs_no_request_and_keeps_the_commands(cl
     with loaded(cluster) as load, half_sent(cluster) as finish:
         cluster.deploy(settings={"max_batch": 2048})
         seen = cluster.wait_for(
-            lambda replicas: len(replicas) == 2 and not old & {each["replica"] for each in replicas}, timeout_s=90
+            lambda replicas: len(replicas) == 2 and not old & {each["replica"] for each in replicas}
         )
         time.sleep(2)  # the old ones drain: a second, then they wait for who is being answered
         assert finish() == [200, 200]
@@ -214,7 +214,7 @@ def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_bac
     pids = cluster.replica_pids()
     with loaded(cluster) as load:
         os.kill(pids[0], signal.SIGKILL)
-        cluster.wait_for(lambda replicas: len(replicas) == 2 and pids[0] not in cluster.replica_pids(), timeout_s=90)
+        cluster.wait_for(lambda replicas: len(replicas) == 2 and pids[0] not in cluster.replica_pids())
         time.sleep(1)
     print("first failures:", Counter(load.first_failures))
     assert load.failures == [], Counter(load.failures)
@@ -232,10 +232,10 @@ def test_a_killed_proxy_is_back_at_once_and_nobody_is_told_that_the_policy_is_un
             os.kill(pid, signal.SIGKILL)
         began = time.monotonic()
         while (now := cluster.pids_of("ray::HAProxyManager")) == manager or not now:
-            assert time.monotonic() - began < 60
+            assert time.monotonic() - began < PATIENCE_S
             time.sleep(0.2)
         while any("bridge.cfg" in Path(f"/proc/{pid}/cmdline").read_text() for pid in cluster.pids_of("/haproxy")):
-            assert time.monotonic() - began < 60
+            assert time.monotonic() - began < PATIENCE_S
             time.sleep(0.2)
         answered = load.answered
         cluster.wait_for(lambda seen: len(seen) == 2 and load.answered > answered + 50)
@@ -265,7 +265,7 @@ def test_a_rolling_update_of_the_environment_keeps_streams_and_broken_code_chang
 
     def stream() -> None:
         nonlocal steps
-        with StreamClient(f"http://127.0.0.1:{cluster.port}", "ur5", api_key=KEY, deadline_ms=20_000) as client:
+        with StreamClient(f"http://127.0.0.1:{cluster.port}", "ur5", api_key=KEY, deadline_ms=60_000) as client:
             while not stop.is_set():
                 client.act(np.array(OBS, np.float32))
                 steps += 1
@@ -281,7 +281,7 @@ def test_a_rolling_update_of_the_environment_keeps_streams_and_broken_code_chang
             old = {each["replica"] for each in cluster.replicas()}
             cluster.application["runtime_env"] = {"env_vars": {"RLSERVO_UPDATE": "1"}}
             cluster.deploy()
-            cluster.wait_for(lambda seen: len(seen) == 2 and not old & {each["replica"] for each in seen}, timeout_s=90)
+            cluster.wait_for(lambda seen: len(seen) == 2 and not old & {each["replica"] for each in seen})
             cluster.wait_for_status("RUNNING")
             time.sleep(2)  # the old ones drain
         finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import http.client
 import json
 import time
@@ -54,16 +55,16 @@ def app(store: PolicyStore) -> Any:
 @pytest.fixture(scope="module")
 def ask(app: Any, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[Ask]:
     with served(app) as port:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
 
         def call(path: str, body: Any = None) -> tuple[int, Any]:
-            method = "GET" if body is None else "POST"
-            connection.request(method, path, body and json.dumps(body), {"content-type": "application/json"})
-            reply = connection.getresponse()
-            return reply.status, json.loads(reply.read())
+            # A connection for each: uvicorn closes one that was silent for five seconds, as a busy machine may be.
+            with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
+                method = "GET" if body is None else "POST"
+                connection.request(method, path, body and json.dumps(body), {"content-type": "application/json"})
+                reply = connection.getresponse()
+                return reply.status, json.loads(reply.read())
 
         yield call
-        connection.close()
 
 
 def test_the_configuration_says_how_a_policy_is_run(ask: Ask) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import http.client
 import json
@@ -42,16 +43,15 @@ def port(store: PolicyStore, served: Callable[[Any], AbstractContextManager[int]
 
 
 @pytest.fixture(scope="module")
-def ask(port: int) -> Iterator[Ask]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-
+def ask(port: int) -> Ask:
     def call(method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, dict[str, str], bytes]:
-        connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
-        reply = connection.getresponse()
-        return reply.status, {name.lower(): value for name, value in reply.headers.items()}, reply.read()
+        # A connection for each: uvicorn closes one that was silent for five seconds, between two tests say.
+        with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
+            connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
+            reply = connection.getresponse()
+            return reply.status, {name.lower(): value for name, value in reply.headers.items()}, reply.read()
 
-    yield call
-    connection.close()
+    return call
 
 
 def infer(ask: Ask, body: Any, model: str = "ur5", **headers: str) -> tuple[int, Any]:
