@@ -13,6 +13,9 @@ pytest_plugins = ["checkpoints", "bundles", "environments", "servers"]
 TOGETHER = {
     "tests/system/test_serving_fuzz.py": "live server",
     "tests/system/test_serving_grpc.py": "live server",
+    "tests/examples/test_shipped_policies.py": "one Ray",
+    "tests/examples/test_tour.py": "one Ray",
+    "tests/examples/test_training_scripts.py": "one Ray",
 }
 
 
