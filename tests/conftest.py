@@ -7,12 +7,22 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-pytest_plugins = ["checkpoints", "bundles", "environments", "servers"]
+pytest_plugins = ["checkpoints", "bundles", "clusters", "environments", "servers"]
 
-# Files whose tests share what is costly to make, by the name of it. The tests of any other file share that file's own.
+# Tests that share what is costly to make, by the beginning of their id. All others share their file's own.
 TOGETHER = {
+    "tests/system/test_serving.py": "live server",
     "tests/system/test_serving_fuzz.py": "live server",
     "tests/system/test_serving_grpc.py": "live server",
+    "tests/system/test_serving_network.py": "live server",
+    "tests/system/test_serving_protocols.py": "live server",
+    "tests/system/test_serving_sessions.py": "live server",
+    "tests/serve_app/protocols/test_access.py::test_on_ray_serve": "live server",
+    "tests/serve_app/protocols/test_web_pages.py::test_on_ray_serve": "live server",
+    "tests/system/test_robo_gym_client.py": "shipped server",
+    "tests/system/test_served_policies.py": "shipped server",
+    "tests/system/test_cluster_check.py": "cluster",
+    "tests/system/test_policies_under_load.py": "cluster",
     "tests/examples/test_shipped_policies.py": "one Ray",
     "tests/examples/test_tour.py": "one Ray",
     "tests/examples/test_training_scripts.py": "one Ray",
@@ -20,13 +30,14 @@ TOGETHER = {
 
 
 class ByFile(LoadScopeScheduling):
-    """All tests of a file in one process, or of the files that are together."""
+    """All tests of a file in one process, or those that are together."""
 
     def _split_scope(self, nodeid: str) -> str:
-        file = nodeid.partition("::")[0]
-        return TOGETHER.get(file, file)
+        shared = (group for beginning, group in TOGETHER.items() if nodeid.startswith(beginning))
+        return next(shared, nodeid.partition("::")[0])
 
 
+@pytest.hookimpl(optionalhook=True)  # -p no:xdist
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByFile:
     """Take the place of `--dist`: marks (loadgroup) do not reach xdist 3.8 under pytest 9.2."""
     config.option.loadscopereorder = False  # the order below, not the files with the most tests first

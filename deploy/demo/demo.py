@@ -89,7 +89,8 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
                 if report.interrupted:
                     raise KeyboardInterrupt
                 longest = max(report.episodes, key=lambda row: (bool(row.success), row.steps))
-                frames = film(policy, robot.env_id, seed=FIRST_SEED + longest.index, note=console.print)
+                seed = FIRST_SEED + longest.index
+                frames = film(policy, robot.env_id, seed=seed, steps=longest.steps, note=console.print)
                 runs.append(RobotRun(robot, report, traces, frames))
     picture = draw_picture(out / "demo.png", runs)
     console.rule("4  result")

@@ -41,8 +41,12 @@ class RobotRun:
     frames: list[Frame]
 
 
-def film(policy: ActingPolicy, env_id: str, *, seed: int, note: Callable[[str], object]) -> list[Frame]:
-    """Return the first, middle and last picture of one episode; none, with a note, where the machine cannot draw."""
+def film(policy: ActingPolicy, env_id: str, *, seed: int, steps: int, note: Callable[[str], object]) -> list[Frame]:
+    """Return the first, middle and last picture of an episode that had so many steps with this seed.
+
+    None, with a note, where the machine cannot draw. Only these are drawn: a picture costs more than a step and its
+    action together.
+    """
     try:
         env = make_env(env_id, {}, render=True)
     except UsageError as error:
@@ -53,17 +57,18 @@ def film(policy: ActingPolicy, env_id: str, *, seed: int, note: Callable[[str], 
         obs, _ = env.reset(seed=seed)
         policy.reset()
         frames.append(rgb_frame(env))
-        ended = False
+        step, ended = 0, False
         while not ended:
             obs, _, terminated, truncated, _ = env.step(policy.act(obs))
-            frames.append(rgb_frame(env))
-            ended = terminated or truncated
+            step, ended = step + 1, terminated or truncated
+            if ended or step == steps // 2:
+                frames.append(rgb_frame(env))
     except UsageError as error:
         note(f"no pictures of the robots: {error.message}")
         return []
     finally:
         env.close()
-    return [frames[0], frames[len(frames) // 2], frames[-1]]
+    return frames
 
 
 def draw_picture(file: Path, runs: list[RobotRun]) -> Path:

@@ -19,16 +19,15 @@ from pathlib import Path
 
 import pytest
 
+from bundles import SHIPPED
 from rlservo.envs.robot_server.manager import RobotServers, ServerManager
 from rlservo.envs.robot_server.server import RobotServer
 from rlservo.envs.robot_server.settings import URSettings
-from rlservo.export.commands.export import export_checkpoint
-from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.ray_serve.processes import free_ports
+from servers import ShippedServer
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "robo_gym_client.py"
-POLICIES = ("ur5", "mir100", "mir100_obstacle_avoidance")  # what the client asks for
 ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")  # what the fixture robo_gym_python installs
 CLIENT = ("httpcore>=1.0.6", "pydantic>=2.6")
 DOCUMENT = (ROOT / "examples" / "robo_gym.md").read_text()
@@ -43,25 +42,9 @@ def commands(language: str = "sh") -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The shipped policies for robo-gym's tasks behind `rlservo serve`."""
-    out = tmp_path_factory.mktemp("served")
-    exports = [line.split() for line in commands() if line.startswith("rlservo export")]
-    for _, _, checkpoint, _, _, _, name in exports:  # rlservo export CHECKPOINT --out policies --name NAME
-        export_checkpoint(ROOT / checkpoint, out, name=name, notify=lambda line: None)
-    (port,) = free_ports(1)
-    server = subprocess.Popen(
-        [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(out), "--port", str(port)],
-        stdout=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    try:
-        with PolicyClient(f"http://127.0.0.1:{port}", "ur5") as waiting:
-            waiting.wait_until_ready(300.0)
-        yield f"http://127.0.0.1:{port}"
-    finally:
-        server.send_signal(signal.SIGINT)
-        server.wait(60)
+def url(shipped_server: ShippedServer) -> str:
+    """Where the shipped policies for robo-gym's tasks are served."""
+    return shipped_server.url
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +248,10 @@ def test_document_names_what_the_tests_install_and_serve() -> None:
     lines = commands()
     assert f"robo-gym/bin/pip install {' '.join(ROBO_GYM)} {' '.join(map(repr, CLIENT))}" in lines
     assert "robo-gym/bin/pip install --no-deps ." in lines  # the fixture above, into another folder
-    assert {line.split()[-1] for line in lines if line.startswith("rlservo export")} == set(POLICIES)
+    exports = [line.split() for line in lines if line.startswith("rlservo export")]
+    # rlservo export CHECKPOINT --out policies --name NAME: what the client asks for, and `shipped` has.
+    assert {words[6]: Path(words[2]).name for words in exports} == SHIPPED
+    assert all((ROOT / words[2]).is_dir() for words in exports)
     for line in [*lines, *commands("text")]:
         for frame in re.findall(r"reference[_-]frame[ :=]+(\w+)", line):
             assert frame == "base_link"

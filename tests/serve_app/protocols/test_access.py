@@ -385,6 +385,8 @@ def test_a_header_that_is_not_utf8_is_refused_after_the_key_in_our_form(server: 
             assert wire.ask(method, path, name + ": café".encode(), *bearer(ADMIN), body=OBS)[0] in (200, 404, 422)
 
 
+@pytest.mark.serve
+@pytest.mark.slow
 def test_on_ray_serve_a_header_that_is_not_utf8_is_no_failure(live_server: Any) -> None:
     """Serve itself decodes these, before the application sees the request (ray 2.60)."""
     with Wire(live_server.port) as wire:
@@ -401,6 +403,8 @@ def test_on_ray_serve_a_header_that_is_not_utf8_is_no_failure(live_server: Any) 
             assert status == 200, (value, answer)
 
 
+@pytest.mark.serve
+@pytest.mark.slow
 def test_on_ray_serve_no_spelling_reaches_administration(live_server: Any) -> None:
     """Through HAProxy, uvicorn and Serve, of which each reads a path in its own way; the server has no admin key."""
     with Wire(live_server.port) as wire:

@@ -237,6 +237,8 @@ def test_a_page_whose_name_leads_to_the_server_moves_and_reads_nothing(
     check_untouched(target, report, plan)
 
 
+@pytest.mark.serve
+@pytest.mark.slow
 def test_on_ray_serve_a_page_is_refused_for_where_it_comes_from(
     browser: str, live_server: Any, served: Serve, tmp_path: Path
 ) -> None:

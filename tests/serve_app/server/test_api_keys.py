@@ -142,7 +142,7 @@ def test_without_a_known_key_every_protocol_answers_401_in_our_form(port: int, h
         assert f'{{code="unauthenticated",policy="",protocol="{protocol}"' in counted
 
 
-@pytest.mark.parametrize("key", [CELL, OTHER, ADMIN])
+@pytest.mark.parametrize("key", [CELL, OTHER, ADMIN], ids=["cell", "other", "admin"])
 def test_a_known_key_gets_through_however_it_is_sent(port: int, key: str) -> None:
     for headers in ({"authorization": f"Bearer {key}"}, {"authorization": f"api-key {key}"}, {"x_api_key": key}):
         for request in (ACT, INFER, LIST, ("GET", "/metrics", None)):
