@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 # Unit tests: what starts no Ray, trains nothing, exports nothing and runs no command line.
-UNITS := tests/envs tests/serve_app tests/export/checkpoints tests/export/commands tests/test_layout.py tests/test_package.py
+UNITS := tests/envs tests/serve_app tests/export/checkpoints/test_experiment.py tests/test_layout.py tests/test_package.py
 NOT_UNITS := --ignore=tests/envs/robot_server/test_manager.py
 
 .PHONY: demo test quick check bench soak faults wheel setup clean

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import runpy
 import signal
@@ -12,7 +13,9 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from ctypes.util import find_library
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -97,6 +100,75 @@ def run_helper_fixture() -> Callable[..., str]:
 @pytest.fixture(scope="session", name="run_here")
 def run_here_fixture() -> Callable[..., Ended]:
     return run_here
+
+
+def _inference(script: str, *more: str) -> tuple[str, ...]:
+    return (script, *more, "--stop-iters", "1", "--num-episodes-during-inference", "2", "--storage", "runs")
+
+
+def _again(name: str, *changes: str) -> tuple[str, ...]:
+    return ("train_shipped.py", name, *(word for change in changes for word in ("--set", change)))
+
+
+OFFSCREEN = bool(os.environ.get("DISPLAY") or find_library("EGL") or find_library("OSMesa"))
+IN_ONE_RAY = {
+    "ur": _inference("training_inference_ur.py"),
+    "mir": _inference("training_inference_mir.py", "--num-cpus", "1"),
+    "tour": ("tour.py", "--quick", *(() if OFFSCREEN else ("--no-video",))),
+    "again": _again(
+        "cartpole_dqn",
+        "stop.env_steps=400", "steps_per_iteration=300", "training.num_steps_sampled_before_learning_starts=200",
+    ),
+    "judged": _again(
+        "mir100_obstacle_avoidance",
+        "stop.env_steps=5000", "stop.episodes=3", "validation.above=0", "validation.episodes=2",
+        "training.train_batch_size_per_learner=2048", "training.num_epochs=1",
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Trained:
+    """How a script ended, in which folder, and what it left in the home folder."""
+
+    ended: Ended
+    folder: Path
+    home: frozenset[str]
+    videos: bool = OFFSCREEN  # whether there is an OpenGL library to make them with
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Trained]]:
+    """Return a function that runs a script of IN_ONE_RAY once; all of them share a process and a Ray."""
+    folder, home = tmp_path_factory.mktemp("one_ray"), tmp_path_factory.mktemp("home")
+    command = [sys.executable, "-W", "ignore", str(HERE / "train_in_one_ray.py")]
+    with (
+        (folder / "errors.txt").open("w") as errors,
+        subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment(home),
+            cwd=home,
+        ) as process,
+    ):  # fmt: skip
+
+        @cache
+        def train(name: str) -> Trained:
+            assert process.stdin is not None and process.stdout is not None
+            process.stdin.write(json.dumps([str(folder / name), *IN_ONE_RAY[name]]) + "\n")
+            process.stdin.flush()
+            reply = process.stdout.readline()
+            assert reply, (folder / "errors.txt").read_text()[-5000:]
+            one = json.loads(reply)
+            return Trained(Ended(one["code"], one["out"], one["err"]), folder / name, frozenset(one["home"]))
+
+        try:
+            yield train
+        finally:
+            assert process.stdin is not None
+            process.stdin.close()  # the last request: it ends, and its Ray with it
+            try:
+                process.wait(200)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
 
 @dataclass(frozen=True)

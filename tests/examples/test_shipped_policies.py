@@ -147,32 +147,25 @@ def test_each_folder_is_small_and_complete(name: str) -> None:
 
 @pytest.mark.slow
 def test_training_again_leaves_a_curve_and_a_checkpoint_that_exports(
-    tmp_path: Path, run_script: Any, run_here: Any
+    trained: Any, run_here: Any, tmp_path: Path
 ) -> None:
-    changes = ("stop.env_steps=400", "steps_per_iteration=300", "training.num_steps_sampled_before_learning_starts=200")
-    arguments = [word for change in changes for word in ("--set", change)]
-    done = run_script("train_shipped.py", "cartpole_dqn", *arguments, home=tmp_path)
+    done = trained("again").ended
     assert done.code == 0, done.out + done.err
-    run = tmp_path / "runs" / "cartpole_dqn"
+    run = trained("again").folder / "runs" / "cartpole_dqn"
     assert len((run / "curve.csv").read_text().splitlines()) == 3  # 300 steps an iteration
     assert (run / "curve.png").exists()
-    judged = ("cartpole_dqn", "--checkpoint", str(run / "checkpoint"), "--episodes", "3")
-    measured = run_here("evaluate_shipped.py", *judged, home=tmp_path)
+    arguments = ("cartpole_dqn", "--checkpoint", str(run / "checkpoint"), "--episodes", "3")
+    measured = run_here("evaluate_shipped.py", *arguments, home=tmp_path)
     assert measured.code == 0, measured.err
     assert "| anywhere | 3 |" in measured.out
 
 
 @pytest.mark.slow
-def test_checkpoints_are_judged_as_the_cards_do_where_the_settings_ask_for_it(tmp_path: Path, run_script: Any) -> None:
-    changes = (
-        "stop.env_steps=5000", "stop.episodes=3", "validation.above=0", "validation.episodes=2",
-        "training.train_batch_size_per_learner=2048", "training.num_epochs=1",
-    )  # fmt: skip
-    arguments = [word for change in changes for word in ("--set", change)]
-    done = run_script("train_shipped.py", "mir100_obstacle_avoidance", *arguments, home=tmp_path)
+def test_checkpoints_are_judged_as_the_cards_do_where_the_settings_ask_for_it(trained: Any) -> None:
+    done = trained("judged").ended
     assert done.code == 0, done.out + done.err
     assert done.out.count("% success of the exported policy over 2 episodes") == 1  # next in 80,000 steps
-    run = tmp_path / "runs" / "mir100_obstacle_avoidance"
+    run = trained("judged").folder / "runs" / "mir100_obstacle_avoidance"
     assert len((run / "curve.csv").read_text().splitlines()) == 4  # 2,048 steps an iteration
     assert (run / "checkpoint" / "rllib_checkpoint.json").exists()
 

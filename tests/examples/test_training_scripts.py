@@ -15,28 +15,21 @@ SCRIPTS = ("training_inference_ur.py", "training_inference_mir.py")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("script", "cores", "size"),
-    [
-        ("training_inference_ur.py", (), r"\d+ sampling processes with 8 simulators each, \d+ cores"),
-        # One core is enough: RLlib's two sampling processes share it.
-        ("training_inference_mir.py", ("--num-cpus", "1"), "2 sampling processes with 8 simulators each, 1 cores"),
-    ],
-)
-def test_short_run_trains_exports_and_runs_episodes(
-    script: str, cores: tuple[str, ...], size: str, run_script: Any, tmp_path: Path
-) -> None:
-    arguments = ("--stop-iters", "1", "--num-episodes-during-inference", "2", "--storage", "runs")
-    done = run_script(script, *cores, *arguments, home=tmp_path)
+@pytest.mark.parametrize("name", ["ur", "mir"])
+def test_short_run_trains_exports_and_runs_episodes(name: str, trained: Any) -> None:
+    run = trained(name)
+    done = run.ended
     assert done.code == 0, done.out + done.err
-    assert re.search(size, done.out)
+    # One core is enough: RLlib's two sampling processes share it.
+    assert "2 sampling processes with 8 simulators each, 1 cores" in done.out
     assert "waiting for" not in done.err
     assert re.search(r"^\w+_00000 +1 +8,\d\d\d +-?\d", done.out, re.MULTILINE)
     assert "best checkpoint: " in done.out
-    bundles = list((tmp_path / "runs" / "policies").glob("*/1/contract.json"))
+    bundles = list((run.folder / "runs" / "policies").glob("*/1/contract.json"))
     assert len(bundles) == 1
     assert "success" in done.out.split("bundle: ")[1]
-    assert {path.name for path in tmp_path.iterdir()} <= {"runs", ".cache", ".config"}
+    assert {path.name for path in run.folder.iterdir()} == {"runs"}
+    assert run.home <= {".cache", ".config"}
 
 
 @pytest.mark.slow
