@@ -18,8 +18,8 @@ from rlservo.serve_app.wire.state_names import BELONGS_TO, LAST_ACTION, MARK
 
 
 @dataclass(frozen=True, slots=True)
-class Carried:
-    """A state as a request brought it, taken apart."""
+class CarriedState:
+    """A state as a request brought it, parsed."""
 
     arrays: Mapping[str, Any]
     """By state name."""
@@ -33,10 +33,10 @@ class Carried:
     last_action: Any = None
 
     @classmethod
-    def read(cls, state: Mapping[str, Any]) -> Carried:
-        """Take a request's state apart. Raises RequestError."""
+    def parse(cls, state: Mapping[str, Any]) -> CarriedState:
+        """Parse a request's state. Raises RequestError."""
         if not state:
-            return NOTHING
+            return BEGIN
         arrays = {name: value for name, value in state.items() if not str(name).startswith(MARK)}
         if len(arrays) == len(state):
             return cls(arrays)
@@ -51,7 +51,7 @@ class Carried:
         return cls(arrays, belongs_to=belongs_to, last_action=state.get(LAST_ACTION))
 
 
-NOTHING = Carried({}, begins=True)
+BEGIN = CarriedState({}, begins=True)
 
 
 def carry(policy: Policy, step: Step) -> dict[str, Any]:

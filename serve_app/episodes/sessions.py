@@ -34,45 +34,45 @@ class Session:
 
     policy: Policy
     state: State | None = None  # None: at its start
-    last: dict[str, NDArray[np.generic]] | None = None  # the last action's leaves
+    last_leaves: dict[str, NDArray[np.generic]] | None = None  # of the last action
     steps: int = 0
     rows: int = 0  # episodes that it takes the place of
     used: float = field(default_factory=time.monotonic)
-    seq: int | None = None  # of the last request that was answered
-    asked: bytes = b""  # what its observation was, as a hash
-    answer: Decision | None = None  # to the last request, for the same request sent again
+    last_seq: int | None = None  # of the last request that was answered
+    last_obs: bytes = b""  # its observation's fingerprint
+    last_decision: Decision | None = None  # for the same request sent again
 
     def keep(self, step: Step) -> None:
         """Remember what a step came to."""
         self.state = step.state or None
-        self.last = step.leaves
+        self.last_leaves = step.leaves
         self.steps += 1
 
     def begin(self, policy: Policy) -> None:
         """Forget everything: the next step is an episode's first."""
         self.policy = policy
-        self.state = self.last = self.seq = self.answer = None
+        self.state = self.last_leaves = self.last_seq = self.last_decision = None
         self.steps = 0
 
-    def repeated(self, seq: int | None, obs: Any) -> Decision | None:
-        """Return the answer there was, when this is the last request again (its reply got lost).
+    def find_reply(self, seq: int | None, obs: Any) -> Decision | None:
+        """Return the decision there was, when this is the last request again (its reply got lost).
 
-        To compute it twice would move the memory on twice. Raises SessionError for a request that comes out of order,
+        To compute it twice would move the state on twice. Raises SessionError for a request that comes out of order,
         and for another one under the last one's number: the old answer would be an action for what is long past.
         """
-        if seq is None or self.seq is None or seq > self.seq:
+        if seq is None or self.last_seq is None or seq > self.last_seq:
             return None
-        if seq == self.seq:
-            if self.policy.fingerprint(self.policy.read(obs)[0]) == self.asked:
-                return self.answer
+        if seq == self.last_seq:
+            if self.policy.fingerprint(self.policy.read(obs)[0]) == self.last_obs:
+                return self.last_decision
             raise SessionError(
                 f"request {seq} of its session was answered already, for another observation: give every request a "
                 "larger 'seq' than the one before, or none",
-                {"seq": seq, "last_seq": self.seq},
+                {"seq": seq, "last_seq": self.last_seq},
             )
         raise SessionError(
-            f"request {seq} came after request {self.seq} of its session was answered: send them in order",
-            {"seq": seq, "last_seq": self.seq},
+            f"request {seq} came after request {self.last_seq} of its session was answered: send them in order",
+            {"seq": seq, "last_seq": self.last_seq},
         )
 
 
@@ -153,9 +153,9 @@ class Sessions:
         if session is None:
             self.lost[name] += 1
             raise SessionLostError(
-                f"this server has no session '{shown(session_id)}' of policy '{name[:64]}': it was never begun, was "
+                f"this server has no session '{shorten(session_id)}' of policy '{name[:64]}': it was never begun, was "
                 f"ended, was idle for {self._idle_s:g} s, or ended with its process or its version: begin an episode",
-                {"session_id": shown(session_id), "policy": name[:64]},
+                {"session_id": shorten(session_id), "policy": name[:64]},
             )
         session.used = time.monotonic()
         sessions.move_to_end(key)
@@ -213,6 +213,6 @@ class Sessions:
             self._sweep_later()
 
 
-def shown(session_id: SessionId) -> str:
+def shorten(session_id: SessionId) -> str:
     """Return an id as an error's sentence may show it."""
     return str(session_id)[:64]

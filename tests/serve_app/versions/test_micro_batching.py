@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from rlservo.export.contract.bundle import load_bundle, write_contract, write_golden
 from rlservo.export.contract.errors import ActionError, BundleError, DeadlineError, UsageError
 from rlservo.export.contract.spaces import BoxSpec
+from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_grpc import Grpc
@@ -289,9 +290,10 @@ def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(s
 
     async def main() -> list[Any]:
         now = time.perf_counter()
-        hurried = core.act("ur5", None, OBS[0], received=now, deadline_ms=30.0)
-        patient = core.act("ur5", None, OBS[1], received=now, deadline_ms=30_000.0)
-        return await asyncio.gather(hurried, patient, slow(), return_exceptions=True)
+        hurried = Request("json", "ur5", None, now, obs=OBS[0], deadline_ms=30.0)
+        patient = Request("json", "ur5", None, now, obs=OBS[1], deadline_ms=30_000.0)
+        decide = core.request_path.decide
+        return await asyncio.gather(decide(hurried), decide(patient), slow(), return_exceptions=True)
 
     with watched(store, store.get("ur5")) as sizes:
         in_a_crowd(store)
