@@ -24,7 +24,6 @@ from rlservo.serve_app.versions.policy_store import (
     Decision,
     EpisodeNote,
     PolicyStore,
-    take_notices,
 )
 from rlservo.serve_app.wire.state_names import BELONGS_TO
 
@@ -86,7 +85,7 @@ class Episodes:
             policy = _owner(store, name, version, carried.belongs_to)
         else:
             policy = _choose(store, request)
-            if stream is not None and _is_loaded(store, stream.policy) and version is None:
+            if stream is not None and store.has(stream.policy) and version is None:
                 policy = stream.policy
             if carried.arrays and policy.contract.state and not store.is_certain(name, version):
                 raise RequestError(
@@ -160,7 +159,7 @@ class Episodes:
         name, version = request.policy, request.version
         own = session.policy.contract.version
         which = "this stream's episode" if session_id is None else f"session '{shorten(session_id)}'"
-        if not _is_loaded(store, session.policy):
+        if not store.has(session.policy):
             if session_id is not None:
                 self.sessions.end(name, session_id, lost=True)
             raise SessionLostError(
@@ -179,11 +178,6 @@ NO_EPISODE = Episode()
 def _choose(store: PolicyStore, request: Request) -> Policy:
     """Return the policy for a request that is with none yet."""
     return store.choose(request.policy, request.version, request.label)
-
-
-def _is_loaded(store: PolicyStore, policy: Policy) -> bool:
-    name, version = policy.contract.name, policy.contract.version
-    return name in store.names and version in store.versions(name) and store.get(name, version) is policy
 
 
 def _owner(store: PolicyStore, name: str, version: str | None, identity: str) -> Policy:
@@ -206,24 +200,20 @@ def _owner(store: PolicyStore, name: str, version: str | None, identity: str) ->
 
 @dataclass(frozen=True, slots=True)
 class _TimedStep:
-    """A step, how long it took, and what there is to say of it."""
+    """A step, and how long it took."""
 
     step: Step
     milliseconds: float
-    notices: tuple[str, ...]
 
     def decision(self, policy: Policy, note: EpisodeNote | None) -> Decision:
-        contract = policy.contract
-        return Decision(
-            self.step.action, contract.name, contract.version, self.milliseconds, self.step.batch, self.notices, note
-        )
+        contract, step = policy.contract, self.step
+        return Decision(step.action, contract.name, contract.version, self.milliseconds, step.batch, step.notices, note)
 
 
 def _take_step(
     policy: Policy, request: Request, episode: Episode, carried: CarriedState = BEGIN, *, session: Session | None = None
 ) -> _TimedStep:
     """Take a step from what the client carries, or from a session's state."""
-    policy.notices.clear()
     started = time.perf_counter()
     step = policy.step(
         request.obs,
@@ -235,5 +225,4 @@ def _take_step(
         explore=request.explore,
         seed=request.seed,
     )
-    taken_ms = (time.perf_counter() - started) * 1e3
-    return _TimedStep(step, taken_ms, take_notices(policy))
+    return _TimedStep(step, (time.perf_counter() - started) * 1e3)

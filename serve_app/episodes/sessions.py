@@ -63,7 +63,7 @@ class Session:
         if seq is None or self.last_seq is None or seq > self.last_seq:
             return None
         if seq == self.last_seq:
-            if self.policy.fingerprint(self.policy.read(obs)[0]) == self.last_obs:
+            if self.policy.fingerprint(self.policy.parse(obs).arrays) == self.last_obs:
                 return self.last_decision
             raise SessionError(
                 f"request {seq} of its session was answered already, for another observation: give every request a "

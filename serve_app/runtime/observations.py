@@ -1,7 +1,7 @@
 """Observations of callers as arrays for the graph, checked: shape, dtype, finite numbers, names.
 
 An observation arrives as an array, as nested lists out of JSON, or as a map from element name to value, alone or as a
-batch. `ObservationReader` turns each into `[batch, ...]` of the graph's dtype. Strict where a robot could be hurt:
+batch. `LeafParser` turns each into `[batch, ...]` of the graph's dtype. Strict where a robot could be hurt:
 shape, dtype, non-finite numbers and names are errors, never guesses.
 
 What happens to a Box observation outside the space's bounds is the policy's options' affair: RLlib's own pipeline
@@ -13,23 +13,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from operator import ge, itemgetter, le
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, first_line
 from rlservo.export.contract.spaces import BoxSpec, DictSpec, LeafSpec, SpaceSpec, TupleSpec, iter_elements, leaf_specs
+from rlservo.serve_app.runtime.drift import EVERY, Drift
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
 SMALL = 128  # elements up to which Python's own sum is faster than numpy's isfinite(...).all()
 BOUND_SLACK = 1e-5  # relative to the bound: what rounding to float32 may put outside of it
+MOST_NOTICES = 16  # of a list of observations: its reply carries them
 LISTED = 8  # names listed in a message before "and N more"
 
 
-class ObservationReader:
-    """Reads one array of a policy's observations: the whole of it, or the leaf `name` of a nested one."""
+class LeafParser:
+    """Parses one array of a policy's observations: the whole of it, or the leaf `name` of a nested one."""
 
     def __init__(
         self,
@@ -38,9 +40,9 @@ class ObservationReader:
         name: str = "obs",
         *,
         options: PolicyOptions = DEFAULT_OPTIONS,
-        notice: Callable[[str], None] | None = None,
+        drift: Drift | None = None,
     ) -> None:
-        """`notice` is told, in a sentence, of what is out of bounds and used all the same."""
+        """`drift` gets one in `EVERY` of the arrays that passed the checks, before it is clipped."""
         self._policy = policy
         self._name = name
         self._space = space
@@ -52,16 +54,16 @@ class ObservationReader:
         # Of a choice that does not exist RLlib makes an error or a one-hot of nothing; a Box may be left.
         self._choices = None if isinstance(space, BoxSpec) else space.bounds()
         self._out_of_bounds = options.out_of_bounds
-        self._notice = notice
         self._bounded = isinstance(space, BoxSpec) and self._take_bounds(space)
         self._names = tuple(element.name for element in space.elements)
-        self.watch: Callable[[NDArray[Any]], None] | None = None  # is shown every array that passed the checks
+        self._drift = drift
+        self._until_drift = 1  # observations until the next one that is counted in
         self._named = bool(self._names) and len(set(self._names)) == len(self._names)
 
-    def read(self, obs: Any) -> tuple[NDArray[Any], bool]:
-        """Return (`[batch, *shape]` of the graph's dtype, whether `obs` was a batch).
+    def parse(self, obs: Any) -> tuple[NDArray[Any], bool, str]:
+        """Return (`[batch, *shape]` of the graph's dtype, whether `obs` was a batch, notice).
 
-        Raises ObservationError.
+        The notice is a sentence on what is out of bounds and used all the same, mostly empty. Raises ObservationError.
         """
         array: NDArray[Any]
         if type(obs) is np.ndarray:
@@ -88,15 +90,19 @@ class ObservationReader:
                 self._check_finite(array)
         elif self._choices is not None:
             self._check_range(array, *self._choices)
-        if self.watch is not None:
-            self.watch(array)
+        if self._drift is not None:
+            self._until_drift -= 1
+            if not self._until_drift:
+                self._until_drift = EVERY
+                self._drift.add(array)
         if self._bounded:
             if values is not None and len(array) == 1:
                 checked = self._pick(values)
                 if all(map(le, self._lows, checked)) and all(map(ge, self._highs, checked)):
-                    return array, batch
-            array = self._keep_bounds(array)
-        return array, batch
+                    return array, batch, ""
+            array, notice = self._keep_bounds(array)
+            return array, batch, notice
+        return array, batch, ""
 
     def _take_bounds(self, space: BoxSpec) -> bool:
         """Remember the bounds with their slack; return whether there is anything to check."""
@@ -118,25 +124,22 @@ class ObservationReader:
         self._pick: Callable[[list[float]], Sequence[float]] = itemgetter(*bounded, *bounded[:1]) if bounded else tuple
         return checked and self._out_of_bounds != "accept"
 
-    def _keep_bounds(self, array: NDArray[Any]) -> NDArray[Any]:
-        """Do with what is outside the bounds as the options say."""
+    def _keep_bounds(self, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
+        """Do with what is outside the bounds as the options say; return (the array to use, notice)."""
         outside = np.asarray((array < self._loosest[0]) | (array > self._loosest[1]))
         if not outside.any():
-            return array
+            return array, ""
         label, index = self._first(array, outside)
         low, high = self._low[index[1:]], self._high[index[1:]]
         if self._out_of_bounds == "refuse":
             self._refuse_element(array, outside, f"outside the observation space's [{low:g}, {high:g}]")
-        clips = self._out_of_bounds == "clip"
-        if self._notice is not None:
-            count = int(np.count_nonzero(outside))
-            more = f" and {count - 1} more" if count > 1 else ""
-            of = "" if self._name == "obs" else f" of {self._name}"
-            self._notice(
-                f"element {label}{of}{more} outside the observation space's [{low:g}, {high:g}]"
-                f"{': clipped' if clips else ''}"
-            )
-        return np.clip(array, self._low, self._high).astype(self._dtype) if clips else array
+        count = int(np.count_nonzero(outside))
+        more = f" and {count - 1} more" if count > 1 else ""
+        of = "" if self._name == "obs" else f" of {self._name}"
+        notice = f"element {label}{of}{more} outside the observation space's [{low:g}, {high:g}]"
+        if self._out_of_bounds == "clip":
+            return np.clip(array, self._low, self._high).astype(self._dtype), f"{notice}: clipped"
+        return array, notice
 
     # How each form becomes an array.
 
@@ -328,8 +331,16 @@ def _listed(names: list[str]) -> str:
     return shown if len(names) <= LISTED else f"{shown} and {len(names) - LISTED} more"
 
 
-class StructureReader:
-    """Reads observations of any space for one policy."""
+class Observed(NamedTuple):
+    """A checked observation."""
+
+    arrays: dict[str, NDArray[Any]]  # `[batch, ...]` by the graph's input names
+    batch: bool  # whether it was given as a batch
+    notices: tuple[str, ...]  # sentences on what is out of bounds and used all the same
+
+
+class ObservationParser:
+    """Parses observations of any space for one policy."""
 
     def __init__(
         self,
@@ -337,51 +348,49 @@ class StructureReader:
         space: SpaceSpec,
         *,
         options: PolicyOptions = DEFAULT_OPTIONS,
-        notice: Callable[[str], None] | None = None,
+        drift: Drift | None = None,
     ) -> None:
+        """`drift` is of a space that is a single array."""
         self._policy = policy
         self._space = space
-        self._readers = {
-            name: ObservationReader(policy, leaf, name, options=options, notice=notice)
+        self.leaves = {
+            name: LeafParser(policy, leaf, name, options=options, drift=drift)
             for name, leaf in leaf_specs(space, "obs").items()
         }
 
-    def watch(self, name: str, see: Callable[[NDArray[Any]], None]) -> None:
-        """Show `see` the checked observations of the leaf `name`."""
-        self._readers[name].watch = see
-
-    def read(self, obs: Any) -> tuple[dict[str, NDArray[Any]], bool]:
-        """Return (`[batch, ...]` by the graph's input names, whether `obs` was a batch).
-
-        Raises ObservationError, which names the path of what does not fit.
-        """
+    def parse(self, obs: Any) -> Observed:
+        """Raise ObservationError, which names the path of what does not fit."""
         if isinstance(self._space, DictSpec) and isinstance(obs, list | tuple) and obs and isinstance(obs[0], Mapping):
-            return self._read_list(obs), True
+            return self._parse_list(obs)
         leaves: dict[str, Any] = {}
         self._collect(self._space, obs, "obs", leaves)
         arrays: dict[str, NDArray[Any]] = {}
         sizes: dict[str, int | None] = {}
-        for name, reader in self._readers.items():
-            arrays[name], batch = reader.read(leaves[name])
+        notices: tuple[str, ...] = ()
+        for name, parser in self.leaves.items():
+            arrays[name], batch, notice = parser.parse(leaves[name])
             sizes[name] = len(arrays[name]) if batch else None
+            if notice:
+                notices += (notice,)
         if len(set(sizes.values())) > 1:
             told = ", ".join(
                 f"{name} {'one' if size is None else f'a batch of {size}'}" for name, size in sizes.items()
             )
             self._refuse("obs", f"its parts are not of one batch ({told})")
-        return arrays, next(iter(sizes.values())) is not None
+        return Observed(arrays, next(iter(sizes.values())) is not None, notices)
 
-    def _read_list(self, observations: Sequence[Any]) -> dict[str, NDArray[Any]]:
-        rows: list[dict[str, NDArray[Any]]] = []
+    def _parse_list(self, observations: Sequence[Any]) -> Observed:
+        rows: list[Observed] = []
         for index, one in enumerate(observations):
             try:
-                arrays, batch = self.read(one)
+                row = self.parse(one)
             except ObservationError as error:
                 raise ObservationError(f"observation {index}: {error.message}", error.details) from error
-            if batch:
+            if row.batch:
                 self._refuse("obs", f"observation {index} of the list is a batch itself")
-            rows.append(arrays)
-        return {name: np.concatenate([row[name] for row in rows]) for name in self._readers}
+            rows.append(row)
+        arrays = {name: np.concatenate([row.arrays[name] for row in rows]) for name in self.leaves}
+        return Observed(arrays, True, tuple(notice for row in rows for notice in row.notices)[:MOST_NOTICES])
 
     def _collect(self, space: SpaceSpec, value: Any, path: str, leaves: dict[str, Any]) -> None:
         if isinstance(space, DictSpec):

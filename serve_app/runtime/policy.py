@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +36,7 @@ from rlservo.serve_app.runtime.loading import (
     check_rows,
     open_graph,
 )
-from rlservo.serve_app.runtime.observations import ObservationReader, StructureReader
+from rlservo.serve_app.runtime.observations import ObservationParser, Observed
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.recurrent_state import Memory, State
 from rlservo.serve_app.runtime.step_limit import StepLimit
@@ -52,7 +51,7 @@ Network = Callable[[dict[str, NDArray[Any]]], dict[str, NDArray[Any]]]
 """Computes tensors `[batch, ...]` by name from tensors by name."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
 class Step:
     """What one step of an episode came to."""
 
@@ -66,6 +65,8 @@ class Step:
     """How many observations there were; None for one that came alone."""
     fed: Mapping[str, NDArray[Any]]
     """What the network was given, by tensor name."""
+    notices: tuple[str, ...] = ()
+    """What was out of bounds or beyond a limit, and used all the same."""
 
     @property
     def rows(self) -> int:
@@ -101,14 +102,12 @@ class Policy:
         self._run: Run = session.run
         self._rng = np.random.default_rng()
         self.options = options
-        self.notices: deque[str] = deque(maxlen=16)
-        """What was out of bounds or beyond a limit and used all the same, for who answers to a client."""
         self._unlogged = 0
         self._logged_at = -NOTICE_EVERY_S
-        self._reader = StructureReader(
-            contract.name, contract.observation_space, options=options, notice=self._take_notice
+        self.drift = Drift.of(contract)
+        self._observations = ObservationParser(
+            contract.name, contract.observation_space, options=options, drift=self.drift
         )
-        self._observed = list(leaf_specs(contract.observation_space, "obs"))
         actions = leaf_specs(contract.action_space, "action")
         self._guards = {name: ActionGuard(contract.name, name, leaf) for name, leaf in actions.items()}
         self._memory = Memory(contract)
@@ -119,16 +118,10 @@ class Policy:
         self.episodic = bool(contract.state) or self.limited
         """Whether an action depends on what came before: on a state, or by a limit on the last action."""
         # Most policies read one array and give one: those few microseconds are what a control loop asks for.
-        observations = leaf_specs(contract.observation_space, "obs")
-        flat = "obs" in observations and "action" in actions  # not a Dict or Tuple, which may have a single leaf
+        leaves = self._observations.leaves
+        flat = "obs" in leaves and "action" in actions  # not a Dict or Tuple, which may have a single leaf
         self._simple = flat and len(contract.inputs) == 1 and not self.episodic
-        self._leaf_reader = ObservationReader(
-            contract.name, next(iter(observations.values())), options=options, notice=self._take_notice
-        )
-        self.drift = Drift.of(contract)
-        if self.drift is not None:
-            self._leaf_reader.watch = self.drift.see
-            self._reader.watch("obs", self.drift.see)
+        self._leaf = next(iter(leaves.values()))
         self._guard = next(iter(self._guards.values()))
         self._input = contract.inputs[0].name
         self._action_only = ["action"]
@@ -191,16 +184,13 @@ class Policy:
         the reward, or remembers another number of episodes, and ActionError when what came out is not finite or not in
         the action space.
         """
-        if not self._simple:
-            return self._act_on(obs, explore, seed, reward)
-        array, batch = self._leaf_reader.read(obs)
-        if explore:
-            self._check_explores()
-            action = self._sample(self._run(self._dist_only, {self._input: array})[0], seed)["action"]
-        else:
-            action = self._run(self._action_only, {self._input: array})[0]
-        self._guard.check(action)
-        return action if batch else action[0, ...]
+        if self._simple:
+            computed, _, batch, _ = self._compute(obs, explore, seed)
+            return computed if batch else computed[0, ...]
+        step = self.step(obs, before=self._state, last=self._last, explore=explore, seed=seed, reward=reward)
+        self._state = step.state or None
+        self._last = step.leaves if self._limit else None
+        return step.action
 
     def act_from(
         self,
@@ -239,7 +229,13 @@ class Policy:
         sends them, which is checked. None of a pair begins an episode. Raises RequestError when they do not fit, and
         what `act` raises.
         """
-        feed, batch = self._reader.read(obs)
+        if self._simple and before is None and state is None and last is None and last_action is None:
+            computed, feed, batch, notices = self._compute(obs, explore, seed)
+            leaves = {"action": computed}
+            if batch:
+                return Step(computed, leaves, {}, len(computed), feed, notices)
+            return Step(computed[0, ...], leaves, {}, None, feed, notices)
+        feed, batch, notices = self.parse(obs)
         rows = len(next(iter(feed.values())))
         known = next((len(leaf) for leaf in (*(before or {}).values(), *(last or {}).values())), rows)
         if known != rows:
@@ -255,27 +251,30 @@ class Policy:
         action, after = self._decide(feed, rows, before, explore, seed, reward)
         if self._limit and last is not None:
             action, limited = self._limit.apply(action, last)
-            for sentence in limited:
-                self._take_notice(sentence)
+            self._log(limited)
+            notices += limited
             for name, guard in self._guards.items():
                 guard.check(action[name])
         space = self._contract.action_space
         own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
-        return Step(build_action(space, own), action, after, rows if batch else None, feed)
+        return Step(build_action(space, own), action, after, rows if batch else None, feed, notices)
 
-    def read(self, obs: Observation) -> tuple[dict[str, NDArray[Any]], bool]:
-        """Return what the network would be given, and whether that is a batch. Raises ObservationError."""
-        return self._reader.read(obs)
+    def parse(self, obs: Observation) -> Observed:
+        """Return an observation as the network's tensors. Raises ObservationError."""
+        observed = self._observations.parse(obs)
+        if observed.notices:
+            self._log(observed.notices)
+        return observed
 
     def action(self, computed: Mapping[str, NDArray[Any]], *, batch: bool) -> Any:
-        """Return the action that the network's outputs are (`read`, `network`), checked. Raises ActionError."""
+        """Return the action that the network's outputs are (`parse`, `network`), checked. Raises ActionError."""
         for name, guard in self._guards.items():
             guard.check(computed[name])
         own = {name: computed[name] if batch else computed[name][0, ...] for name in self._guards}
         return build_action(self._contract.action_space, own)
 
     def network(self) -> Network:
-        """Return the network: from what `read` gives to the action's tensors by name, unchecked (`action` checks).
+        """Return the network: from what `parse` gives to the action's tensors by name, unchecked (`action` checks).
 
         It is onnxruntime's own `run`: what has been given to it is computed even when the policy is closed meanwhile.
         """
@@ -286,14 +285,14 @@ class Policy:
         check_rows(self._bundle, self._open_session().run)
 
     def fingerprint(self, fed: Mapping[str, NDArray[Any]]) -> bytes:
-        """Return what tells the observation of a feed (`read`, `Step.fed`) from others."""
+        """Return what tells the observation of a feed (`parse`, `Step.fed`) from others."""
         digest = hashlib.blake2b(digest_size=16)
-        for name in self._observed:
+        for name in self._observations.leaves:
             digest.update(fed[name].tobytes())
         return digest.digest()
 
     def twin(self) -> Policy:
-        """Return another policy over the same graph, for another thread: its memory, notices and drift are its own."""
+        """Return another policy over the same graph, for another thread: its recurrent state and drift are its own."""
         return Policy(self._bundle, self._open_session(), self.options, graph_hash=self._graph_hash)
 
     def reset(self) -> None:
@@ -317,19 +316,32 @@ class Policy:
             _refuse_closed([], {})
         return self._session
 
-    def _act_on(self, obs: Observation, explore: bool, seed: int | None, reward: ArrayLike | None) -> Any:
-        step = self.step(obs, before=self._state, last=self._last, explore=explore, seed=seed, reward=reward)
-        self._state = step.state or None
-        self._last = step.leaves if self._limit else None
-        return step.action
+    def _compute(
+        self, obs: Observation, explore: bool, seed: int | None
+    ) -> tuple[NDArray[Any], dict[str, NDArray[Any]], bool, tuple[str, ...]]:
+        """Return (action `[batch, ...]`, feed, whether `obs` is a batch, notices) of a simple policy."""
+        array, batch, notice = self._leaf.parse(obs)
+        feed = {self._input: array}
+        if explore:
+            self._check_explores()
+            action = self._sample(self._run(self._dist_only, feed)[0], seed)["action"]
+        else:
+            action = self._run(self._action_only, feed)[0]
+        self._guard.check(action)
+        notices: tuple[str, ...] = ()
+        if notice:
+            notices = (notice,)
+            self._log(notices)
+        return action, feed, batch, notices
 
-    def _take_notice(self, sentence: str) -> None:
-        self.notices.append(sentence)
-        self._unlogged += 1
-        now = time.monotonic()
-        if now - self._logged_at >= NOTICE_EVERY_S:
-            logger.warning("policy '%s': %s (%d times)", self._contract.name, sentence, self._unlogged)
-            self._unlogged, self._logged_at = 0, now
+    def _log(self, notices: tuple[str, ...]) -> None:
+        """Log a notice once in `NOTICE_EVERY_S`, with how many there were."""
+        for sentence in notices:
+            self._unlogged += 1
+            now = time.monotonic()
+            if now - self._logged_at >= NOTICE_EVERY_S:
+                logger.warning("policy '%s': %s (%d times)", self._contract.name, sentence, self._unlogged)
+                self._unlogged, self._logged_at = 0, now
 
     def _decide(
         self,

@@ -62,7 +62,7 @@ class StepLimit:
 
     def apply(
         self, action: dict[str, NDArray[Any]], last: Mapping[str, NDArray[Any]]
-    ) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    ) -> tuple[dict[str, NDArray[Any]], tuple[str, ...]]:
         """Return (the action within its limits, a sentence for each leaf that was limited).
 
         Raises ActionError where the options refuse instead.
@@ -88,7 +88,7 @@ class StepLimit:
                 raise ActionError(f"policy '{self._policy}': {sentence}", {"policy": self._policy})
             notices.append(f"{sentence}: limited")
             limited[name] = (before + np.clip(step, -steps, steps)).astype(action[name].dtype)
-        return limited, notices
+        return limited, tuple(notices)
 
     def _read(self, name: str, steps: Any) -> NDArray[np.float64]:
         space = self._leaves.get(name)

@@ -12,7 +12,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.loaded_policies import Library
 from rlservo.serve_app.versions.plan import ServedConfig, plan_of
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.policy_store import PolicyStore, load_policy
 from rlservo.serve_app.versions.repository import Repository, raise_all
 
 
@@ -25,7 +25,8 @@ def load_served(
     """
     settings = settings or ServerSettings.from_environment(environment={})
     calls, limits = BlockingCalls(), settings.bundle_limits
-    library = Library(Repository(paths, limits), partial(Policy.load, limits=limits))
+    load = partial(load_policy, threads=settings.threads, options=settings.policy_options, limits=limits)
+    library = Library(Repository(paths, limits), load)
     available = calls.wait(
         library.repository.available, config, timeout_s=settings.scan_timeout_s, what="looking through the folders"
     )

@@ -121,7 +121,6 @@ class Control:
         self._ledger = ledger
         self._broadcast = broadcast
         self._is_current = is_current
-        self._serving: dict[str, PolicyPlan] = {}
         self._served: dict[str, set[str]] = {}  # every identity that was ever served here, by name
         self._loading: dict[Loadable, asyncio.Task[Loaded]] = {}
         self._given_up: dict[Loadable, UnavailableError] = {}
@@ -246,10 +245,6 @@ class Control:
             except Exception as error:  # the ledger may be out of reach for a while; what is served goes on
                 logger.warning("the ledger of policies could not be followed: %s", error)
 
-    def arranged(self, name: str) -> PolicyPlan | None:
-        """Return the plan by which this replica serves a policy."""
-        return self._serving.get(name)
-
     def states(self) -> dict[str, dict[str, VersionState]]:
         """Return how every version stands that is served, should be, or was refused."""
         states: dict[Key, VersionState] = {}
@@ -257,7 +252,7 @@ class Control:
             for failed in self.plan.refused.versions if self.plan.refused is not None else ():
                 states[failed.name, failed.version] = VersionState("failed", failed.reason)
         states.update({key: VersionState("failed", reason) for key, reason in self._failed.items()})
-        for name, policy in self._serving.items():
+        for name, policy in ({} if self.store is None else self.store.plans).items():
             for version, digest in policy.versions.items():
                 loaded = self._library.get(name, version, digest)
                 if loaded is not None:
@@ -405,7 +400,7 @@ class Control:
                 else:
                     loaded[name, version, digest] = one
             behind += [error.message for error in errors.values()]
-            was = self._serving.get(name)
+            was = None if self.store is None else self.store.plans.get(name)
             if errors and was is not None:
                 wanted = was
                 keys = [(name, version, digest) for version, digest in was.versions.items()]
@@ -426,7 +421,7 @@ class Control:
         changed = [name for name, identities in self._served.items() if len(identities) > 1]
         self.store = PolicyStore(policies, serving, changed=changed, replaces=self.store)
         self._given_up = {key: error for key, error in self._given_up.items() if key in found}
-        self.plan, self._serving, self._failed, self._behind = plan, serving, failed, tuple(behind)
+        self.plan, self._failed, self._behind = plan, failed, tuple(behind)
         if behind:
             logger.error("generation %d cannot be served as it should: %s", plan.generation, "; ".join(behind))
         else:

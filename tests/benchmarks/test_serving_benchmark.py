@@ -24,7 +24,6 @@ import soak as soak_module
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 from soak import Track, mix, soak
 from speed import report
@@ -34,6 +33,7 @@ from speed.machine import OTHER, PROXY, REPLICA, processes
 from speed.report import Result, Verdict, verdicts
 from speed.rounds import JSON1, JSON16, Rounds, Sample, check_answers
 from speed.servers import Exchange, Server, listening, running
+from stores import load_store
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 UR5 = ROOT / "examples" / "checkpoints" / "ur5_positioning"
@@ -51,7 +51,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
 @pytest.fixture(scope="module")
 def server(case: Case) -> Iterator[Server]:
     """Our application in this process, behind uvicorn instead of Ray Serve."""
-    store = PolicyStore.load([case.bundle.path])
+    store = load_store(case.bundle.path)
     app = create_app(lambda: store, ServerSettings())
     with socket.create_server(("127.0.0.1", 0)) as listener:
         uvicorn_server = uvicorn.Server(uvicorn.Config(app, log_level="critical", access_log=False))

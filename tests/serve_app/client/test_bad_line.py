@@ -36,6 +36,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -143,7 +144,7 @@ def real_ur5(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def store(recurrent: Path, real_ur5: Path) -> PolicyStore:
-    return PolicyStore.load([recurrent, real_ur5])
+    return load_store(recurrent, real_ur5)
 
 
 @pytest.fixture(scope="module")

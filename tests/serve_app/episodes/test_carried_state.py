@@ -28,6 +28,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan import PolicyPlan
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+from stores import store_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -75,18 +76,18 @@ def everything(versions: dict[str, Policy], served: Serve) -> Iterator[Server]:
     held: list[Server] = []
     app = create_app(lambda: held[0].store, ServerSettings())
     with served(app) as port:
-        held.append(Server(f"http://127.0.0.1:{port}", app, PolicyStore([versions["1"]])))
+        held.append(Server(f"http://127.0.0.1:{port}", app, store_of(versions["1"])))
         yield held[0]
 
 
 @pytest.fixture
 def server(everything: Server, versions: dict[str, Policy]) -> Server:
-    everything.store = PolicyStore([versions["1"]])
+    everything.store = store_of(versions["1"])
     return everything
 
 
 def promoted(versions: dict[str, Policy]) -> PolicyStore:
-    return PolicyStore([versions["1"], versions["2"], versions["other"]])
+    return store_of(versions["1"], versions["2"], versions["other"])
 
 
 def in_process(policy: Policy, steps: int) -> list[list[float]]:
@@ -110,11 +111,11 @@ def test_a_state_stays_with_its_version_whatever_becomes_the_default(
     assert (status, reply["code"]) == (409, "session-conflict") and "is of version 1" in reply["error"]
     status, reply = server.act("other", state=first["state"])
     assert (status, reply["code"]) == (410, "session-lost") and "'leaky/1#" in reply["error"]
-    server.store = PolicyStore([versions["2"]])
+    server.store = store_of(versions["2"])
     status, reply = server.act("leaky", state=first["state"])
     assert (status, reply["code"]) == (410, "session-lost") and "begin an episode (state {})" in reply["error"]
     _, first = server.act("leaky", state={})
-    server.store = PolicyStore([versions["2 again"]])  # the same name and version, and another network
+    server.store = store_of(versions["2 again"])  # the same name and version, and another network
     assert server.act("leaky", state=first["state"])[0] == 410
 
 
@@ -130,7 +131,7 @@ def test_a_state_without_a_version_is_only_used_where_it_can_be_of_one_alone(
         assert status == 400 and "does not say of which version" in reply["error"], reply
         assert "('@policy' in 'state', or the parameter 'state_policy'), or name the version" in reply["error"]
     assert server.act("leaky/versions/2", state=bare)[1]["version"] == "2"
-    server.store = PolicyStore([versions["2"]], changed=["leaky"])  # version 1 was here until a moment ago
+    server.store = store_of(versions["2"], changed=["leaky"])  # version 1 was here until a moment ago
     assert server.act("leaky", state=bare)[0] == 400
 
 
@@ -243,7 +244,7 @@ def test_our_clients_go_on_with_their_version_and_learn_when_it_is_gone(
         first = client.act(OBS)
         server.store = promoted(versions)
         np.testing.assert_allclose([first, client.act(OBS)], expected, rtol=1e-6)
-        server.store = PolicyStore([versions["2"]])
+        server.store = store_of(versions["2"])
         with pytest.raises((SessionLostError, UnknownVersionError)):
             client.act(OBS)
 
@@ -255,7 +256,7 @@ def test_our_clients_go_on_with_their_version_and_learn_when_it_is_gone(
 def limited(server: Server, versions: dict[str, Policy], box_policy: Callable[..., Path], tmp_path: Path) -> Server:
     options = PolicyOptions(max_action_step=LIMIT)
     folders = [box_policy(tmp_path), versions["1"].path]
-    server.store = PolicyStore([Policy.load(folder, options=options) for folder in folders])
+    server.store = store_of(*(Policy.load(folder, options=options) for folder in folders))
     return server
 
 

@@ -21,6 +21,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+from stores import load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -58,7 +59,7 @@ class Server:
 
 @pytest.fixture(scope="module")
 def store(leaky_policy: Callable[..., Path], ur5: Path, tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
-    return PolicyStore.load([leaky_policy(tmp_path_factory.mktemp("leaky")), ur5])
+    return load_store(leaky_policy(tmp_path_factory.mktemp("leaky")), ur5)
 
 
 Serve = Callable[[Any], AbstractContextManager[int]]

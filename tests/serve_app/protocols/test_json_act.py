@@ -23,6 +23,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.docs_page import PAGE
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
 JSON = {"content-type": "application/json"}
@@ -37,7 +38,7 @@ Ask = Callable[..., tuple[int, dict[str, str], Any]]
 @pytest.fixture(scope="module")
 def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
     unsafe = box_policy(tmp_path_factory.mktemp("unsafe"), name="unsafe", action_scale=5.0)
-    return PolicyStore.load([policies, unsafe])
+    return load_store(policies, unsafe)
 
 
 class Loading:

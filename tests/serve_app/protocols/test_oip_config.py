@@ -23,6 +23,7 @@ from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan import PolicyPlan
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 OPTIONS = {
     "gathered": PolicyOptions(micro_batch=16),
@@ -43,7 +44,7 @@ def store(
     for name in ("gathered", "careful"):
         box_policy(root, name=name)
     leaky_policy(root)
-    return PolicyStore.load([policies, root], options=OPTIONS)
+    return load_store(policies, root, options=OPTIONS)
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ import pytest
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 LENGTH = "Inference-Header-Content-Length"
 BATCH = np.random.default_rng(5).standard_normal((33, 27)).astype(np.float32)
@@ -30,7 +31,7 @@ Ask = Callable[..., tuple[int, dict[str, str], bytes]]
 @pytest.fixture(scope="module")
 def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
     unsafe = box_policy(tmp_path_factory.mktemp("unsafe"), name="unsafe", action_scale=5.0)
-    return PolicyStore.load([policies, unsafe])
+    return load_store(policies, unsafe)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,8 @@ from rlservo.serve_app.ray_serve.ingress import NO_WATCH, Ingress, ServeBypass
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.request_checks import REQUEST_ID
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore, load_policy
+from rlservo.serve_app.versions.policy_store import load_policy
+from stores import store_of
 
 ACT = "/v1/policies/ur5/act"
 OBS = json.dumps({"obs": [0.0] * 27}).encode()
@@ -46,7 +47,7 @@ class Serve:
 
 @pytest.fixture
 def app(ur5: Path) -> Any:
-    store = PolicyStore([load_policy(ur5)])
+    store = store_of(load_policy(ur5))
     return create_app(lambda: store, ServerSettings())
 
 
@@ -170,7 +171,7 @@ def test_a_stream_reaches_the_application_without_serve(app: Any) -> None:
 
 def test_keys_are_asked_for_without_serve_as_well(ur5: Path) -> None:
     key, line = new_key("robot")
-    store = PolicyStore([load_policy(ur5)])
+    store = store_of(load_policy(ur5))
     app = create_app(lambda: store, ServerSettings(api_keys=line))
 
     async def scenario() -> None:

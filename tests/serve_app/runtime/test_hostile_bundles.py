@@ -386,8 +386,8 @@ def test_a_replica_whose_files_hang_does_not_hold_up_the_commands_of_others(
             with pytest.raises(UnavailableError, match="elsewhere: loading policy 'ur5' version 2 took longer"):
                 await controls[0].change(lambda p, n=number: aliased(p, f"alias{n}"), what="alias")  # type: ignore[misc]
             assert time.monotonic() - began < 0.9  # not another second
-            arranged = controls[1].arranged("gridworld")
-            assert arranged is not None and f"alias{number}" in arranged.aliases
+            served = controls[1].store
+            assert served is not None and f"alias{number}" in served.plans["gridworld"].aliases
             await asyncio.sleep(0.1)
         stalled.go_on.set()
         for _ in range(200):

@@ -29,6 +29,7 @@ from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -67,7 +68,7 @@ def file(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def store(ur5: Path) -> PolicyStore:
-    return PolicyStore.load([ur5])
+    return load_store(ur5)
 
 
 @pytest.fixture

@@ -25,6 +25,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.replica_versions import Control
 from rlservo.serve_app.wire.loopback import is_loopback
+from stores import load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -68,7 +69,7 @@ def stream(port: int, **headers: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def store(ur5: Path) -> PolicyStore:
-    return PolicyStore.load([ur5])
+    return load_store(ur5)
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from rlservo.serve_app.ray_serve.environment import ray_environment
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.request_path import Admission
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -35,7 +35,7 @@ Serve = Callable[..., AbstractContextManager[int]]
 
 @pytest.fixture(scope="module")
 def serve(policies: Path, served: Callable[[Any], AbstractContextManager[int]]) -> Serve:
-    store = PolicyStore.load([policies])
+    store = load_store(policies)
     return lambda **settings: served(create_app(lambda: store, ServerSettings(**settings)))
 
 

@@ -118,8 +118,7 @@ def test_changes_at_the_same_time_all_happen_one_after_the_other(folder: Path) -
         ]
         await asyncio.gather(*changes)
         for control in fleet.controls:
-            arranged = control.arranged("ur5")
-            assert arranged is not None and len(arranged.aliases) == 1 + 9
+            assert control.store is not None and len(control.store.plans["ur5"].aliases) == 1 + 9
         assert fleet.shelf.newest() == 10
 
     asyncio.run(run())
