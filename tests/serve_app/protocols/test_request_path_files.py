@@ -81,9 +81,10 @@ def test_a_json_request_passes_at_most_nine_files_between_socket_and_network(ur5
             reader, writer = await asyncio.open_connection(*listener.getsockname())
             passed = PassedFiles()
             for number in range(3):  # the first tells the prefix, by way of Serve
+                content = request()
                 sys.setprofile(passed if number == 2 else None)
                 try:
-                    writer.write(request())
+                    writer.write(content)
                     status = await reader.readline()
                     await reader.readuntil(b"}")
                 finally:
