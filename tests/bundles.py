@@ -38,8 +38,8 @@ from rlservo.export.contract.contract import (
     TensorSpec,
 )
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, Element
-from rlservo.serve_app.versions.loaded_policies import Library
-from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 
 OBS = 27
@@ -364,7 +364,7 @@ class MemoryLedger:
     def newest(self) -> int:
         return max(self.plans, default=0)
 
-    def read(self, generation: int) -> bytes | None:
+    def fetch(self, generation: int) -> bytes | None:
         return self.plans.get(generation)
 
     def append(self, generation: int, content: bytes) -> bool:
@@ -372,12 +372,12 @@ class MemoryLedger:
 
 
 @pytest.fixture(scope="session")
-def controlled() -> Callable[..., AbstractContextManager[Control]]:
+def controlled() -> Callable[..., AbstractContextManager[ReplicaVersions]]:
     """Control over what is served of some folders, for an application that can be administered."""
 
     @contextlib.contextmanager
-    def control_of(*folders: Path, config: Any = None) -> Iterator[Control]:
-        control = Control(Library(Repository(list(folders))), MemoryLedger(), replica="only")
+    def control_of(*folders: Path, config: Any = None) -> Iterator[ReplicaVersions]:
+        control = ReplicaVersions(LoadedPolicies(Repository(list(folders))), MemoryLedger(), replica="only")
         try:
             asyncio.run(control.configure({} if config is None else config))
             yield control

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError
-from rlservo.serve_app.episodes.carried_state import BEGIN, CarriedState, carry
+from rlservo.serve_app.episodes.carried_state import NO_STATE, CarriedState, carry
 from rlservo.serve_app.episodes.request import Episode, Request
 from rlservo.serve_app.episodes.sessions import Session, SessionId, Sessions, shorten
 from rlservo.serve_app.runtime.policy import Policy, Step
@@ -48,7 +48,7 @@ class Episodes:
             name = request.policy
             has_session = self.sessions.peek(name, episode.session_id) is not None
             begins = episode.reset and self._alone()
-            if has_session or begins or _choose(store, request).episodic:
+            if has_session or begins or _choose(store, request).is_stateful:
                 return self._act_in_session(store, request, episode, episode.session_id)
             # There is nothing to remember: the id says only which requests belong together.
             episode = replace(episode, session_id=None, reset=False, end=False)
@@ -62,7 +62,7 @@ class Episodes:
         policy = _choose(store, request)
         if policy.contract.state:
             raise RequestError(f"policy '{request.policy}' {NEEDS_STATE}", NEEDS)
-        if policy.limited and episode.last_action is None:
+        if policy.has_step_limit and episode.last_action is None:
             raise RequestError(f"policy '{request.policy}' {NEEDS_LAST}", NEEDS)
         return _take_step(policy, request, episode).decision(policy, None)
 
@@ -81,8 +81,8 @@ class Episodes:
         name, version, stream = request.policy, request.version, request.stream
         assert episode.state is not None
         carried = CarriedState.parse(episode.state)
-        if carried.belongs_to is not None:
-            policy = _owner(store, name, version, carried.belongs_to)
+        if carried.policy_identity is not None:
+            policy = _owner(store, name, version, carried.policy_identity)
         else:
             policy = _choose(store, request)
             if stream is not None and store.has(stream.policy) and version is None:
@@ -94,10 +94,11 @@ class Episodes:
                     f"last reply gave ('{BELONGS_TO}' in 'state', or the parameter 'state_policy'), or name the "
                     "version in the address"
                 )
-        if policy.limited and not carried.begins and carried.last_action is None and episode.last_action is None:
+        needs_last = policy.has_step_limit and not carried.is_empty
+        if needs_last and carried.last_action is None and episode.last_action is None:
             raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
         timed = _take_step(policy, request, episode, carried)
-        carries = bool(policy.contract.state) or policy.limited
+        carries = bool(policy.contract.state) or policy.has_step_limit
         return timed.decision(policy, EpisodeNote(state=carry(policy, timed.step)) if carries else None)
 
     def _act_on_stream(self, store: PolicyStore, request: Request, episode: Episode, stream: Session) -> Decision:
@@ -110,9 +111,9 @@ class Episodes:
                 raise
             policy = _choose(store, request)  # an episode begins: with what is there now
         timed = _take_step(policy, request, episode, session=Session(policy) if begins else stream)
-        rows = timed.step.rows if policy.episodic else 0
+        rows = timed.step.rows if policy.is_stateful else 0
         if rows != stream.rows:
-            self.sessions.hold(stream, rows)
+            self.sessions.reserve(stream, rows)
         if begins:
             stream.begin(policy)
         stream.keep(timed.step)
@@ -132,24 +133,24 @@ class Episodes:
                     "this server has several replicas, and requests of a session would reach any of them: send the "
                     "'state' along, use a WebSocket, or run one replica"
                 )
-            if policy.episodic and not episode.end:
+            if policy.is_stateful and not episode.end:
                 self.sessions.check_room(name, session_id)
             session = Session(policy)
         else:
             session = self.sessions.find(name, session_id)
             self._check_version(store, request, session, session_id)
-            repeated = session.find_reply(seq, request.obs)
+            repeated = session.answer_again(seq, request.obs)
             if repeated is not None:
                 return repeated
         timed = _take_step(session.policy, request, episode, session=session)
         if episode.end:
             self.sessions.end(name, session_id)
         elif episode.reset:
-            self.sessions.put(name, session_id, session, timed.step.rows if session.policy.episodic else 0)
+            self.sessions.put(name, session_id, session, timed.step.rows if session.policy.is_stateful else 0)
         session.keep(timed.step)
         decision = timed.decision(session.policy, EpisodeNote(session_id=session_id, step=session.steps))
-        session.last_seq, session.last_decision = seq, decision
-        session.last_obs = b"" if seq is None else session.policy.fingerprint(timed.step.fed)
+        session.seq, session.answer = seq, decision
+        session.inputs_hash = b"" if seq is None else session.policy.fingerprint(timed.step.inputs)
         return decision
 
     def _check_version(
@@ -211,15 +212,20 @@ class _TimedStep:
 
 
 def _take_step(
-    policy: Policy, request: Request, episode: Episode, carried: CarriedState = BEGIN, *, session: Session | None = None
+    policy: Policy,
+    request: Request,
+    episode: Episode,
+    carried: CarriedState = NO_STATE,
+    *,
+    session: Session | None = None,
 ) -> _TimedStep:
     """Take a step from what the client carries, or from a session's state."""
     started = time.perf_counter()
     step = policy.step(
         request.obs,
         before=None if session is None else session.state,
-        last=None if session is None else session.last_leaves,
-        state=carried.arrays if carried.arrays or (policy.contract.state and not carried.begins) else None,
+        last=None if session is None else session.last,
+        state=carried.arrays if carried.arrays or (policy.contract.state and not carried.is_empty) else None,
         last_action=carried.last_action if episode.last_action is None else episode.last_action,
         reward=episode.reward,
         explore=request.explore,

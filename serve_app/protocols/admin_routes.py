@@ -27,9 +27,9 @@ from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_checks import HEADERS, REQUEST_ID, header_text
 from rlservo.serve_app.server.request_log import write_change
-from rlservo.serve_app.versions import plan
+from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
-from rlservo.serve_app.versions.replica_versions import Change, Control
+from rlservo.serve_app.versions.replica_versions import Change, ReplicaVersions
 
 Route = TypeVar("Route", bound=Callable[..., Any])
 
@@ -79,7 +79,7 @@ class Changed(BaseModel):
     shadow: str | None
 
 
-def add_admin(app: FastAPI, core: Core, control: Control) -> None:
+def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
     """Add /v1/admin and the repository extension's load and unload to the application."""
     errors = error_models(404, 409, 415, 503)
 
@@ -135,20 +135,22 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
     @grant(Access.admin)
     async def unload(request: Request, name: str, given: UnloadCommand) -> Response:
         version = given.version
-        return await changed(request, name, f"unload {name} {version or ''}", lambda p: plan.unload(p, name, version))
+        return await changed(
+            request, name, f"unload {name} {version or ''}", lambda p: plan_changes.unload(p, name, version)
+        )
 
     @command("alias", "Let an alias lead to a loaded version")
     @grant(Access.admin)
     async def alias(request: Request, name: str, given: AliasCommand) -> Response:
         what = f"alias {name} {given.alias}={given.version or ''}"
-        return await changed(request, name, what, lambda p: plan.set_alias(p, name, given.alias, given.version))
+        return await changed(request, name, what, lambda p: plan_changes.set_alias(p, name, given.alias, given.version))
 
     @command("rollback", "Let an alias lead where it led before")
     @grant(Access.admin)
     async def rollback(request: Request, name: str, given: RollbackCommand) -> Response:
         what = f"rollback {name} {given.alias}"
         alias, expected = given.alias, given.expected
-        return await changed(request, name, what, lambda p: plan.roll_back(p, name, alias, expected=expected))
+        return await changed(request, name, what, lambda p: plan_changes.roll_back(p, name, alias, expected=expected))
 
     @command("canary", "Send a share of the sessions to another version")
     @grant(Access.admin)
@@ -158,13 +160,13 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
         ended = given.version is None or not given.share
         chosen = None if ended else Canary(version=str(given.version), share=given.share or 0)
         what = f"canary {name} {given.version or 'off'} {given.share or ''}"
-        return await changed(request, name, what, lambda p: plan.set_canary(p, name, chosen))
+        return await changed(request, name, what, lambda p: plan_changes.set_canary(p, name, chosen))
 
     @command("shadow", "Let another version compute along")
     @grant(Access.admin)
     async def shadow(request: Request, name: str, given: ShadowCommand) -> Response:
         what = f"shadow {name} {given.version or 'off'}"
-        return await changed(request, name, what, lambda p: plan.set_shadow(p, name, given.version))
+        return await changed(request, name, what, lambda p: plan_changes.set_shadow(p, name, given.version))
 
     # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: nobody reads it.
     def repository(path: str, summary: str) -> Callable[[Route], Route]:
@@ -190,7 +192,7 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
     @grant(Access.admin)
     async def unload_model(request: Request, name: str) -> Response:
         what = f"unload {name}"
-        await apply(request, what, control.change(lambda p: plan.unload(p, name, None), what=what))
+        await apply(request, what, control.change(lambda p: plan_changes.unload(p, name, None), what=what))
         return Response(b"{}", media_type="application/json")
 
 

@@ -22,7 +22,7 @@ from rlservo.serve_app.server.gauges import gauges_of
 from rlservo.serve_app.server.request_checks import Hosts, RequestChecks
 from rlservo.serve_app.server.request_path import StoreProvider
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 
 DESCRIPTION = "Actions from exported RLlib policies. Every error is a sentence, a code and, where it helps, details."
 
@@ -32,7 +32,7 @@ def create_app(
     settings: ServerSettings,
     *,
     replica: str = "",
-    control: Control | None = None,
+    control: ReplicaVersions | None = None,
     alone: Callable[[], bool] = lambda: True,
     host: str = "127.0.0.1",
 ) -> PolicyApp:

@@ -270,13 +270,14 @@ class _BodyTimer:
     again for every piece that they bring; for as long again as the time was, at most.
     """
 
-    __slots__ = ("_handle", "_last", "_loop", "_quiet", "_seen", "_task", "late", "pieces")
+    __slots__ = ("_handle", "_last", "_loop", "_quiet", "_seconds", "_seen", "_task", "late", "pieces")
 
     def __init__(self, seconds: float) -> None:
         self._loop = asyncio.get_running_loop()
         self._task = asyncio.current_task()
         self._handle = self._loop.call_later(seconds, self._check)
-        self._last = self._loop.time() + 2 * seconds
+        self._seconds = seconds
+        self._last = 0.0  # when the time is over whatever comes: as long again, from the first check on
         self._quiet = self._seen = 0
         self.pieces = 0
         self.late = False
@@ -287,6 +288,7 @@ class _BodyTimer:
 
     def _check(self) -> None:
         now = self._loop.time()
+        self._last = self._last or now + self._seconds
         if self.pieces != self._seen and now < self._last:
             self._seen, self._quiet = self.pieces, 0
         if self._quiet < TURNS:

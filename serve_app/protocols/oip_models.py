@@ -213,7 +213,7 @@ def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]
     policy = core.store().get(name, version)
     contract = policy.contract
     versions = core.store().versions(name) if version is None else (contract.version,)
-    inputs = [*contract.inputs, *(last_action_inputs(contract) if policy.limited else ())]
+    inputs = [*contract.inputs, *(last_action_inputs(contract) if policy.has_step_limit else ())]
 
     def described(tensor: TensorSpec) -> dict[str, Any]:
         return {"name": tensor.name, "datatype": datatype_of(tensor.dtype), "shape": tensor.shape}

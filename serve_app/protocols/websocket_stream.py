@@ -87,7 +87,7 @@ class StreamEndpoint:
             await _fail(send, error_answer(error)[1])
             return
         idle = IdleTimer(core.settings.stream_idle_s)
-        opening.stream = Session(policy) if policy.episodic else None
+        opening.stream = Session(policy) if policy.is_stateful else None
         try:
             await send(_binary(encode_metadata(policy.contract)))
             await self._answer_all(opening, scope, receive, send, idle)

@@ -32,10 +32,10 @@ from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_policies import Library
+from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
 from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.versions.policy_store import load_policy
-from rlservo.serve_app.versions.replica_versions import Control, Following
+from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.wire.loopback import is_loopback
 
@@ -79,7 +79,7 @@ def build(args: BuildArguments) -> Application:
     """
     ray_parts.check()
     settings = ServerSettings.from_environment(args.settings)
-    ServedConfig.read(args.served)
+    ServedConfig.parse(args.served)
     # A folder may exist only on the nodes that run replicas, so it is the replica that looks.
     folders = [str(Path(folder).expanduser().absolute()) for folder in args.policies]
     server: Deployment = cast("Deployment", PolicyServer)  # the decorator's type says it is still the class
@@ -133,10 +133,10 @@ class PolicyServer(InferenceService):
                 options=self._settings.policy_options,
                 limits=limits,
             )
-            library = Library(Repository(folders, limits), load)
+            library = LoadedPolicies(Repository(folders, limits), load)
         except RlservoError as error:
             raise _plain(error) from None
-        self._control = Control(
+        self._control = ReplicaVersions(
             library,
             GcsLedger(_controller()._actor_id.hex(), context.app_name, context.deployment),
             replica=self._replica,
@@ -174,7 +174,7 @@ class PolicyServer(InferenceService):
                 await self._control.configure(user_config)
             except RlservoError as error:
                 raise _plain(error) from None
-            self._watch = asyncio.create_task(self._control.watch())
+            self._watch = asyncio.create_task(self._control.poll_ledger())
         else:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
 
@@ -188,7 +188,7 @@ class PolicyServer(InferenceService):
         if self._control.store is None:
             raise RuntimeError("no policies are loaded: the deployment's user_config must be a map, and not null")
 
-    async def follow_plan(self, generation: int) -> Following:
+    async def follow_plan(self, generation: int) -> ReplicaProgress:
         """Serve a plan that another replica wrote; replicas call this of each other."""
         return await self._control.follow(generation)
 
@@ -213,9 +213,9 @@ class PolicyServer(InferenceService):
             return True
         return current is None or current.user_config == user_config
 
-    async def _tell_all(self, generation: int) -> list[Following]:
+    async def _tell_all(self, generation: int) -> list[ReplicaProgress]:
         replies = await self._call_all("follow_plan", generation)
-        return [reply for reply in replies if isinstance(reply, Following)]
+        return [reply for reply in replies if isinstance(reply, ReplicaProgress)]
 
     async def _ask_all(self) -> list[Any]:
         return sorted(await self._call_all("describe"), key=lambda reply: str(reply.get("replica")))

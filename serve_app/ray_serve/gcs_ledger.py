@@ -28,7 +28,7 @@ class GcsLedger:
         """Return the highest number, 0 when there is none."""
         return max(self._numbers(), default=0)
 
-    def read(self, generation: int) -> bytes | None:
+    def fetch(self, generation: int) -> bytes | None:
         """Return a document; None when it is not there (any more)."""
         content: bytes | None = _internal_kv_get(self._key(generation), namespace=NAMESPACE)
         return content

@@ -94,7 +94,7 @@ def serve_policies(
     chosen = ServerSettings.from_environment(settings)
     paths = [str(Path(path).expanduser().absolute()) for path in dirs]
     _check_ray()
-    with contextlib.closing(load_served(paths, ServedConfig.read(served), chosen)) as store:
+    with contextlib.closing(load_served(paths, ServedConfig.parse(served), chosen)) as store:
         policies = tuple((name, store.default(name)) for name in store.names)
         if chosen.default_policy not in (None, *store.names):
             raise UsageError(

@@ -37,9 +37,6 @@ ONNX_TYPES = {
 Run = Callable[[list[str], dict[str, NDArray[Any]]], Any]
 
 
-# Loading: what must hold before a graph may act.
-
-
 def check_contract(bundle: Bundle) -> None:
     """Refuse what this runtime cannot run faithfully, and contracts that contradict themselves."""
     contract = bundle.contract
@@ -120,12 +117,12 @@ def open_graph(bundle: Bundle, threads: int) -> onnxruntime.InferenceSession:
             raise BundleError(f"{bundle.onnx} is not a graph onnxruntime can run: {sentence}") from error
 
 
-def check_graph(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
+def check_graph(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> None:
     """Compare the graph's inputs and outputs with the contract's."""
     contract = bundle.contract
     for side, listed, actual in (
-        ("inputs", contract.inputs, session.get_inputs()),
-        ("outputs", contract.outputs, session.get_outputs()),
+        ("inputs", contract.inputs, ort_session.get_inputs()),
+        ("outputs", contract.outputs, ort_session.get_outputs()),
     ):
         found = {node.name: node for node in actual}
         if set(found) != {tensor.name for tensor in listed}:
@@ -151,9 +148,9 @@ def check_graph(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
                 )
 
 
-def check_copy(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
+def check_copy(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> None:
     """Compare the contract with the copy inside the graph: an edited one may have valid hashes."""
-    text = session.get_modelmeta().custom_metadata_map.get(CONTRACT_KEY)
+    text = ort_session.get_modelmeta().custom_metadata_map.get(CONTRACT_KEY)
     if text is None:
         return  # a graph that another tool wrote; what of the contract can be seen in it has been compared
     exported = embedded_contract(text, bundle.onnx)

@@ -24,7 +24,7 @@ from rlservo.export.contract.errors import ActionError, RequestError, UsageError
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.interface import Observation
-from rlservo.serve_app.runtime.action_guard import ActionGuard
+from rlservo.serve_app.runtime.action_check import ActionCheck
 from rlservo.serve_app.runtime.drift import Drift
 from rlservo.serve_app.runtime.exploration import sample_leaves
 from rlservo.serve_app.runtime.loading import (
@@ -38,7 +38,7 @@ from rlservo.serve_app.runtime.loading import (
 )
 from rlservo.serve_app.runtime.observations import ObservationParser, Observed
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
-from rlservo.serve_app.runtime.recurrent_state import Memory, State
+from rlservo.serve_app.runtime.recurrent_state import State, StateTensors
 from rlservo.serve_app.runtime.step_limit import StepLimit
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Step:
     """What the next step needs, `[batch, *shape]`; empty for a stateless policy."""
     batch: int | None
     """How many observations there were; None for one that came alone."""
-    fed: Mapping[str, NDArray[Any]]
+    inputs: Mapping[str, NDArray[Any]]
     """What the network was given, by tensor name."""
     notices: tuple[str, ...] = ()
     """What was out of bounds or beyond a limit, and used all the same."""
@@ -86,20 +86,20 @@ class Policy:
     def __init__(
         self,
         bundle: Bundle,
-        session: onnxruntime.InferenceSession,
+        ort_session: onnxruntime.InferenceSession,
         options: PolicyOptions = DEFAULT_OPTIONS,
         *,
         graph_hash: str = "",
     ) -> None:
-        """Wrap a session whose graph fits `bundle.contract`; use `Policy.load`."""
+        """Wrap onnxruntime's session, whose graph fits `bundle.contract`; use `Policy.load`."""
         contract = bundle.contract
         self._bundle = bundle
         self._graph_hash = graph_hash
         self.identity = f"{contract.name}/{contract.version}#{graph_hash[:SHOWN_HASH]}"
-        """What a memory of this policy's belongs to: name, version and graph, the same wherever it is loaded."""
+        """Name, version and graph, the same wherever it is loaded: a recurrent state goes to the policy of its own."""
         self._contract = contract
-        self._session: onnxruntime.InferenceSession | None = session
-        self._run: Run = session.run
+        self._ort_session: onnxruntime.InferenceSession | None = ort_session
+        self._run: Run = ort_session.run
         self._rng = np.random.default_rng()
         self.options = options
         self._unlogged = 0
@@ -109,20 +109,20 @@ class Policy:
             contract.name, contract.observation_space, options=options, drift=self.drift
         )
         actions = leaf_specs(contract.action_space, "action")
-        self._guards = {name: ActionGuard(contract.name, name, leaf) for name, leaf in actions.items()}
-        self._memory = Memory(contract)
-        self._limit = StepLimit(contract.name, actions, options)
+        self._action_checks = {name: ActionCheck(contract.name, name, leaf) for name, leaf in actions.items()}
+        self._state_tensors = StateTensors(contract)
+        self._step_limit = StepLimit(contract.name, actions, options)
         self._state: State | None = None
         self._last: dict[str, NDArray[Any]] | None = None
-        self.limited = bool(self._limit)
-        self.episodic = bool(contract.state) or self.limited
+        self.has_step_limit = bool(self._step_limit)
+        self.is_stateful = bool(contract.state) or self.has_step_limit
         """Whether an action depends on what came before: on a state, or by a limit on the last action."""
         # Most policies read one array and give one: those few microseconds are what a control loop asks for.
         leaves = self._observations.leaves
         flat = "obs" in leaves and "action" in actions  # not a Dict or Tuple, which may have a single leaf
-        self._simple = flat and len(contract.inputs) == 1 and not self.episodic
+        self._simple = flat and len(contract.inputs) == 1 and not self.is_stateful
         self._leaf = next(iter(leaves.values()))
-        self._guard = next(iter(self._guards.values()))
+        self._action_check = next(iter(self._action_checks.values()))
         self._input = contract.inputs[0].name
         self._action_only = ["action"]
         self._dist_only = ["action_dist_inputs"]
@@ -150,12 +150,12 @@ class Policy:
             raise UsageError(f"threads must be 1 or more, got {threads}")
         bundle = load_bundle(path, limits)
         check_contract(bundle)
-        session = open_graph(bundle, threads)
-        check_graph(bundle, session)
-        check_copy(bundle, session)
+        ort_session = open_graph(bundle, threads)
+        check_graph(bundle, ort_session)
+        check_copy(bundle, ort_session)
         if check_golden:
-            check_golden_vectors(bundle, session.run)
-        return cls(bundle, session, options, graph_hash=bundle.sums[ONNX_FILE])
+            check_golden_vectors(bundle, ort_session.run)
+        return cls(bundle, ort_session, options, graph_hash=bundle.sums[ONNX_FILE])
 
     @property
     def contract(self) -> Contract:
@@ -189,7 +189,7 @@ class Policy:
             return computed if batch else computed[0, ...]
         step = self.step(obs, before=self._state, last=self._last, explore=explore, seed=seed, reward=reward)
         self._state = step.state or None
-        self._last = step.leaves if self._limit else None
+        self._last = step.leaves if self._step_limit else None
         return step.action
 
     def act_from(
@@ -244,17 +244,17 @@ class Policy:
                 f"observation{'s' if rows > 1 else ''}: reset to begin others"
             )
         if state is not None:
-            before = self._memory.read(state, rows, batch=batch)
+            before = self._state_tensors.parse(state, rows, batch=batch)
         if last_action is not None:
             given = action_leaves(self._contract.action_space, last_action, "action")
-            last = self._limit.read(given, rows, batch=batch)
+            last = self._step_limit.parse_last_action(given, rows, batch=batch)
         action, after = self._decide(feed, rows, before, explore, seed, reward)
-        if self._limit and last is not None:
-            action, limited = self._limit.apply(action, last)
+        if self._step_limit and last is not None:
+            action, limited = self._step_limit.apply(action, last)
             self._log(limited)
             notices += limited
-            for name, guard in self._guards.items():
-                guard.check(action[name])
+            for name, check in self._action_checks.items():
+                check.check(action[name])
         space = self._contract.action_space
         own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
         return Step(build_action(space, own), action, after, rows if batch else None, feed, notices)
@@ -266,11 +266,11 @@ class Policy:
             self._log(observed.notices)
         return observed
 
-    def action(self, computed: Mapping[str, NDArray[Any]], *, batch: bool) -> Any:
+    def build_action(self, computed: Mapping[str, NDArray[Any]], *, batch: bool) -> Any:
         """Return the action that the network's outputs are (`parse`, `network`), checked. Raises ActionError."""
-        for name, guard in self._guards.items():
-            guard.check(computed[name])
-        own = {name: computed[name] if batch else computed[name][0, ...] for name in self._guards}
+        for name, check in self._action_checks.items():
+            check.check(computed[name])
+        own = {name: computed[name] if batch else computed[name][0, ...] for name in self._action_checks}
         return build_action(self._contract.action_space, own)
 
     def network(self) -> Network:
@@ -278,30 +278,30 @@ class Policy:
 
         It is onnxruntime's own `run`: what has been given to it is computed even when the policy is closed meanwhile.
         """
-        return _named(self._open_session().run, list(self._guards))
+        return _named(self._open().run, list(self._action_checks))
 
     def check_rows(self) -> None:
         """Raise BundleError where the network computes several observations otherwise than each by itself."""
-        check_rows(self._bundle, self._open_session().run)
+        check_rows(self._bundle, self._open().run)
 
     def fingerprint(self, fed: Mapping[str, NDArray[Any]]) -> bytes:
-        """Return what tells the observation of a feed (`parse`, `Step.fed`) from others."""
+        """Return what tells the observation of a feed (`parse`, `Step.inputs`) from others."""
         digest = hashlib.blake2b(digest_size=16)
         for name in self._observations.leaves:
             digest.update(fed[name].tobytes())
         return digest.digest()
 
-    def twin(self) -> Policy:
+    def clone(self) -> Policy:
         """Return another policy over the same graph, for another thread: its recurrent state and drift are its own."""
-        return Policy(self._bundle, self._open_session(), self.options, graph_hash=self._graph_hash)
+        return Policy(self._bundle, self._open(), self.options, graph_hash=self._graph_hash)
 
     def reset(self) -> None:
         """Start an episode: a recurrent policy forgets. Nothing to do for a stateless one."""
         self._state = self._last = None
 
     def close(self) -> None:
-        """Drop the session; `act` raises UsageError from now on."""
-        self._run, self._session = _refuse_closed, None
+        """Drop the graph; `act` raises UsageError from now on."""
+        self._run, self._ort_session = _refuse_closed, None
 
     def __enter__(self) -> Self:
         return self
@@ -311,10 +311,10 @@ class Policy:
     ) -> None:
         self.close()
 
-    def _open_session(self) -> onnxruntime.InferenceSession:
-        if self._session is None:
+    def _open(self) -> onnxruntime.InferenceSession:
+        if self._ort_session is None:
             _refuse_closed([], {})
-        return self._session
+        return self._ort_session
 
     def _compute(
         self, obs: Observation, explore: bool, seed: int | None
@@ -327,7 +327,7 @@ class Policy:
             action = self._sample(self._run(self._dist_only, feed)[0], seed)["action"]
         else:
             action = self._run(self._action_only, feed)[0]
-        self._guard.check(action)
+        self._action_check.check(action)
         notices: tuple[str, ...] = ()
         if notice:
             notices = (notice,)
@@ -353,16 +353,16 @@ class Policy:
         reward: ArrayLike | None,
     ) -> tuple[dict[str, NDArray[Any]], State]:
         """Return (action leaves `[batch, ...]`, next state) for checked observations."""
-        feed.update(self._memory.feed(before, rows, reward))
-        names = (["action_dist_inputs"] if explore else list(self._guards)) + self._memory.outputs
+        feed.update(self._state_tensors.inputs(before, rows, reward))
+        names = (["action_dist_inputs"] if explore else list(self._action_checks)) + self._state_tensors.outputs
         if explore:
             self._check_explores()
         computed = dict(zip(names, self._run(names, feed), strict=True))
         action = self._sample(computed["action_dist_inputs"], seed) if explore else computed
-        for name, guard in self._guards.items():
-            guard.check(action[name])
-        after = self._memory.keep(computed, action if explore else None)
-        return {name: action[name] for name in self._guards}, after
+        for name, check in self._action_checks.items():
+            check.check(action[name])
+        after = self._state_tensors.next_state(computed, action if explore else None)
+        return {name: action[name] for name in self._action_checks}, after
 
     def _check_explores(self) -> Distribution:
         distribution = self._contract.distribution

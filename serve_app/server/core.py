@@ -20,7 +20,7 @@ from rlservo.serve_app.server.request_metrics import Metrics
 from rlservo.serve_app.server.request_path import Admission, RequestPath, StoreProvider
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.shadow import Shadows
 
 
@@ -33,7 +33,7 @@ class Core:
         settings: ServerSettings,
         *,
         replica: str = "",
-        control: Control | None = None,
+        control: ReplicaVersions | None = None,
         alone: Callable[[], bool] = lambda: True,
     ) -> None:
         """Read the keys that `settings` name; `replica` names this process in the metrics. Raises UsageError.

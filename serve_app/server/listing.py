@@ -104,7 +104,7 @@ def describe(core: Core) -> dict[str, Any]:
         "changed_at": plan and plan.changed_at,
         "changed_by": plan and plan.changed_by,
         "refused": plan and plan.refused and plan.refused.model_dump(),
-        "behind": list(control.following().behind) if control is not None else [],
+        "behind": list(control.progress().behind) if control is not None else [],
     }
 
 

@@ -84,8 +84,8 @@ class RequestLog:
             fields["seq"] = request.seq
         _requests.info("answered", extra={FIELDS: fields})
 
-    def write_failure(self, request: Request, code: str, sentence: str, *, peer: str | None = None) -> None:
-        """Write a request that got none; `peer` is the address of a client that was refused before it was read."""
+    def write_failure(self, request: Request, code: str, sentence: str) -> None:
+        """Write a request that got none."""
         if not _requests.isEnabledFor(logging.INFO):
             return
         fields: dict[str, Any] = {
@@ -94,13 +94,28 @@ class RequestLog:
             "policy": request.policy[:64],
             "version": request.version and request.version[:32],
             "code": code,
+            "ms": round((time.perf_counter() - request.received) * 1e3, 3),
         }
-        if peer is None:
-            fields["ms"] = round((time.perf_counter() - request.received) * 1e3, 3)
-        else:
-            fields["peer"] = peer
-        if request.on_websocket and type(request.seq) is int:
+        if request.on_websocket and request.seq is not None:
             fields["seq"] = request.seq
+        self._write_refusal(fields, sentence)
+
+    def write_unread(
+        self, protocol: str, code: str, sentence: str, *, request_id: str | None, peer: str | None
+    ) -> None:
+        """Write a request that was refused before it was routed; `peer` is its client's address."""
+        fields: dict[str, Any] = {
+            "request_id": _shorten(request_id),
+            "protocol": protocol,
+            "policy": "",
+            "version": None,
+            "code": code,
+        }
+        if peer is not None:
+            fields["peer"] = peer
+        self._write_refusal(fields, sentence)
+
+    def _write_refusal(self, fields: dict[str, Any], sentence: str) -> None:
         if self._values:
             fields["error"] = sentence
         _requests.info("refused", extra={FIELDS: fields})

@@ -275,8 +275,7 @@ class RequestPath:
     def record_refusal(self, protocol: str, error: RlservoError, request_id: str | None, *, peer: str | None) -> None:
         """Count and log a request that was refused before it was routed, and the address it came from."""
         self._metrics.count_failure(protocol, "", "", error.code)
-        refused = Request(protocol, "", None, 0.0, request_id=request_id)
-        self._log.write_failure(refused, error.code, error.message, peer=peer)
+        self._log.write_unread(protocol, error.code, error.message, request_id=request_id, peer=peer)
 
     def open_stream(self, request: Request) -> None:
         """Count a stream that opens, from whose opening `request` is. Raises OverloadedError."""

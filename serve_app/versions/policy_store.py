@@ -31,7 +31,7 @@ from rlservo.serve_app.versions.plan import PolicyPlan
 
 @dataclass(frozen=True, slots=True)
 class EpisodeNote:
-    """What a reply says of its episode."""
+    """Fields of a reply about its episode."""
 
     state: Mapping[str, Any] | None = None  # for the client to carry, as `carried_state.py` has it
     session_id: str | int | None = None
@@ -57,7 +57,7 @@ class Decision:
 class _Canary:
     policy: Policy
     share: float
-    needs_session: bool  # a policy with a memory cannot change in the middle of an episode
+    needs_label: bool  # a stateful policy cannot change in the middle of an episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,7 @@ class PolicyStore:
         """
         if version is None:
             canary = self._find(name).canary
-            if canary is not None and _draw(name, label, canary.needs_session) < canary.share:
+            if canary is not None and _draw(name, label, canary.needs_label) < canary.share:
                 return canary.policy
         return self.get(name, version)
 
@@ -219,7 +219,7 @@ class PolicyStore:
     ) -> Decision:
         """Decide as `act` does without exploring; with what else is there in one run where the policy's options say so.
 
-        `check` is asked again right before the network runs. Raises what it and `act` raise.
+        `check` is called again right before the network runs. Raises what it and `act` raise.
         """
         policy = self._stateless(name, version, label)
         batcher = self._batchers.get(policy)
@@ -232,7 +232,7 @@ class PolicyStore:
         single = rows == 1  # also a batch of one: the Open Inference Protocol has no other
         computed = await batcher.compute(feed, check) if single else batcher.compute_now(feed)
         started = time.perf_counter()
-        action = policy.action(computed.outputs, batch=batch)
+        action = policy.build_action(computed.outputs, batch=batch)
         infer_ms = parse_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
         version = policy.contract.version
         return Decision(action, name, version, infer_ms, rows if batch else None, notices, sharers=computed.requests)
@@ -246,7 +246,7 @@ class PolicyStore:
 
     def _stateless(self, name: str, version: str | None, label: str | None) -> Policy:
         policy = self.choose(name, version, label)
-        if policy.episodic:  # its memory belongs to one episode, and a server has many callers
+        if policy.is_stateful:  # its recurrent state belongs to one episode, and a server has many callers
             raise RequestError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}", NEEDS)
         return policy
 
@@ -267,12 +267,12 @@ def _serve(name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> _Serv
     canary: _Canary | None = None
     if plan.canary is not None:
         policy = versions.get(plan.version_of(plan.canary.version) or "")
-        canary = None if policy is None else _Canary(policy, plan.canary.share, policy.episodic)
+        canary = None if policy is None else _Canary(policy, plan.canary.share, policy.is_stateful)
     shadow: Shadow | None = None
     if plan.shadow is not None:
         policy = versions.get(plan.version_of(plan.shadow) or "")
         if policy is not None and policy is not default:
-            shadow = Shadow(default.contract.version, policy.contract.version, policy.twin())
+            shadow = Shadow(default.contract.version, policy.contract.version, policy.clone())
     return _Served(plan, versions, default, canary, shadow)
 
 
@@ -280,7 +280,7 @@ def _wants_batches(policy: Policy) -> bool:
     """Return whether single observations are computed together: the options say so, and nothing else goes in."""
     contract = policy.contract
     observed = leaf_specs(contract.observation_space, "obs")
-    return policy.options.micro_batch > 1 and not policy.episodic and len(contract.inputs) == len(observed)
+    return policy.options.micro_batch > 1 and not policy.is_stateful and len(contract.inputs) == len(observed)
 
 
 def _act(policy: Policy, obs: Observation, explore: bool = False, seed: int | None = None) -> Decision:
@@ -291,10 +291,10 @@ def _act(policy: Policy, obs: Observation, explore: bool = False, seed: int | No
     return Decision(step.action, contract.name, contract.version, infer_ms, step.batch, step.notices)
 
 
-def _draw(name: str, label: str | None, needs_session: bool) -> float:
+def _draw(name: str, label: str | None, needs_label: bool) -> float:
     """Return a number in [0, 1): the label's own, or without one a random one."""
     if label is None:
-        return 1.0 if needs_session else random.random()
+        return 1.0 if needs_label else random.random()
     digest = hashlib.blake2b(f"{name}/{label}".encode("utf-8", "surrogatepass"), digest_size=8).digest()
     return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
 

@@ -23,7 +23,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_grpc import Grpc
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.runtime.recurrent_state import Memory
+from rlservo.serve_app.runtime.recurrent_state import StateTensors
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan import PolicyPlan
 from rlservo.serve_app.versions.policy_store import PolicyStore
@@ -272,7 +272,7 @@ def steps(policy: Any, size: int, count: int = 4) -> list[Any]:
 def test_clients_act_as_in_process_where_the_step_is_limited(
     limited: Server, name: str, kind: type[PolicyClient | StreamClient], server_state: bool
 ) -> None:
-    here = limited.store.get(name).twin()
+    here = limited.store.get(name).clone()
     size = here.contract.observation_space.shape[0]  # type: ignore[union-attr]
     with kind(limited.url, name, server_state=server_state) as client:
         for _ in range(2):  # an episode's first action is limited by nothing
@@ -345,9 +345,9 @@ def test_what_the_robot_was_commanded_instead_is_what_the_next_step_is_measured_
 def test_a_reward_is_seen_where_nothing_else_is_remembered(versions: dict[str, Policy]) -> None:
     contract = versions["1"].contract
     reward = TensorSpec(name="reward", dtype="float32", shape=(-1,))
-    with_state = Memory(contract.model_copy(update={"inputs": (*contract.inputs, reward)}))
-    assert with_state.feed(None, 1, 2.5)["reward"] == 0  # an episode begins: nothing has been earned
-    alone = Memory(contract.model_copy(update={"inputs": (contract.inputs[0], reward), "state": ()}))
-    assert alone.feed(None, 1, 2.5)["reward"] == 2.5
+    with_state = StateTensors(contract.model_copy(update={"inputs": (*contract.inputs, reward)}))
+    assert with_state.inputs(None, 1, 2.5)["reward"] == 0  # an episode begins: nothing has been earned
+    alone = StateTensors(contract.model_copy(update={"inputs": (contract.inputs[0], reward), "state": ()}))
+    assert alone.inputs(None, 1, 2.5)["reward"] == 2.5
     with pytest.raises(RequestError, match="0 at an episode's start"):
-        alone.feed(None, 1, None)
+        alone.inputs(None, 1, None)

@@ -112,7 +112,7 @@ def test_a_stream_takes_places_too_and_gives_them_back(server: Server) -> None:
 def test_a_reset_that_is_refused_leaves_the_episode_as_it_was(
     server: Server, store: PolicyStore, refused: dict[str, Any], status: int
 ) -> None:
-    here = store.get("leaky").twin()
+    here = store.get("leaky").clone()
     expected = [here.act(OBS).tolist() for _ in range(2)]
     assert server.act("s", reset=True)[1]["action"] == pytest.approx(expected[0])
     assert server.act("s", reset=True, **refused)[0] == status
@@ -121,7 +121,7 @@ def test_a_reset_that_is_refused_leaves_the_episode_as_it_was(
 
 
 def test_a_stream_whose_reset_is_refused_goes_on(server: Server, store: PolicyStore) -> None:
-    here = store.get("leaky").twin()
+    here = store.get("leaky").clone()
     expected = [here.act(OBS).tolist() for _ in range(2)]
     with websockets.sync.client.connect(f"ws://127.0.0.1:{server.port}/v1/policies/leaky/stream?errors=keep") as socket:
         socket.recv()
@@ -195,5 +195,5 @@ def test_a_policy_alone_keeps_its_identity_wherever_it_is_loaded(
     one, same, other = (
         Policy.load(leaky_policy(tmp_path / str(number), seed=seed)) for number, seed in enumerate((1, 1, 2))
     )
-    assert one.identity == same.identity == one.twin().identity != other.identity
+    assert one.identity == same.identity == one.clone().identity != other.identity
     assert one.identity.startswith("leaky/1#")

@@ -22,10 +22,10 @@ from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.server.api_keys import ACCESS, Access, access_of, grant, new_key
 from rlservo.serve_app.server.request_log import FIELDS
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 
 Serve = Callable[[Any], AbstractContextManager[int]]
-Controlled = Callable[..., AbstractContextManager[Control]]
+Controlled = Callable[..., AbstractContextManager[ReplicaVersions]]
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -125,7 +125,7 @@ class Wire:
 @dataclass(frozen=True)
 class Served:
     app: PolicyApp
-    control: Control
+    control: ReplicaVersions
     port: int
     kind: str
 

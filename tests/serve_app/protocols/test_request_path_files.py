@@ -98,4 +98,4 @@ def test_a_json_request_passes_at_most_nine_files_between_socket_and_network(ur5
     passed = asyncio.run(scenario())
     assert passed.reached_network
     assert len(passed.files) <= MOST_FILES, list(passed.files)
-    assert list(passed.files)[-1] == "serve_app/runtime/observations.py"  # what is nearest to the network
+    assert list(passed.files)[-1] == "serve_app/runtime/leaf_observations.py"  # what is nearest to the network

@@ -160,7 +160,7 @@ def test_a_served_policy_has_its_options_and_says_what_they_did(
 
 
 def test_integer_boxes_of_their_dtypes_own_range_need_no_look() -> None:
-    from rlservo.serve_app.runtime.observations import LeafParser
+    from rlservo.serve_app.runtime.leaf_observations import LeafParser
 
     image = LeafParser("p", BoxSpec(shape=(4, 4), dtype="uint8", low=0, high=255))
     assert not image._bounded

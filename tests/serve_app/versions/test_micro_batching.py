@@ -353,7 +353,7 @@ def test_the_next_store_goes_on_with_the_batchers_of_the_policies_it_keeps(polic
     assert asyncio.run(batcher.compute({"obs": OBS[:1]})).outputs["action"].shape == (1, 6)
     after = store_of(kept, replaces=first).batcher_of(kept)
     assert after is batcher and after.observations == 1  # the counts are Prometheus counters: they do not start again
-    other = kept.twin()
+    other = kept.clone()
     assert store_of(other, replaces=first).batcher_of(other) is not batcher
 
 
