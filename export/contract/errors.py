@@ -28,6 +28,7 @@ them to exit codes.
     │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
     │   ├── LateError             late                     the observation waited too long: send a newer one
     │   └── PartlyAppliedError    partly-applied           a change that some replicas could not follow
+    ├── InternalError             internal                 the server's own fault: its log says more
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
 """
 
@@ -210,6 +211,12 @@ class RefusedError(ConflictError):
     """A version or a configuration cannot be served, so what ran before goes on."""
 
     code = "version-refused"
+
+
+class InternalError(RlservoError):
+    """The server failed, by a fault of its own."""
+
+    code = "internal"
 
 
 class UsageError(RlservoError):

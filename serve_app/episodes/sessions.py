@@ -153,9 +153,9 @@ class Sessions:
         if session is None:
             self.lost[name] += 1
             raise SessionLostError(
-                f"this server has no session '{shown(session_id)}' of policy '{name[:64]}': it was never begun, was "
+                f"this server has no session '{shorten(session_id)}' of policy '{name[:64]}': it was never begun, was "
                 f"ended, was idle for {self._idle_s:g} s, or ended with its process or its version: begin an episode",
-                {"session_id": shown(session_id), "policy": name[:64]},
+                {"session_id": shorten(session_id), "policy": name[:64]},
             )
         session.used = time.monotonic()
         sessions.move_to_end(key)
@@ -213,6 +213,6 @@ class Sessions:
             self._sweep_later()
 
 
-def shown(session_id: SessionId) -> str:
+def shorten(session_id: SessionId) -> str:
     """Return an id as an error's sentence may show it."""
     return str(session_id)[:64]

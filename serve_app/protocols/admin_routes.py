@@ -1,7 +1,8 @@
 """Administration over HTTP: load, unload, alias, rollback, canary, shadow, on every replica at once.
 
-Every command answers when all replicas serve the change, or says which do not and why. `api_keys.Guard` lets nobody in
-without an admin key. The Open Inference Protocol's `load` and `unload` are two of these under other names.
+Every command answers when all replicas serve the change, or says which do not and why. `request_checks.Authorizer`
+lets nobody in without an admin key. The Open Inference Protocol's `load` and `unload` are two of these under other
+names.
 """
 
 from __future__ import annotations
@@ -16,13 +17,16 @@ from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from rlservo.export.contract.errors import RequestError, RlservoError
-from rlservo.serve_app.protocols import json_messages, oip_infer
-from rlservo.serve_app.protocols.http_endpoint import KEY, json_only, peer_of, request_id
+from rlservo.serve_app.protocols.http_endpoint import KEY, peer_of
 from rlservo.serve_app.protocols.http_errors import error_models
+from rlservo.serve_app.protocols.json_messages import encode_json
+from rlservo.serve_app.protocols.media_types import accept_json
+from rlservo.serve_app.protocols.oip_infer import accept_media_type
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_log import administered
+from rlservo.serve_app.server.request_checks import HEADERS, REQUEST_ID, header_text
+from rlservo.serve_app.server.request_log import write_change
 from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
 from rlservo.serve_app.versions.replica_versions import Change, ReplicaVersions
@@ -86,17 +90,17 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
             summary=summary,
             response_model=Changed,
             responses=errors,
-            dependencies=[Depends(json_only)],
+            dependencies=[Depends(accept_json)],
         )
 
     async def apply(request: Request, what: str, command: Awaitable[Plan]) -> Plan:
         key = request.scope.get(KEY)
         log = partial(
-            administered,
+            write_change,
             what,
             key="" if key is None else key.label,
             peer=peer_of(request.scope),
-            request_id=request_id(request.scope),
+            request_id=header_text(request.scope[HEADERS], REQUEST_ID),
         )
         try:
             after = await command
@@ -172,7 +176,7 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
             summary=summary,
             response_class=Response,
             responses=errors,
-            dependencies=[Depends(oip_infer.media_type)],
+            dependencies=[Depends(accept_media_type)],
         )
 
     # As a Triton that serves what its configuration pins: loading changes what clients get only where the model was not
@@ -203,4 +207,4 @@ def _answer(name: str, after: Plan) -> Response:
         "canary": policy.canary and policy.canary.model_dump(),
         "shadow": policy.shadow,
     }
-    return Response(json_messages.encode_json(document), media_type="application/json")
+    return Response(encode_json(document), media_type="application/json")

@@ -21,7 +21,8 @@ from ray.serve import Application, Deployment
 from ray.serve.config import HTTPOptions, gRPCOptions
 
 from rlservo.export.contract.errors import PartlyAppliedError, RlservoError
-from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import InferenceService
 from rlservo.serve_app.ray_serve import ingress, ray_parts
 from rlservo.serve_app.ray_serve.autoscaling import BUSY, Load
@@ -157,10 +158,9 @@ class PolicyServer(InferenceService):
         )
         core: Core = app.state.core
         self._core = core
-        core.admission.age.watch()
+        core.admission.loop_clock.start()
         # By way of the module: Serve pickles this class with copies of the objects that it names.
-        ahead = self._settings.ahead_of_serve and _can_be_left_out()
-        ingress.door.open(app, core.admission.is_open, ahead=ahead)
+        ingress.bypass.install(app, answers=self._settings.ahead_of_serve and _can_bypass_serve())
         self.serve_grpc(core, local_only=is_loopback(self._host))
         return app
 
@@ -249,8 +249,8 @@ def _controller() -> Any:
     return ray_parts.find("ray.serve.context:_get_global_client")()._controller
 
 
-def _can_be_left_out() -> bool:
-    """Whether Serve's handling of a request can be: where Serve traces, it is to see every request.
+def _can_bypass_serve() -> bool:
+    """Whether Serve's handling of a request can be left out: where Serve traces, it is to see every request.
 
     A replica that stops then waits for its HTTP server alone, as ray 2.60's does; one that does not is asked.
     """

@@ -27,6 +27,8 @@ from uvicorn.protocols.http import auto
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
+from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites
+
 if TYPE_CHECKING:
     from starlette.types import Message, Receive, Scope, Send
     from websockets.frames import Frame
@@ -64,15 +66,17 @@ PRIVATE_OF_STREAMS = ("handle_cont", "handle_ping", "handle_pong")
 
 
 class TimedProtocol(HttpToolsProtocol):
-    """A connection that ends when one of its phases takes too long."""
+    """A connection that ends when one of its phases takes too long, and writes each reply at once."""
 
     _head_since: float | None = None  # since when a head is awaited; None while something else is
     _body_since = 0.0  # since when the request's body is awaited
     _timer: asyncio.TimerHandle | None = None
+    _replies: JoinedWrites
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first head."""
         super().connection_made(transport)
+        self._replies = JoinedWrites(transport)
         self._head_since = self.loop.time()
         self._timer = self.loop.call_later(CHECK_PERIOD_S, self._check_phase)
         # The kernel ends the connection, whoever else still holds it: uvicorn's WebSockets, too.
@@ -127,6 +131,9 @@ class TimedProtocol(HttpToolsProtocol):
             cycle.keep_alive = False
             if _has_body(cycle.scope):
                 app = _refuse_upgrade
+        if cycle.scope["method"] == "POST":  # of a HEAD there would be no body for its head to wait for
+            self._replies.head = None
+            cycle.transport = self._replies
         super()._start_asgi_task(cycle, app)
 
     def _check_phase(self) -> None:

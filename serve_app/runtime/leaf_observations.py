@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, first_line
 from rlservo.export.contract.spaces import BoxSpec, LeafSpec, iter_elements
-from rlservo.serve_app.runtime.drift import Drift
+from rlservo.serve_app.runtime.drift import EVERY, Drift
 from rlservo.serve_app.runtime.observation_faults import describe, describe_unequal, first_non_number, list_names
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.rounding import rounding_slack
@@ -39,7 +39,7 @@ class LeafParser:
         options: PolicyOptions = DEFAULT_OPTIONS,
         drift: Drift | None = None,
     ) -> None:
-        """`drift` gets every array that passed the checks, before it is clipped."""
+        """`drift` gets one in `EVERY` of the arrays that passed the checks, before it is clipped."""
         self._policy = policy
         self._name = name
         self._space = space
@@ -54,6 +54,7 @@ class LeafParser:
         self._bounded = isinstance(space, BoxSpec) and self._set_bounds(space)
         self._names = tuple(element.name for element in space.elements)
         self._drift = drift
+        self._until_drift = 1  # observations until the next one that is counted in
         self._named = bool(self._names) and len(set(self._names)) == len(self._names)
 
     def parse(self, obs: Any) -> tuple[NDArray[Any], bool, str]:
@@ -87,7 +88,10 @@ class LeafParser:
         elif self._choices is not None:
             self._check_range(array, *self._choices)
         if self._drift is not None:
-            self._drift.add(array)
+            self._until_drift -= 1
+            if not self._until_drift:
+                self._until_drift = EVERY
+                self._drift.add(array)
         if self._bounded:
             if values is not None and len(array) == 1:
                 checked = self._pick(values)

@@ -57,7 +57,7 @@ class Decision:
 class _Canary:
     policy: Policy
     share: float
-    needs_session: bool  # a stateful policy cannot change in the middle of an episode
+    needs_label: bool  # a stateful policy cannot change in the middle of an episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,15 +172,15 @@ class PolicyStore:
         except UnknownPolicyError:
             return ""
 
-    def choose(self, name: str, version: str | None, session: str | None) -> Policy:
-        """Return the policy that a request gets: as `get`, but where a canary runs, a share of the sessions get that.
+    def choose(self, name: str, version: str | None, label: str | None) -> Policy:
+        """Return the policy that a request gets: as `get`, but where a canary runs, a share of the labels get that.
 
-        All requests of a session get the same one, on every replica, for as long as the share does not change; a larger
+        All requests of a label get the same one, on every replica, for as long as the share does not change; a larger
         share keeps those it had. Raises what `get` raises.
         """
         if version is None:
             canary = self._find(name).canary
-            if canary is not None and _draw(name, session, canary.needs_session) < canary.share:
+            if canary is not None and _draw(name, label, canary.needs_label) < canary.share:
                 return canary.policy
         return self.get(name, version)
 
@@ -200,13 +200,13 @@ class PolicyStore:
         *,
         explore: bool = False,
         seed: int | None = None,
-        session: str | None = None,
+        label: str | None = None,
     ) -> Decision:
         """Decide for `obs`: an action for one observation, a batch for a batch.
 
         Raises UnknownPolicyError, UnknownVersionError and what `Policy.act` raises.
         """
-        return _act(self._stateless(name, version, session), obs, explore, seed)
+        return _act(self._stateless(name, version, label), obs, explore, seed)
 
     async def act_together(
         self,
@@ -214,14 +214,14 @@ class PolicyStore:
         version: str | None,
         obs: Observation,
         *,
-        session: str | None = None,
+        label: str | None = None,
         check: Callable[[], None] | None = None,
     ) -> Decision:
         """Decide as `act` does without exploring; with what else is there in one run where the policy's options say so.
 
         `check` is called again right before the network runs. Raises what it and `act` raise.
         """
-        policy = self._stateless(name, version, session)
+        policy = self._stateless(name, version, label)
         batcher = self._batchers.get(policy)
         if batcher is None:
             return _act(policy, obs)
@@ -244,8 +244,8 @@ class PolicyStore:
             for policy in served.versions.values():
                 policy.close()
 
-    def _stateless(self, name: str, version: str | None, session: str | None) -> Policy:
-        policy = self.choose(name, version, session)
+    def _stateless(self, name: str, version: str | None, label: str | None) -> Policy:
+        policy = self.choose(name, version, label)
         if policy.is_stateful:  # its recurrent state belongs to one episode, and a server has many callers
             raise StateNeededError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}")
         return policy
@@ -291,11 +291,11 @@ def _act(policy: Policy, obs: Observation, explore: bool = False, seed: int | No
     return Decision(step.action, contract.name, contract.version, infer_ms, step.batch, step.notices)
 
 
-def _draw(name: str, session: str | None, needs_session: bool) -> float:
-    """Return a number in [0, 1): the session's own, or without one a random one."""
-    if session is None:
-        return 1.0 if needs_session else random.random()
-    digest = hashlib.blake2b(f"{name}/{session}".encode("utf-8", "surrogatepass"), digest_size=8).digest()
+def _draw(name: str, label: str | None, needs_label: bool) -> float:
+    """Return a number in [0, 1): the label's own, or without one a random one."""
+    if label is None:
+        return 1.0 if needs_label else random.random()
+    digest = hashlib.blake2b(f"{name}/{label}".encode("utf-8", "surrogatepass"), digest_size=8).digest()
     return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
 
 

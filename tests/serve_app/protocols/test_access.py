@@ -17,7 +17,8 @@ from typing import Any
 
 import pytest
 
-from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.server.api_keys import ACCESS, Access, access_of, grant, new_key
 from rlservo.serve_app.server.request_log import FIELDS
 from rlservo.serve_app.server.settings import ServerSettings

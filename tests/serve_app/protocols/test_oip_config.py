@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_config import model_config, statistics
@@ -170,11 +171,12 @@ def test_a_run_that_several_requests_share_is_one_execution(store: PolicyStore) 
     async def crowd() -> list[Any]:
         batcher._several = True  # as if several had come in the turn before
         obs = np.zeros(27, np.float32)
-        return await asyncio.gather(*(core.act("gathered", None, obs, received=time.perf_counter()) for _ in range(6)))
+        requests = [Request("oip", "gathered", None, time.perf_counter(), obs=obs) for _ in range(6)]
+        return await asyncio.gather(*map(core.request_path.decide, requests))
 
     ran = batcher.runs
     for decision in asyncio.run(crowd()):
-        core.metrics.answered("oip", decision, 1, 0.001)
+        core.metrics.record_answer("oip", decision, 0.001)
     assert batcher.runs - ran == 1
     (found,) = statistics(core, "gathered")
     assert (found["inference_count"], found["execution_count"]) == (6, 1)

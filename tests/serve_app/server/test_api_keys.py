@@ -16,10 +16,11 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import InvalidStatus
 
-from rlservo.export.contract.errors import ForbiddenError, UsageError
+from rlservo.export.contract.errors import ForbiddenError, RequestError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.api_keys import Keys, Role, check_exposure, new_key
-from rlservo.serve_app.server.request_checks import Hosts, RequestChecks
+from rlservo.serve_app.server.api_key_file import CurrentKeys
+from rlservo.serve_app.server.api_keys import Access, Keys, Role, check_exposure, new_key
+from rlservo.serve_app.server.request_checks import Authorizer, Hosts, RequestChecks, fold_headers
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
@@ -188,6 +189,13 @@ def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served
             assert caught.value.response.status_code == 403
 
 
+def check(headers: list[tuple[bytes, bytes]], **settings: Any) -> None:
+    """Check a request with these headers against a server on loopback that wants no key."""
+    chosen = ServerSettings(**settings)
+    checks = RequestChecks(Hosts("127.0.0.1", chosen, keyed=False), Authorizer(CurrentKeys(chosen)))
+    checks.check({"type": "http", "method": "POST"}, fold_headers(headers), Access.act)
+
+
 @pytest.mark.parametrize(
     "page",
     [
@@ -197,16 +205,29 @@ def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served
     ],
 )
 def test_a_page_that_says_twice_where_it_is_from_is_refused(page: dict[bytes, list[bytes]]) -> None:
-    checks = RequestChecks(Hosts("127.0.0.1", ServerSettings(allowed_hosts="x"), keyed=False))
-    said = [(name, value) for name, values in page.items() for value in values]
+    headers = [(b"host", b"x"), *((name, value) for name, values in page.items() for value in values)]
     with pytest.raises(ForbiddenError):
-        checks.read({"type": "http", "method": "POST", "headers": [(b"host", b"x"), *said]})
+        check(headers, allowed_hosts="x")
 
 
 def test_a_page_has_no_origin_where_the_request_has_no_host() -> None:
-    checks = RequestChecks(Hosts("127.0.0.1", ServerSettings(), keyed=False))
     with pytest.raises(ForbiddenError):
-        checks.read({"type": "http", "method": "POST", "headers": [(b"origin", b"http://")]})
+        check([(b"origin", b"http://")])
+
+
+@pytest.mark.parametrize("hosts", [(b"127.0.0.1", b"127.0.0.1"), (b"127.0.0.1", b"evil.example")])
+@pytest.mark.parametrize("allowed", ["", "*"])
+def test_a_request_that_names_two_hosts_is_refused(hosts: tuple[bytes, bytes], allowed: str) -> None:
+    with pytest.raises(RequestError, match="two Host headers"):
+        check([(b"host", host) for host in hosts], allowed_hosts=allowed)
+
+
+def test_a_header_that_is_not_utf8_is_refused_also_where_another_of_its_name_comes_first() -> None:
+    with pytest.raises(RequestError, match="the header 'x-note' is not UTF-8"):
+        check([(b"x-note", b"fine"), (b"x-note", b"\xff")])
+    with pytest.raises(RequestError, match="the header 'x-note' is not UTF-8"):
+        check([(b"x-note", b"\xff")])
+    check([(b"x-note", "é".encode()), (b"x-note", b"fine")])
 
 
 def asked_as(host: str, listening_on: str, *, keyed: bool = False, allowed: str = "") -> bool:

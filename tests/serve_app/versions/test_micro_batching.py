@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from rlservo.export.contract.bundle import load_bundle, write_contract, write_golden
 from rlservo.export.contract.errors import ActionError, BundleError, DeadlineError, UsageError
 from rlservo.export.contract.spaces import BoxSpec
+from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.oip_grpc import Grpc
+from rlservo.serve_app.protocols.oip_grpc import OipGrpcCodec
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
@@ -222,7 +223,8 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
             return [unpack(await one.recv())["actions"] for one in opened]
 
     async def calls() -> list[Any]:
-        service = Grpc(create_app(lambda: store, ServerSettings()).state.core)
+        core = create_app(lambda: store, ServerSettings()).state.core
+        codec, answer = OipGrpcCodec(core), core.request_path.answer
         asked = messages.ModelInferRequest(model_name="ur5")
         asked.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
         requests = []
@@ -230,7 +232,8 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
             del asked.raw_input_contents[:]
             asked.raw_input_contents.append(row.tobytes())
             requests.append((asked.SerializeToString(), None))
-        return await asyncio.gather(*(service._infer(request, None, None) for request in requests))
+        now = time.perf_counter()
+        return await asyncio.gather(*(answer(codec, Request("grpc", "", None, now), one) for one in requests))
 
     with Policy.load(ur5) as alone, watched(store, store.get("ur5")) as sizes:
         expected = [alone.act(row) for row in OBS[:8]]
@@ -290,9 +293,10 @@ def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(s
 
     async def main() -> list[Any]:
         now = time.perf_counter()
-        hurried = core.act("ur5", None, OBS[0], received=now, deadline_ms=30.0)
-        patient = core.act("ur5", None, OBS[1], received=now, deadline_ms=30_000.0)
-        return await asyncio.gather(hurried, patient, slow(), return_exceptions=True)
+        hurried = Request("json", "ur5", None, now, obs=OBS[0], deadline_ms=30.0)
+        patient = Request("json", "ur5", None, now, obs=OBS[1], deadline_ms=30_000.0)
+        decide = core.request_path.decide
+        return await asyncio.gather(decide(hurried), decide(patient), slow(), return_exceptions=True)
 
     with watched(store, store.get("ur5")) as sizes:
         in_a_crowd(store)
