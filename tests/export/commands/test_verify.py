@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gymnasium
 import pytest
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from rich.console import Console
 
 from rlservo.export.commands.element_names import read_elements
@@ -78,6 +79,28 @@ def test_verify_drives_recurrent_and_nested_policies(
     assert evaluation.return_bundle == pytest.approx(evaluation.return_checkpoint, rel=1e-4)
     assert load_bundle(bundle).contract.evaluations == (evaluation,)
     assert not [file for file in bundle.iterdir() if file.name.startswith(".")]
+
+
+def test_verify_drives_where_the_actions_do_not_start_at_zero(
+    zoo: Path, tmp_path: Path, notices: list[str], toy: str
+) -> None:
+    exported = export_checkpoint(zoo / "started", tmp_path, notify=notices.append)
+    result = verify_bundle(exported.path, zoo / "started", env_id=toy, episodes=2, notify=notices.append)
+    assert result.evaluation is not None
+    assert result.evaluation.return_bundle == pytest.approx(result.evaluation.return_checkpoint, rel=1e-5)
+
+
+def test_an_interrupted_verification_writes_no_half_of_a_comparison(
+    zoo: Path, tmp_path: Path, notices: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    exported = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
+    monkeypatch.setattr(PendulumEnv, "step", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        verify_bundle(exported.path, zoo / "pendulum", env_id="Pendulum-v1", episodes=2, notify=notices.append)
+    assert read_contract(exported.path).evaluations == ()
 
 
 def test_verify_catches_another_checkpoint(zoo: Path, tmp_path: Path, notices: list[str]) -> None:
