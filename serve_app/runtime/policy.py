@@ -278,7 +278,8 @@ class Policy:
 
         It is onnxruntime's own `run`: what has been given to it is computed even when the policy is closed meanwhile.
         """
-        run, names = self._open().run, list(self._action_checks)
+        run: Callable[..., Sequence[Any]] = self._open().run  # an action is dense: no sparse tensors, no maps
+        names = list(self._action_checks)
         return lambda feed: dict(zip(names, run(names, feed), strict=True))
 
     def check_rows(self) -> None:

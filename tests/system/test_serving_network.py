@@ -23,7 +23,7 @@ import pytest
 from rlservo.export.contract.errors import UnauthenticatedError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.ray_serve.ingress import PROCESS
+from rlservo.serve_app.protocols.http_endpoint import PROCESS
 from rlservo.serve_app.ray_serve.processes import MARK
 from rlservo.serve_app.ray_serve.server_log import LOG_BYTES, cut_log
 from rlservo.serve_app.runtime.policy import Policy
