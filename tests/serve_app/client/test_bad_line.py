@@ -339,7 +339,7 @@ def test_a_server_that_is_away_is_unavailable_and_found_again(
             began = time.monotonic()
             with pytest.raises(UnavailableError):
                 client.act(obs)
-            assert time.monotonic() - began < 0.45
+            assert time.monotonic() - began < 1.0  # the deadline, and a busy machine
         line.upstream = port
         np.testing.assert_allclose(client.act(obs), store.get("ur5").act(obs), rtol=1e-5, atol=1e-6)
 
