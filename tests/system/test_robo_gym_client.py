@@ -14,6 +14,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,6 +31,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "robo_gym_client.py"
 ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")  # what the fixture robo_gym_python installs
 CLIENT = ("httpcore>=1.0.6", "pydantic>=2.6")
+EPISODE_STEPS = 600  # after which robo-gym ends an episode of the UR
 DOCUMENT = (ROOT / "examples" / "robo_gym.md").read_text()
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -177,6 +179,13 @@ def test_missing_policy_server_policy_or_room_is_one_sentence_and_leaves_nothing
         manager.close()
 
 
+def actions(url: str) -> int:
+    """Return for how many actions the policy server has been asked."""
+    with urllib.request.urlopen(f"{url}/metrics", timeout=60) as reply:
+        lines = reply.read().decode().splitlines()
+    return int(sum(float(line.split()[-1]) for line in lines if line.startswith("rlservo_requests_total{")))
+
+
 class SlowToStart(RobotServers):
     """A manager that takes its time, as robo-gym's own does."""
 
@@ -198,6 +207,7 @@ def test_ctrl_c_ends_with_130_and_no_simulator(
     process = subprocess.Popen(
         [str(robo_gym_python), str(EXAMPLE), *line],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(light_client)},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
     )  # fmt: skip
     try:
         deadline = time.monotonic() + 120
@@ -205,9 +215,15 @@ def test_ctrl_c_ends_with_130_and_no_simulator(
             assert process.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        time.sleep(0.5 if during == "start" else 15.0)  # long enough for an episode to end
+        if during == "start":
+            time.sleep(0.5)
+        else:
+            began = actions(url)
+            while actions(url) <= began + EPISODE_STEPS:  # then one has ended
+                assert time.monotonic() < deadline + 120
+                time.sleep(0.2)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=180)
         assert process.returncode == 130, err
         assert err.strip().splitlines()[-1] == "stopped"
         assert "Traceback" not in err

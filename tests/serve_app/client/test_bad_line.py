@@ -214,16 +214,16 @@ def test_a_late_reply_is_never_used_for_a_newer_observation(
 ) -> None:
     seen = ur5_observations(6)
     expected = [store.get("ur5").act(obs) for obs in seen]
-    with connected(kind, line, deadline_ms=150.0) as client:
+    with connected(kind, line, deadline_ms=300.0) as client:
         client.act(seen[0])
         for step in range(1, 6):
             if step % 2:
-                line.faults.append(("delay", 0.25))
+                line.faults.append(("delay", 0.5))
                 began = time.monotonic()
                 with pytest.raises(DeadlineError):
                     client.act(seen[step])
-                assert 0.1 < time.monotonic() - began < 0.24
-                time.sleep(0.15)  # it arrives now, before the next question
+                assert 0.2 < time.monotonic() - began < 0.49
+                time.sleep(0.3)  # it arrives now, before the next question
             else:
                 np.testing.assert_allclose(client.act(seen[step]), expected[step], rtol=1e-5, atol=1e-6)
         if isinstance(client, StreamClient):
@@ -340,7 +340,7 @@ def test_a_server_that_is_away_is_unavailable_and_found_again(
             began = time.monotonic()
             with pytest.raises(UnavailableError):
                 client.act(obs)
-            assert time.monotonic() - began < 0.45
+            assert time.monotonic() - began < 1.0  # the deadline, and a busy machine
         line.upstream = port
         np.testing.assert_allclose(client.act(obs), store.get("ur5").act(obs), rtol=1e-5, atol=1e-6)
 
