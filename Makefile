@@ -4,9 +4,9 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-# Unit tests: what starts no Ray, trains nothing, exports nothing and runs no command line.
+# Unit tests: what starts no Ray and no robot server or proxy, trains nothing and runs no command line.
 UNITS := tests/envs tests/serve_app tests/export/checkpoints/test_experiment.py tests/test_layout.py tests/test_package.py
-NOT_UNITS := --ignore=tests/envs/robot_server/test_manager.py
+NOT_UNITS := --ignore=tests/envs/robot_server/test_manager.py --ignore=tests/serve_app/ray_serve/test_haproxy_wrapper.py
 
 .PHONY: demo test quick check bench soak faults wheel setup clean
 
