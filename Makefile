@@ -4,13 +4,20 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test check bench soak faults wheel setup clean
+# Unit tests: what starts no Ray and no robot server or proxy, trains nothing and runs no command line.
+UNITS := tests/envs tests/serve_app tests/export/checkpoints/test_experiment.py tests/test_layout.py tests/test_package.py
+NOT_UNITS := --ignore=tests/envs/robot_server/test_manager.py --ignore=tests/serve_app/ray_serve/test_haproxy_wrapper.py
+
+.PHONY: demo test quick check bench soak faults wheel setup clean
 
 demo: setup  ## Export the two shipped checkpoints, serve them, drive both simulators; a table and a picture in demo/
 	$(BIN)/rlservo demo --out demo
 
-test: setup  ## All tests
-	$(BIN)/python -m pytest
+test: setup  ## All tests, in two processes
+	$(BIN)/python -m pytest -n 2
+
+quick: setup  ## Unit tests, in under a minute
+	$(BIN)/python -m pytest -n 2 -m "not slow and not serve and not trained" $(NOT_UNITS) $(UNITS)
 
 check: setup  ## Lint, format and types, as CI runs them
 	$(BIN)/python .ci/alias_stubs.py

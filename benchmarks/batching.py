@@ -40,7 +40,7 @@ from rich.table import Table
 
 from rlservo.export.commands.export import export_checkpoint
 from rlservo.export.contract.bundle import ONNX_FILE, Bundle, load_bundle
-from rlservo.export.contract.onnx_session import open_session
+from rlservo.export.contract.ort_session import open_ort_session
 from rlservo.serve_app.ray_serve.processes import free_ports
 from speed.loads import wrk
 from speed.servers import Exchange, Server, running
@@ -161,7 +161,7 @@ def quiet(_line: str) -> None:
 
 def measure_alone(bundle: Bundle) -> Alone:
     """Take turns, so that a busy moment meets both."""
-    session = open_session(bundle.path / ONNX_FILE, 1)
+    session = open_ort_session(bundle.path / ONNX_FILE, 1)
     recorded, _ = bundle.golden()
     one = {name: array[:1] for name, array in recorded.items()}
     sixteen = {name: np.resize(array, (ROBOTS, *array.shape[1:])) for name, array in recorded.items()}

@@ -1,7 +1,9 @@
-"""How often an estimate's interval covers the truth: repeated recordings of CartPole, estimated and counted.
+"""How often an estimate's interval covers the truth: repeated recordings, estimated and counted.
 
 Each repetition records so many episodes with one policy and estimates the return of others, whose true returns come
-from many episodes of their own. Run: python benchmarks/estimates.py
+from many episodes of their own. `--world linear` is a point pulled to 0, for fitted Q evaluation alone. Repetition i
+has the seed FIRST_SEED + i: seeds below 1000 were used when the limits of the estimates were chosen.
+Run: python benchmarks/estimates.py; python benchmarks/estimates.py --world linear --episodes 100
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ DIRECTION = np.array([0.05, 0.35, 2.2, 1.1])  # of a linear policy that balances
 BEHAVIOUR = 1.0
 TRUTH_EPISODES = 20_000
 LIMIT = 200  # steps of an episode
+FIRST_SEED = 1000
+LINEAR_GAIN, LINEAR_STEPS = 0.5, 10  # of the recorded policy in the linear world
 
 Probability = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Of pushing right, for observations `[rows, 4]`."""
@@ -108,19 +112,61 @@ def trajectories(
     return found
 
 
-def study(candidates: list[Candidate], recorded: Probability, episodes: int, repetitions: int) -> None:
+def study(candidates: list[Candidate], recorded: Probability, episodes: int, seeds: range) -> None:
     """Fill in the candidates' counts."""
     for candidate in candidates:
         candidate.truth = float(run_episodes(candidate.probability, TRUTH_EPISODES, 10**6)[2].mean())
-    for repetition in range(repetitions):
-        obs, actions, lengths = run_episodes(recorded, episodes, repetition)
-        rng = np.random.default_rng(repetition)
+    for seed in seeds:
+        obs, actions, lengths = run_episodes(recorded, episodes, seed)
+        rng = np.random.default_rng(seed)
         for candidate in candidates:
             made = trajectories(obs, actions, lengths, recorded, candidate)
             for one in importance_sampling(made, 1.0, rng):
                 candidate.count(one)
             if candidate.deterministic:
                 candidate.count(fitted_estimate(made, 1.0, rng))
+
+
+def linear_episodes(
+    gain: float, noise: float, episodes: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (positions, actions) `[episodes, steps]` of a point that earns -x^2 at x and moves by half its action."""
+    position = rng.normal(size=episodes)
+    positions, actions = [], []
+    for _ in range(LINEAR_STEPS):
+        action = -gain * position + noise * rng.normal(size=episodes)
+        positions.append(position)
+        actions.append(action)
+        position = position + 0.5 * action + 0.05 * rng.normal(size=episodes)
+    return np.array(positions).T, np.array(actions).T
+
+
+def linear_study(episodes: int, seeds: range) -> list[Candidate]:
+    """Return fitted Q's counts for policies that pull harder or weaker than the recorded one, which explores by noise.
+
+    The candidates differ from the one that the tests have (noise 0.5, pulls harder by 0.2), by which it was tuned.
+    """
+    found = []
+    for noise, shift in [(0.5, 0.2), (0.5, 0.0), (0.5, -0.3), (0.5, 0.5), (0.2, 0.2), (0.2, -0.1)]:
+        candidate = Candidate(f"recorded with noise {noise:g}, gain {LINEAR_GAIN + shift:g}", linear(0.0), True)
+        truth, _ = linear_episodes(LINEAR_GAIN + shift, 0.0, 10 * TRUTH_EPISODES, np.random.default_rng(10**6))
+        candidate.truth = float(-(truth**2).sum(axis=1).mean())
+        for seed in seeds:
+            rng = np.random.default_rng(seed)
+            positions, actions = linear_episodes(LINEAR_GAIN, noise, episodes, rng)
+            made = [
+                Trajectory(
+                    -(x**2),
+                    None,
+                    x[:, None].astype(np.float32),
+                    a[:, None].astype(np.float32),
+                    (-(LINEAR_GAIN + shift) * x[:, None]).astype(np.float32),
+                )
+                for x, a in zip(positions, actions, strict=True)
+            ]
+            candidate.count(fitted_estimate(made, 1.0, rng))
+        found.append(candidate)
+    return found
 
 
 def candidates_of_the_study() -> list[Candidate]:
@@ -142,9 +188,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--repetitions", type=int, default=100)
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
+    parser.add_argument("--world", choices=["cartpole", "linear"], default="cartpole")
     arguments = parser.parse_args()
-    candidates = candidates_of_the_study()
-    study(candidates, linear(BEHAVIOUR), arguments.episodes, arguments.repetitions)
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.repetitions)
+    if arguments.world == "linear":
+        candidates = linear_study(arguments.episodes, seeds)
+    else:
+        candidates = candidates_of_the_study()
+        study(candidates, linear(BEHAVIOUR), arguments.episodes, seeds)
     print(f"{arguments.repetitions} repetitions of {arguments.episodes} episodes; 95% intervals")
     for candidate in candidates:
         print(f"{candidate.name}: true return {candidate.truth:.1f}")

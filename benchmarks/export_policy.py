@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rlservo.export.contract.bundle import load_bundle
-from rlservo.export.contract.onnx_session import open_session
+from rlservo.export.contract.ort_session import open_ort_session
 from rlservo.serve_app.runtime.policy import Policy
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -80,7 +80,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         results["export"] = cost = export(Path(folder))
         bundle = load_bundle(folder)
-        policy, session = Policy.load(folder), open_session(bundle.onnx)
+        policy, session = Policy.load(folder), open_ort_session(bundle.onnx)
         rng = np.random.default_rng(0)
         for batch, calls in CALLS.items():
             obs = rng.standard_normal((batch, 27)).astype(np.float32)

@@ -119,7 +119,7 @@ def main() -> None:
 def warm_up() -> None:
     """Train once: an import on first use that the time limit cut off would break everything after it."""
     config = configuration("CartPole-v1", 0, 1, MINIBATCH)
-    with training_run.built(config.build_algo()) as algorithm:
+    with training_run.stopping(config.build_algo()) as algorithm:
         algorithm.train()
 
 
@@ -164,7 +164,7 @@ def measure(env: str, runners: int, envs: int, iterations: int, batch: int, limi
     taken: list[Iteration] = []
     time_limit = TimeLimit(limit)
     try:
-        with time_limit, training_run.built(configuration(env, runners, envs, batch).build_algo()) as algorithm:
+        with time_limit, training_run.stopping(configuration(env, runners, envs, batch).build_algo()) as algorithm:
             clock = Clock(algorithm)
             clock.iteration()  # the first one warms up
             for _ in range(iterations):

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -18,13 +17,6 @@ cluster = typer.Typer(
     help="Prepare a Ray cluster's nodes, and check them.",
     no_args_is_help=True,
 )
-
-
-class Format(str, Enum):
-    """For whom variables are printed."""
-
-    sh = "sh"
-    env_file = "env-file"
 
 
 @cluster.command("env")
@@ -41,7 +33,9 @@ def print_environment(
     one_machine: Annotated[
         bool, typer.Option("--one-machine", help="For ray start --head --node-ip-address 127.0.0.1: bind to loopback.")
     ] = False,
-    format: Annotated[Format, typer.Option(help="sh: to eval; env-file: for systemd and docker.")] = Format.sh,
+    format: Annotated[
+        Literal["sh", "env-file"], typer.Option(help="sh: to eval; env-file: for systemd and docker.")
+    ] = "sh",
 ) -> None:
     """Print the variables that `ray start` needs on every node.
 
@@ -50,15 +44,15 @@ def print_environment(
 
     Example: `eval "$(rlservo cluster env)" && ray start --head`
     """
-    given = {"stream_idle_s": stream_idle_s, "max_connections_per_address": max_connections_per_address}
+    options = {"stream_idle_s": stream_idle_s, "max_connections_per_address": max_connections_per_address}
     with terminal.needs_extra("serve"):
         from rlservo.serve_app.ray_serve.environment import cluster_environment
     variables = cluster_environment(
         haproxy_folder.expanduser().absolute(),
-        settings={name: value for name, value in given.items() if value is not None},
+        settings={name: value for name, value in options.items() if value is not None},
         one_machine=one_machine,
     )
-    write = _export if format is Format.sh else _assign
+    write = _export if format == "sh" else _assign
     print("\n".join(write(name, value) for name, value in variables.items()))
 
 
@@ -98,12 +92,12 @@ def check(
     """
     with terminal.needs_extra("serve"):
         from rlservo.serve_app.ray_serve.cluster_check import check_cluster
-    found: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = []
     for each in check_cluster(address, configuration=config, own=own or (), on_wait=terminal.note):
-        found.append({"check": each.name, "ok": each.ok, "message": each.message})
+        results.append({"check": each.name, "ok": each.ok, "message": each.message})
         if not as_json:
             print(f"{'ok     ' if each.ok else 'PROBLEM'}  {each.name}: {each.message}", flush=True)
-    is_well = all(each["ok"] for each in found)
+    is_well = all(each["ok"] for each in results)
     if as_json:
-        terminal.print_json({"ok": is_well, "checks": found})
+        terminal.print_json({"ok": is_well, "checks": results})
     raise typer.Exit(0 if is_well else 1)

@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.terminal import Json, needs_extra, note, print_json
 from rlservo.export.contract.errors import UsageError
-
-
-class Pick(str, Enum):
-    """Which end of a metric is the better one."""
-
-    max = "max"
-    min = "min"
 
 
 def export(
@@ -43,7 +35,9 @@ def export(
     metric: Annotated[
         str | None, typer.Option(help="Of a Tune trial or experiment, the checkpoint with the best of this metric.")
     ] = None,
-    mode: Annotated[Pick, typer.Option(help="Whether the best is the largest or the smallest.")] = Pick.max,
+    mode: Annotated[
+        Literal["max", "min"], typer.Option(help="Whether the best is the largest or the smallest.")
+    ] = "max",
     as_json: Json = False,
 ) -> None:
     """Turn an RLlib checkpoint into a policy bundle. It is proven equal to RLlib's own actions, or nothing is written.
@@ -51,21 +45,21 @@ def export(
     Examples: `rlservo export examples/checkpoints/ur5_positioning --out policies`,
     `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
     """
-    started = time.perf_counter()
+    start = time.perf_counter()
     if all_modules and (module_id is not None or agent_id is not None):
         raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
     with terminal.errors().status("importing") as status, ExitStack() as fetching:
         with needs_extra("train"):
             from rlservo.export.checkpoints.experiment import best_checkpoint
-            from rlservo.export.checkpoints.remote import fetched
+            from rlservo.export.checkpoints.remote import fetch
             from rlservo.export.commands.export import LOADING_RUNS_CODE, export_all_modules, export_checkpoint
             from rlservo.export.commands.report import export_report, peak_memory_mb
 
         if metric is not None:
             note(LOADING_RUNS_CODE.format(path=checkpoint))
-            local = fetching.enter_context(fetched(checkpoint, status.update))
-            best = best_checkpoint(local, metric, mode.value, app_dir=app_dir, notify=note)
-            note(f"{best.path} has the {mode.value} {metric}: {best.score:g}")
+            local = fetching.enter_context(fetch(checkpoint, status.update))
+            best = best_checkpoint(local, metric, mode, app_dir=app_dir, notify=note)
+            note(f"{best.path} has the {mode} {metric}: {best.score:g}")
             checkpoint = str(best.path)
         if all_modules:
             results = export_all_modules(
@@ -92,7 +86,7 @@ def export(
                 progress=status.update,
             )
             results = [one]
-    cost = {"seconds": round(time.perf_counter() - started, 2), "peak_memory_mb": round(peak_memory_mb())}
+    cost = {"seconds": round(time.perf_counter() - start, 2), "peak_memory_mb": round(peak_memory_mb())}
     if as_json:
         documents = [
             {"path": str(result.path), "contract": result.contract.model_dump(mode="json"), **cost}
@@ -134,14 +128,14 @@ def inspect(
     """
     from rlservo.export.contract.bundle import load_bundle
 
-    loaded = load_bundle(bundle)
+    contents = load_bundle(bundle)
     if as_json:
-        print_json(loaded.contract.model_dump(mode="json"))
+        print_json(contents.contract.model_dump(mode="json"))
     else:
         from rlservo.export.commands.report import contract_report
 
-        terminal.output().print(contract_report(loaded.contract))
-        terminal.output().print(f"{loaded.path}: all hashes match", markup=False, highlight=False, soft_wrap=True)
+        terminal.output().print(contract_report(contents.contract))
+        terminal.output().print(f"{contents.path}: all hashes match", markup=False, highlight=False, soft_wrap=True)
 
 
 def verify(

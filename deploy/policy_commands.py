@@ -49,8 +49,8 @@ def list_policies(url: Url = LOCAL, key_file: KeyFile = None, as_json: Json = Fa
         for sentence in replica["behind"]:
             terminal.output().print(f"behind: {sentence}", style="red", markup=False, highlight=False, soft_wrap=True)
         if replica["refused"] is not None:
-            refused = f"refused: {replica['refused']['change']} at {replica['refused']['at']}: "
-            terminal.output().print(refused + replica["refused"]["reason"], style="red", markup=False, highlight=False)
+            refusal = f"refused: {replica['refused']['change']} at {replica['refused']['at']}: "
+            terminal.output().print(refusal + replica["refused"]["reason"], style="red", markup=False, highlight=False)
 
 
 @policy.command()
@@ -193,34 +193,34 @@ def served_config(
 
     Raises UsageError.
     """
-    document = _read_config(file) if file is not None else {}
+    document = _load_config(file) if file is not None else {}
     policies = document.setdefault("policies", {})
 
     def of(name: str) -> dict[str, Any]:
         entry: dict[str, Any] = policies.setdefault(name, {})
         return entry
 
-    for given in versions or ():
-        name, listed = _pair(given, "ur5=3,4")
-        of(name)["versions"] = listed.split(",")
-    for given in aliases or ():
-        name, pair = _of_policy(given, "ur5:production=3")
+    for text in versions or ():
+        name, numbers = _pair(text, "ur5=3,4")
+        of(name)["versions"] = numbers.split(",")
+    for text in aliases or ():
+        name, pair = _of_policy(text, "ur5:production=3")
         key, version = _pair(pair, "ur5:production=3")
         of(name).setdefault("aliases", {})[key] = version
-    for given in canaries or ():
-        name, pair = _of_policy(given, "ur5:candidate=0.1")
+    for text in canaries or ():
+        name, pair = _of_policy(text, "ur5:candidate=0.1")
         version, share = _share(pair)
         of(name)["canary"] = {"version": version, "share": share}
-    for given in shadows or ():
-        name, version = _pair(given, "ur5=candidate")
+    for text in shadows or ():
+        name, version = _pair(text, "ur5=candidate")
         of(name)["shadow"] = version
     return document
 
 
-def _read_config(file: Path) -> dict[str, Any]:
+def _load_config(file: Path) -> dict[str, Any]:
     text = file.read_text(encoding="utf-8", errors="replace")
     try:
-        document = json.loads(text) if file.suffix == ".json" else _read_yaml(text)
+        document = json.loads(text) if file.suffix == ".json" else _parse_yaml(text)
     except ValueError as error:
         raise UsageError(f"{file} cannot be read: {' '.join(str(error).split())[:300]}") from None
     if not isinstance(document, dict) or not isinstance(document.get("policies", {}), dict):
@@ -228,7 +228,7 @@ def _read_config(file: Path) -> dict[str, Any]:
     return document
 
 
-def _read_yaml(text: str) -> Any:
+def _parse_yaml(text: str) -> Any:
     try:
         import yaml
     except ModuleNotFoundError:
@@ -239,17 +239,17 @@ def _read_yaml(text: str) -> Any:
         raise ValueError(str(error)) from None
 
 
-def _pair(given: str, example: str) -> tuple[str, str]:
-    left, equals, right = given.partition("=")
-    if not left or not equals:
-        raise UsageError(f"{given!r}: expected for example {example}")
-    return left, right
+def _pair(text: str, example: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not key or not equals:
+        raise UsageError(f"{text!r}: expected for example {example}")
+    return key, value
 
 
-def _of_policy(given: str, example: str) -> tuple[str, str]:
-    name, colon, rest = given.partition(":")
+def _of_policy(text: str, example: str) -> tuple[str, str]:
+    name, colon, rest = text.partition(":")
     if not name or not colon:
-        raise UsageError(f"{given!r}: expected for example {example}")
+        raise UsageError(f"{text!r}: expected for example {example}")
     return name, rest
 
 

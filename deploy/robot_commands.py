@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from enum import Enum
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -19,16 +18,9 @@ robot_server = typer.Typer(
 )
 
 
-class ClockKind(str, Enum):
-    """When a control cycle ends."""
-
-    fast = "fast"
-    real = "real"
-
-
 Host = Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for clients on other machines.")]
 Clock = Annotated[
-    ClockKind,
+    Literal["fast", "real"],
     typer.Option(help="fast: a cycle takes what its simulation takes; real: its time on the wall, as on the robot."),
 ]
 RobotPort = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free one.")]
@@ -57,7 +49,7 @@ def robot_server_ur(
     ),
     host: Host = "127.0.0.1",
     port: RobotPort = 50051,
-    clock: Clock = ClockKind.fast,
+    clock: Clock = "fast",
     gui: Gui = False,
     seed: Seed = None,
 ) -> None:
@@ -72,7 +64,7 @@ def robot_server_ur(
         settings = URSettings(
             host=host,
             port=port,
-            clock=clock.value,
+            clock=clock,
             gui=gui,
             seed=seed,
             ur_model=ur_model,
@@ -92,7 +84,7 @@ def robot_server_mir100(
     world: Annotated[str, typer.Option(help="empty or lab_6x8.")] = "empty",
     host: Host = "127.0.0.1",
     port: RobotPort = 50051,
-    clock: Clock = ClockKind.fast,
+    clock: Clock = "fast",
     gui: Gui = False,
     seed: Seed = None,
 ) -> None:
@@ -103,7 +95,7 @@ def robot_server_mir100(
     with _one_sentence_errors():
         from rlservo.envs.robot_server.settings import Mir100Settings
 
-        settings = Mir100Settings(host=host, port=port, clock=clock.value, gui=gui, seed=seed, world=world)
+        settings = Mir100Settings(host=host, port=port, clock=clock, gui=gui, seed=seed, world=world)
         _serve(settings, f"MiR100, world {world}, 10 Hz")
 
 
@@ -112,7 +104,7 @@ def server_manager(
     port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Port; without it the first free one of 50100 to 50199.")
     ] = None,
-    clock: Clock = ClockKind.fast,
+    clock: Clock = "fast",
     max_servers: Annotated[int, typer.Option(min=1, help="How many robot servers may run at once.")] = 100,
     orphan_timeout: Annotated[
         float, typer.Option(min=0.0, help="Seconds without a client after which a robot server ends; 0: never.")
@@ -128,13 +120,13 @@ def server_manager(
 
         def ready(bound: int) -> None:
             terminal.output().print(
-                f"server manager on {host}:{bound}, clock {clock.value}; Ctrl-C stops it", highlight=False
+                f"server manager on {host}:{bound}, clock {clock}; Ctrl-C stops it", highlight=False
             )
 
         serve_manager(
             host=host,
             port=port,
-            clock=clock.value,
+            clock=clock,
             max_servers=max_servers,
             orphan_s=orphan_timeout or None,
             on_ready=ready,

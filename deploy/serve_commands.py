@@ -4,32 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from rlservo.deploy import policy_commands, terminal
+from rlservo.deploy.terminal import Json, needs_extra, note, print_json
 from rlservo.export.contract.errors import UsageError
 
 if TYPE_CHECKING:
     from rlservo.serve_app.interface import ActingPolicy
-from rlservo.deploy.terminal import Json, needs_extra, note, print_json
 
 
-class Rate(str, Enum):
-    """How fast the loop runs."""
-
-    real = "real"
-    max = "max"
-
-
-class TransportKind(str, Enum):
-    """How to reach the server."""
-
-    http = "http"
-    ws = "ws"
+TransportKind = Literal["http", "ws"]
 
 
 def serve(
@@ -61,10 +49,10 @@ def serve(
     `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`
     """
     with needs_extra("serve"):
-        from rlservo.serve_app.ray_serve.launcher import Served, serve_policies
+        from rlservo.serve_app.ray_serve.launcher import RunningServer, serve_policies
         from rlservo.serve_app.wire.admin_key_file import key_file
 
-    def ready(served: Served) -> None:
+    def ready(served: RunningServer) -> None:
         for name, default in served.policies:
             terminal.output().print(
                 f"{served.url}/v1/policies/{name}  (version {default})", highlight=False, soft_wrap=True
@@ -106,12 +94,12 @@ def key(
     """
     from rlservo.serve_app.server.api_keys import new_key
 
-    made, line = new_key(label, admin=admin)
+    secret, line = new_key(label, admin=admin)
     if as_json:
-        print_json({"key": made, "line": line})
+        print_json({"key": secret, "line": line})
         return
     note("the key, for the client; it is not kept anywhere and not shown again:")
-    print(made)
+    print(secret)
     note("the line, for the server's key file (RLSERVO_API_KEYS_FILE):")
     print(line)
 
@@ -123,9 +111,9 @@ def rollout(
     bundle: Annotated[Path | None, typer.Option(help="Act in process with this bundle instead of a server.")] = None,
     episodes: Annotated[int, typer.Option(min=1)] = 10,
     seed: Annotated[int | None, typer.Option(help="Episode i is reset with seed + i.")] = None,
-    rate: Annotated[Rate, typer.Option(help="real: at the control rate, as on a robot; max: as fast as it goes.")] = (
-        Rate.max
-    ),
+    rate: Annotated[
+        Literal["real", "max"], typer.Option(help="real: at the control rate, as on a robot; max: as fast as it goes.")
+    ] = ("max"),
     explore: Annotated[bool, typer.Option("--explore", help="Sample actions instead of taking the mode.")] = False,
     env_arg: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
@@ -133,7 +121,7 @@ def rollout(
     video: Annotated[Path | None, typer.Option(help="Write the first episode to this .mp4 file.")] = None,
     transport: Annotated[
         TransportKind, typer.Option(help="http: JSON, a request per action; ws: one WebSocket.")
-    ] = TransportKind.http,
+    ] = "http",
     deadline_ms: Annotated[float | None, typer.Option(help="An action that takes longer is not used.")] = None,
     fallback: Annotated[
         str | None,
@@ -158,7 +146,7 @@ def rollout(
     """
     if (url is None) == (bundle is None):
         raise UsageError("give either --url (a server) or --bundle (in process)")
-    if bundle is not None and (fallback, deadline_ms, transport) != (None, None, TransportKind.http):
+    if bundle is not None and (fallback, deadline_ms, transport) != (None, None, "http"):
         raise UsageError("--transport, --deadline-ms and --fallback are for a server (--url)")
     if video is not None:
         choose_gl_backend()
@@ -172,7 +160,7 @@ def rollout(
             env,
             episodes=episodes,
             seed=seed,
-            rate=rate.value,
+            rate=rate,
             explore=explore,
             env_kwargs=parse_env_arguments(env_arg or []),
             video=video,
@@ -224,7 +212,7 @@ def _acting_policy(
         from rlservo.serve_app.client.policy_client import PolicyClient
         from rlservo.serve_app.client.stream_client import StreamClient
 
-    kind = StreamClient if transport is TransportKind.ws else PolicyClient
+    kind = StreamClient if transport == "ws" else PolicyClient
     return kind(str(url), name, deadline_ms=deadline_ms, server_state=server_state, api_key=api_key)
 
 

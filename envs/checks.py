@@ -82,8 +82,8 @@ def as_vector(name: str, value: Any, length: int) -> NDArray[np.float64]:
     return array
 
 
-def check_option_names(options: dict[str, Any], known: Sequence[str]) -> None:
+def check_option_names(options: dict[str, Any], names: Sequence[str]) -> None:
     """Raise InvalidResetError on a reset option that does not exist."""
     for name in options:
-        if name not in known:
-            raise InvalidResetError(f"reset option {name!r} does not exist: expected one of {', '.join(known)}")
+        if name not in names:
+            raise InvalidResetError(f"reset option {name!r} does not exist: expected one of {', '.join(names)}")

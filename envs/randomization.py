@@ -1,7 +1,6 @@
 """Domain randomisation: what a real robot adds to a simulator, drawn anew for each episode.
 
-A wrapper for every environment of this package. It knows nothing of tasks; payload needs a simulation that has
-`set_payload`, as the UR arms' have.
+A wrapper for every environment of this package; payload needs a simulation with `set_payload`, as the UR arms' have.
 """
 
 from __future__ import annotations
@@ -83,8 +82,8 @@ class DomainRandomization(gym.Wrapper[Array, Array, Array, Array]):
         observation, info = self.env.reset(seed=seed, options=options)
         self._actions = deque()
         self._observations = deque([observation] * (age + 1), maxlen=age + 1)
-        drawn = {"action_latency": self._delay, "observation_latency": age, "payload": mass}
-        return self._seen(), {**info, "randomization": drawn}
+        draws = {"action_latency": self._delay, "observation_latency": age, "payload": mass}
+        return self._next_observation(), {**info, "randomization": draws}
 
     def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
         """Give the environment the action of some cycles ago, and return what is seen by now."""
@@ -93,9 +92,9 @@ class DomainRandomization(gym.Wrapper[Array, Array, Array, Array]):
         self._actions.append(action)
         observation, reward, terminated, truncated, info = self.env.step(self._actions.popleft())
         self._observations.append(observation)
-        return self._seen(), reward, terminated, truncated, info
+        return self._next_observation(), reward, terminated, truncated, info
 
-    def _seen(self) -> Array:
+    def _next_observation(self) -> Array:
         observation = self._observations[0]
         if not self._noise.any():
             return observation
@@ -104,22 +103,22 @@ class DomainRandomization(gym.Wrapper[Array, Array, Array, Array]):
         assert isinstance(space, gym.spaces.Box)
         return np.clip(noisy, space.low, space.high).astype(observation.dtype)
 
-    def _standard_deviations(self, given: float | Sequence[float] | Mapping[str, float]) -> NDArray[np.float64]:
+    def _standard_deviations(self, value: float | Sequence[float] | Mapping[str, float]) -> NDArray[np.float64]:
         space = self.observation_space
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
             raise ValueError(f"the observation space is {space}: expected a Box of one dimension")
         size = space.shape[0]
-        if isinstance(given, Mapping):
+        if isinstance(value, Mapping):
             describe = getattr(self.env.unwrapped, "describe", None)
             names = [element["name"] for element in describe()["observation"]] if describe else []
-            unknown = [name for name in given if name not in names]
+            unknown = [name for name in value if name not in names]
             if unknown:
                 raise ValueError(
                     f"observation_noise names {', '.join(unknown)}: expected some of {', '.join(names) or 'no names'}"
                 )
-            noise = np.array([given.get(name, 0.0) for name in names], dtype=np.float64)
+            noise = np.array([value.get(name, 0.0) for name in names], dtype=np.float64)
         else:
-            noise = np.asarray(given, dtype=np.float64)
+            noise = np.asarray(value, dtype=np.float64)
             noise = np.full(size, float(noise)) if noise.ndim == 0 else noise
         if noise.shape != (size,):
             raise ValueError(f"observation_noise has shape {noise.shape}, expected one number or {size}")
@@ -128,15 +127,15 @@ class DomainRandomization(gym.Wrapper[Array, Array, Array, Array]):
         return noise
 
 
-def _range(name: str, given: Range) -> Range:
-    low, high = given
+def _range(name: str, value: Range) -> Range:
+    low, high = value
     if not (math.isfinite(low) and math.isfinite(high) and 0.0 <= low <= high):
-        raise ValueError(f"{name} is {tuple(given)}: expected (low, high) with 0 <= low <= high")
+        raise ValueError(f"{name} is {tuple(value)}: expected (low, high) with 0 <= low <= high")
     return float(low), float(high)
 
 
-def _cycles(name: str, given: tuple[int, int]) -> tuple[int, int]:
-    low, high = _range(name, given)
+def _cycles(name: str, value: tuple[int, int]) -> tuple[int, int]:
+    low, high = _range(name, value)
     if low != int(low) or high != int(high):
-        raise ValueError(f"{name} is {tuple(given)}: expected whole control cycles")
+        raise ValueError(f"{name} is {tuple(value)}: expected whole control cycles")
     return int(low), int(high)

@@ -33,7 +33,7 @@ BEGIN, END = "<!-- evaluate_shipped.py begins -->", "<!-- evaluate_shipped.py en
 
 
 @dataclass(frozen=True)
-class Measured:
+class Evaluation:
     """What one evaluation came to. Success is None where neither environment nor training.yaml says what it is."""
 
     start: str
@@ -60,28 +60,28 @@ def load_settings(name: str) -> dict[str, Any]:
     return settings
 
 
-def evaluate(policy: rlservo.Policy, settings: Mapping[str, Any], episodes: int, seed: int) -> list[Measured]:
+def evaluate(policy: rlservo.Policy, settings: Mapping[str, Any], episodes: int, seed: int) -> list[Evaluation]:
     """Run every evaluation of the settings with a loaded policy."""
-    measured = []
-    for wanted in settings["evaluation"]:
-        env_config = wanted.get("env_config", {})
+    evaluations = []
+    for setting in settings["evaluation"]:
+        env_config = setting.get("env_config", {})
         report = rlservo.rollout(policy, settings["env"], episodes=episodes, seed=seed, env_kwargs=env_config)
         if report.interrupted:
             raise KeyboardInterrupt
-        measured.append(_measured(wanted, env_config, report.episodes, seed))
-    return measured
+        evaluations.append(_summarise(setting, env_config, report.episodes, seed))
+    return evaluations
 
 
-def _measured(
-    wanted: Mapping[str, Any], env_config: dict[str, Any], rows: tuple[EpisodeRow, ...], seed: int
-) -> Measured:
-    threshold = wanted.get("success_return")
-    judged = [row.success if threshold is None else row.episode_return >= threshold for row in rows]
-    successes = None if None in judged else sum(bool(success) for success in judged)
+def _summarise(
+    setting: Mapping[str, Any], env_config: dict[str, Any], rows: tuple[EpisodeRow, ...], seed: int
+) -> Evaluation:
+    threshold = setting.get("success_return")
+    outcomes = [row.success if threshold is None else row.episode_return >= threshold for row in rows]
+    successes = None if None in outcomes else sum(bool(success) for success in outcomes)
     returns = np.array([row.episode_return for row in rows])
     margin = 1.96 * returns.std(ddof=1) / len(rows) ** 0.5 if len(rows) > 1 else float("nan")
-    return Measured(
-        start=wanted["start"],
+    return Evaluation(
+        start=setting["start"],
         env_config=env_config,
         episodes=len(rows),
         seed=seed,
@@ -95,13 +95,13 @@ def _measured(
     )
 
 
-def render(measured: list[Measured]) -> str:
+def render(evaluations: list[Evaluation]) -> str:
     """Return the Markdown table of a card."""
     lines = [
         "| start | episodes | success | 95% interval | mean return (95% interval) | worst | mean steps | endings |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for one in measured:
+    for one in evaluations:
         success, interval = "-", "-"
         if one.successes is not None and one.success_interval is not None:
             success = f"{one.successes / one.episodes:.1%}"
@@ -116,17 +116,17 @@ def render(measured: list[Measured]) -> str:
     return "\n".join(lines)
 
 
-def write_card(name: str, measured: list[Measured]) -> None:
+def write_card(name: str, evaluations: list[Evaluation]) -> None:
     """Put the figures into evaluation.json and, between the two marks, into the card."""
     folder = SHIPPED / name
-    document = json.dumps([asdict(one) for one in measured], indent=2)
+    document = json.dumps([asdict(one) for one in evaluations], indent=2)
     (folder / "evaluation.json").write_text(document + "\n", encoding="utf-8")
     card = folder / "README.md"
     before, begin, rest = card.read_text(encoding="utf-8").partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
         raise SystemExit(f"{card} has no place for the table: expected the lines {BEGIN} and {END}")
-    card.write_text(f"{before}{BEGIN}\n{render(measured)}\n{END}{after}", encoding="utf-8")
+    card.write_text(f"{before}{BEGIN}\n{render(evaluations)}\n{END}{after}", encoding="utf-8")
 
 
 def main() -> None:
@@ -151,16 +151,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as bundles:
         for name in names:
             try:
-                exported = rlservo.export_checkpoint(
+                bundle = rlservo.export_checkpoint(
                     args.checkpoint or SHIPPED / name, bundles, name=name, notify=lambda line: None
                 )
-                with rlservo.Policy.load(exported.path) as policy:
-                    measured = evaluate(policy, load_settings(name), args.episodes, args.seed)
+                with rlservo.Policy.load(bundle.path) as policy:
+                    evaluations = evaluate(policy, load_settings(name), args.episodes, args.seed)
             except rlservo.errors.RlservoError as error:
                 sys.exit(f"error: {name}: {error.message}")
-            print(f"{name}\n{render(measured)}\n", flush=True)
+            print(f"{name}\n{render(evaluations)}\n", flush=True)
             if args.write:
-                write_card(name, measured)
+                write_card(name, evaluations)
 
 
 if __name__ == "__main__":

@@ -55,16 +55,16 @@ def main() -> int:
             env_id, arguments = locate_robot(args)
             endings: list[str] = []
             seconds: list[float] = []  # from asking for an action to having it
-            interrupted = False
+            is_interrupted = False
             try:
                 with PolicyClient(args.url, args.policy or POLICIES[args.task]) as policy:
                     _ = policy.contract  # before a simulator is started for a policy that is not there
                     drive(env_id, arguments, policy, args.episodes, endings, seconds, None if args.json else out)
             except KeyboardInterrupt:
-                interrupted = True
+                is_interrupted = True
             if endings:
-                write_report(out, summary(env_id, endings, seconds, interrupted), as_json=args.json)
-            if interrupted:
+                write_report(out, summary(env_id, endings, seconds, is_interrupted), as_json=args.json)
+            if is_interrupted:
                 raise KeyboardInterrupt
         except KeyboardInterrupt:
             print("stopped", file=sys.stderr)
@@ -107,9 +107,9 @@ def parse_arguments() -> argparse.Namespace:
 def report_only_on_stdout() -> Iterator[TextIO]:
     """Give standard output for the report; whatever else writes there, children too, goes to standard error."""
     sys.stdout.flush()
-    kept = os.dup(1)
+    stdout = os.dup(1)
     os.dup2(2, 1)
-    with os.fdopen(kept, "w", encoding="utf-8") as out:
+    with os.fdopen(stdout, "w", encoding="utf-8") as out:
         yield out
         # Standard output stays with standard error: robo-gym prints once more when its environment is collected.
 
@@ -181,7 +181,7 @@ def drive(
     """
     env: Any = None
     try:
-        with interrupts_held(), sentences(f"{env_id} could not be started"):
+        with hold_interrupts(), sentences(f"{env_id} could not be started"):
             env = gym.make(env_id, disable_env_checker=True, **arguments).unwrapped
         for number in range(1, episodes + 1):
             endings.append(drive_one_episode(env, policy, seconds))
@@ -189,7 +189,7 @@ def drive(
                 print(f"episode {number}: {endings[-1]}", file=out, flush=True)
     finally:
         if hasattr(env, "kill_sim"):  # robo-gym's own; its UR environments' `close` leaves the simulator
-            with interrupts_held():
+            with hold_interrupts():
                 end_simulator(env)
 
 
@@ -210,17 +210,17 @@ def drive_one_episode(env: gym.Env[Any, Any], policy: PolicyClient, seconds: lis
 
 
 @contextlib.contextmanager
-def interrupts_held() -> Iterator[None]:
+def hold_interrupts() -> Iterator[None]:
     """Let Ctrl-C and SIGTERM wait for the end of a call: robo-gym's client swallows them and tries ten times."""
-    arrived: list[int] = []
+    signals: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda number, _frame: arrived.append(number)) for number in numbers]
+    before = [signal.signal(number, lambda number, _frame: signals.append(number)) for number in numbers]
     try:
         yield
     finally:
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
-    if arrived:
+    if signals:
         raise KeyboardInterrupt
 
 
@@ -246,7 +246,7 @@ def end_simulator(env: Any) -> None:
     env.expect_sim_running = False  # or `__del__` tries ten times more
 
 
-def summary(env_id: str, endings: list[str], seconds: list[float], interrupted: bool) -> dict[str, Any]:
+def summary(env_id: str, endings: list[str], seconds: list[float], is_interrupted: bool) -> dict[str, Any]:
     """Return the report of the episodes that ended."""
     p50, p95, p99 = (1000.0 * np.percentile(seconds, [50, 95, 99])).tolist()
     return {
@@ -256,7 +256,7 @@ def summary(env_id: str, endings: list[str], seconds: list[float], interrupted: 
         "endings": {ending: endings.count(ending) for ending in sorted(set(endings))},
         "steps": len(seconds),
         "latency_ms": {"p50": p50, "p95": p95, "p99": p99},
-        "interrupted": interrupted,
+        "interrupted": is_interrupted,
     }
 
 

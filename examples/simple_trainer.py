@@ -117,19 +117,19 @@ def argument_parser() -> argparse.ArgumentParser:
     faults.add_argument("--max-num-env-runner-restarts", type=int, default=1000, help="then the training fails")
     faults.add_argument("--max-failures", type=int, default=0, help="times a failed trial goes on from its checkpoint")
 
-    seen = parser.add_argument_group("what is written")
-    seen.add_argument("--storage", type=Path, default=Path("runs"), help="folder for results and checkpoints")
-    seen.add_argument("--checkpoint-frequency", type=int, default=5, help="iterations between checkpoints")
-    seen.add_argument("--evaluation-interval", type=int, default=0, help="iterations between evaluations; 0 is none")
-    seen.add_argument("--evaluation-duration", type=int, default=10, help="episodes of an evaluation")
-    seen.add_argument("--evaluation-num-env-runners", type=int, default=0, help="further cores for it; 0: the driver")
-    seen.add_argument(
+    group = parser.add_argument_group("what is written")
+    group.add_argument("--storage", type=Path, default=Path("runs"), help="folder for results and checkpoints")
+    group.add_argument("--checkpoint-frequency", type=int, default=5, help="iterations between checkpoints")
+    group.add_argument("--evaluation-interval", type=int, default=0, help="iterations between evaluations; 0 is none")
+    group.add_argument("--evaluation-duration", type=int, default=10, help="episodes of an evaluation")
+    group.add_argument("--evaluation-num-env-runners", type=int, default=0, help="further cores for it; 0: the driver")
+    group.add_argument(
         "--log-level", choices=["DEBUG", "INFO", "WARN", "ERROR"], default="ERROR", help="RLlib's and Ray's"
     )
-    seen.add_argument("--output", type=Path, help="folder for episode traces: what was seen, done and earned")
-    seen.add_argument("--export", type=Path, help="folder for the best checkpoint's bundle; default: STORAGE/policies")
-    seen.add_argument("--no-export", action="store_true", help="end with the checkpoint")
-    seen.add_argument("--episodes", type=int, default=10, help="episodes with the bundle afterwards")
+    group.add_argument("--output", type=Path, help="folder for episode traces: what was seen, done and earned")
+    group.add_argument("--export", type=Path, help="folder for the best checkpoint's bundle; default: STORAGE/policies")
+    group.add_argument("--no-export", action="store_true", help="end with the checkpoint")
+    group.add_argument("--episodes", type=int, default=10, help="episodes with the bundle afterwards")
 
     sweep = parser.add_argument_group("hyper-parameter sweep")
     sweep.add_argument("--sweep", action="append", default=[], metavar="NAME=V1,V2,...", help="try each value")
@@ -140,11 +140,11 @@ def argument_parser() -> argparse.ArgumentParser:
     sweep.add_argument("--metric", default=RETURN, help="what the best checkpoint has most of")
     sweep.add_argument("--mode", choices=["max", "min"], default="max", help="or least")
     for old in OLD_ARGUMENTS:
-        parser.add_argument(old, nargs="?", action=_Renamed, help=argparse.SUPPRESS, default=argparse.SUPPRESS)
+        parser.add_argument(old, nargs="?", action=_NewName, help=argparse.SUPPRESS, default=argparse.SUPPRESS)
     return parser
 
 
-class _Renamed(argparse.Action):
+class _NewName(argparse.Action):
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
         parser.error(f"{option_string} is of older versions: use {OLD_ARGUMENTS[str(option_string)]}")
 
@@ -227,11 +227,11 @@ def check_machine(run: Run, config: AlgorithmConfig | None = None, concurrent: i
     request = [bundle for bundle in (driver, *others) if any(bundle.values())]
     machine = Room("this machine", ({"CPU": os.cpu_count() or 1, "GPU": gpus},))
     resources.check_room(request, machine, config=config)
-    ray_has = Room("this machine", ({"CPU": session_cores(run), "GPU": math.ceil(run.num_gpus)},))
+    ray_has = Room("this machine", ({"CPU": ray_cores(run), "GPU": math.ceil(run.num_gpus)},))
     resources.check_room(run.request, ray_has, config=config, concurrent=concurrent)
 
 
-def session_cores(run: Run) -> int:
+def ray_cores(run: Run) -> int:
     """Return the cores a private Ray is started with: of as many trials at once as the machine holds."""
     return run.num_cpus * max(1, (os.cpu_count() or 1) // run.num_cpus)
 
@@ -293,14 +293,14 @@ def observation_steps(space: Any, kind: str) -> Any:
     vector: choices one-hot, Dict and Tuple in the space's order, other images pixel by pixel. uint8 is not scaled.
     """
     flatten = not (isinstance(space, Box) and (len(space.shape) == 1 or _is_known_image(space)))
-    filtered = kind == "MeanStdFilter"
-    if filtered and (not isinstance(space, Box) or np.dtype(space.dtype).kind != "f"):
+    has_filter = kind == "MeanStdFilter"
+    if has_filter and (not isinstance(space, Box) or np.dtype(space.dtype).kind != "f"):
         raise UsageError(f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, {space} is none")
-    if not (flatten or filtered):
+    if not (flatten or has_filter):
         return None
 
     def build(env: Any, spaces: Any, device: Any) -> list[Any]:
-        return ([FlattenObservations()] if flatten else []) + ([MeanStdFilter()] if filtered else [])
+        return ([FlattenObservations()] if flatten else []) + ([MeanStdFilter()] if has_filter else [])
 
     return build
 
@@ -344,23 +344,23 @@ def set_up(args: argparse.Namespace) -> tuple[AlgorithmConfig, Run, list[str]]:
 
     Raises UsageError for an environment, a setting or a range that cannot be used.
     """
-    env_config = {name: value[0] for name, value in search_space.read_settings(args.env_arg, "--env-arg").items()}
+    env_config = {name: value[0] for name, value in search_space.parse_settings(args.env_arg, "--env-arg").items()}
     config = algorithm_config(args, inspect_environment(args, env_config), env_config)
-    fixed = search_space.read_settings(args.set, "--set")
-    if several := [name for name, values in fixed.items() if len(values) > 1]:
+    constants = search_space.parse_settings(args.set, "--set")
+    if several := [name for name, values in constants.items() if len(values) > 1]:
         raise UsageError(f"--set {several[0]}: expected one value; --sweep {several[0]}=... tries several")
-    search_space.apply(config, {name: values[0] for name, values in fixed.items()}, "--set")
+    search_space.apply(config, {name: values[0] for name, values in constants.items()}, "--set")
     search_space.validate(config)
     grid = {
-        name: tune.grid_search(values) for name, values in search_space.read_settings(args.sweep, "--sweep").items()
+        name: tune.grid_search(values) for name, values in search_space.parse_settings(args.sweep, "--sweep").items()
     }
-    space = search_space.read_search_space(args.search_space) if args.search_space else {}
-    if twice := sorted((set(grid) | set(space)) & set(fixed)) or sorted(set(grid) & set(space)):
+    space = search_space.load_search_space(args.search_space) if args.search_space else {}
+    if twice := sorted((set(grid) | set(space)) & set(constants)) or sorted(set(grid) & set(space)):
         raise UsageError(f"{twice[0]} is given twice, by --set, --sweep or --search-space: once is enough")
     search_space.apply(config, grid, "--sweep")
     search_space.apply(config, space, "--search-space")
-    combined = search_space.check_combinations(config, grid | space) or [config]
-    request = max(map(resources.request_of, combined), key=resources.size)
+    combinations = search_space.check_combinations(config, grid | space) or [config]
+    request = max(map(resources.request_of, combinations), key=resources.size)
     cpus, gpus = resources.size(request)
     run = Run(
         args.run,
@@ -411,11 +411,11 @@ def main() -> None:
     if args.resume:
         if more := sorted(explicit(sys.argv[1:]) - set(AFTER_RESUME)):
             raise UsageError(f"--resume goes on with the run as it was set up: leave --{more[0].replace('_', '-')} out")
-        run, _ = training_run.read_run(args.resume)
+        run, _ = training_run.load_run(args.resume)
         if args.address is None and run.request:  # runs of before have none
             check_machine(run)
         with training_run.ray_session(
-            num_cpus=session_cores(run),
+            num_cpus=ray_cores(run),
             num_gpus=run.num_gpus,
             address=args.address,
             log_level=run.rest["log_level"],
@@ -429,7 +429,7 @@ def main() -> None:
         if args.address is None:
             check_machine(run, config, args.max_concurrent_trials)
         with training_run.ray_session(
-            num_cpus=session_cores(run),
+            num_cpus=ray_cores(run),
             num_gpus=run.num_gpus,
             address=args.address,
             log_level=args.log_level,

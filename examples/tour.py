@@ -10,7 +10,6 @@ estimates, Q-values, policy and module state, export, and videos of the exported
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 import shutil
 import sys
@@ -23,18 +22,15 @@ import gymnasium as gym
 import numpy as np
 import shared.training_run as training_run
 from gymnasium.utils.env_checker import check_env
-from gymnasium.wrappers import RecordVideo
 from shared.training_run import RETURN, STEPS, Run
 
-from rlservo import Policy
+from rlservo import Policy, rollout
 from rlservo.deploy.serve_commands import choose_gl_backend
-from rlservo.serve_app.rollout.environment import control_rate_of
-from rlservo.serve_app.rollout.video import VideoFile
 
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
 SHIPPED = Path(__file__).resolve().parent / "checkpoints" / "ur5_positioning"
 ARROWS = "←↓→↑"  # FrozenLake's actions
-EXPLORED = 5_000  # steps on FrozenLake, after which it hardly explores any more
+EXPLORATION_STEPS = 5_000  # steps on FrozenLake, after which it hardly explores any more
 
 
 @dataclass(frozen=True)
@@ -69,7 +65,7 @@ def main() -> None:
     try:
         for stop in args.stops or stops:
             stops[stop](settings)
-    except training_run.Interrupted:
+    except training_run.InterruptError:
         raise KeyboardInterrupt from None  # a tour begins anew
 
 
@@ -102,55 +98,29 @@ def random_baseline(env_id: str, episodes: int, **arguments: Any) -> float:
     returns = []
     for episode in range(episodes):
         env.reset(seed=episode)
-        total, ended = 0.0, False
-        while not ended:
+        total, is_over = 0.0, False
+        while not is_over:
             _, reward, terminated, truncated, _ = env.step(env.action_space.sample())
-            total, ended = total + float(reward), terminated or truncated
+            total, is_over = total + float(reward), terminated or truncated
         returns.append(total)
     env.close()
     print(f"random actions: mean return {np.mean(returns):.2f} over {episodes} episodes")
     return float(np.mean(returns))
 
 
-class Mp4(RecordVideo[Any, Any, Any]):
-    """Gymnasium's RecordVideo, written with the ffmpeg that rlservo brings: moviepy cannot share its Pillow with us."""
-
-    def __init__(self, env: Any, video_folder: str, **arguments: Any) -> None:
-        with contextlib.suppress(gym.error.DependencyNotInstalled):  # looked for last, when all else is set
-            super().__init__(env, video_folder, **arguments)
-
-    def stop_recording(self) -> None:
-        """Write the frames that were recorded."""
-        path = Path(self.video_folder) / f"{self._video_name}.mp4"
-        with VideoFile(path, fps=self.frames_per_sec) as video:
-            for frame in self.recorded_frames:
-                video.add(cast(Any, frame))
-        self.recorded_frames, self.recording = [], False
-
-
 def film(settings: Settings, bundle: Path, env_id: str, **arguments: Any) -> None:
     """Run an episode with the exported policy, recorded."""
+    video = None
     with Policy.load(bundle) as policy:
-        made = gym.make(
-            env_id, render_mode="rgb_array" if settings.video else None, disable_env_checker=True, **arguments
-        )
-        env: Any = made
         if settings.video:
-            rate = control_rate_of(made, arguments, policy.contract)
-            shutil.rmtree(settings.out / "videos" / policy.contract.name, ignore_errors=True)
             folder = settings.out / "videos" / policy.contract.name
-            env = Mp4(made, str(folder), episode_trigger=lambda _: True, fps=round(rate or 10))
-        obs, _ = env.reset(seed=10_000)
-        policy.reset()
-        total, steps, ended = 0.0, 0, False
-        while not ended:
-            action = policy.act(obs)
-            obs, reward, terminated, truncated, _ = env.step(int(action) if action.ndim == 0 else action)
-            total, steps, ended = total + float(reward), steps + 1, terminated or truncated
-        env.close()
-    print(f"the exported policy: return {total:.2f} in {steps} steps")
-    if settings.video:
-        print(f"video: {next((settings.out / 'videos' / policy.contract.name).glob('*.mp4'))}")
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            video = folder / "episode.mp4"
+        (episode,) = rollout(policy, env_id, episodes=1, seed=10_000, env_kwargs=arguments, video=video).episodes
+    print(f"the exported policy: return {episode.episode_return:.2f} in {episode.steps} steps")
+    if video is not None:
+        print(f"video: {video}")
 
 
 # CartPole: PPO with Tune, as one trains in earnest.
@@ -209,7 +179,7 @@ def algorithm_state(checkpoint: Path) -> None:
     """Rebuild the whole algorithm, read its weights here and in every env runner, and write them back."""
     from ray.rllib.algorithms.algorithm import Algorithm
 
-    with training_run.built(Algorithm.from_checkpoint(str(checkpoint))) as algorithm:
+    with training_run.stopping(Algorithm.from_checkpoint(str(checkpoint))) as algorithm:
         weights = algorithm.get_module().get_state()
         for name, array in weights.items():
             print(f"  {name:40} {np.shape(array)}")
@@ -218,12 +188,12 @@ def algorithm_state(checkpoint: Path) -> None:
         print(f"env runners hold: {steps}")
         before = {name: np.array(array) for name, array in weights.items()}
         algorithm.get_module().set_state({name: array * 0.5 for name, array in before.items()})
-        halved = algorithm.get_module().get_state()
+        state = algorithm.get_module().get_state()
         name = next(iter(before))
-        print(f"{name} halved: {np.allclose(halved[name], before[name] * 0.5)}")
+        print(f"{name} halved: {np.allclose(state[name], before[name] * 0.5)}")
         algorithm.get_module().set_state(before)
-        evaluated = algorithm.evaluate()["env_runners"]["episode_return_mean"]
-        print(f"algorithm.evaluate(): mean return {evaluated:.1f}")
+        mean_return = algorithm.evaluate()["env_runners"]["episode_return_mean"]
+        print(f"algorithm.evaluate(): mean return {mean_return:.1f}")
 
 
 def distribution_and_value(checkpoint: Path, bundle: Path, obs: Any) -> None:
@@ -256,9 +226,9 @@ def graph_outputs(bundle: Path, obs: Any) -> dict[str, Any]:
     """Return every output of the exported graph for one observation: action, distribution, value or Q-values."""
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(str(bundle / "policy.onnx"), providers=["CPUExecutionProvider"])
-    names = [output.name for output in session.get_outputs()]
-    return dict(zip(names, session.run(names, {"obs": np.asarray(obs)[None]}), strict=True))
+    ort_session = onnxruntime.InferenceSession(str(bundle / "policy.onnx"), providers=["CPUExecutionProvider"])
+    names = [output.name for output in ort_session.get_outputs()]
+    return dict(zip(names, ort_session.run(names, {"obs": np.asarray(obs)[None]}), strict=True))
 
 
 # FrozenLake: DQN with RLlib's own Python API, for its Q-values.
@@ -310,16 +280,16 @@ def frozen_lake(settings: Settings) -> None:
     shutil.rmtree(log, ignore_errors=True)
     log.mkdir(parents=True)
     config.debugging(seed=1)
-    with training_run.ray_session(num_cpus=1), training_run.built(training_run.build(config)) as algorithm:
-        steps, arrived = 0, False  # one episode tells: without slipping, every episode of a policy is the same
-        while not (arrived and (settings.quick or steps >= EXPLORED)) and steps < 4 * EXPLORED:
+    with training_run.ray_session(num_cpus=1), training_run.stopping(training_run.build(config)) as algorithm:
+        steps, is_solved = 0, False  # one episode tells: without slipping, every episode of a policy is the same
+        while not (is_solved and (settings.quick or steps >= EXPLORATION_STEPS)) and steps < 4 * EXPLORATION_STEPS:
             result = algorithm.train()
             steps = result[STEPS]
-            arrived = result["evaluation"]["env_runners"]["episode_return_mean"] == 1.0
+            is_solved = result["evaluation"]["env_runners"]["episode_return_mean"] == 1.0
             mean = result["env_runners"].get("episode_return_mean", float("nan"))
             print(
                 f"{steps:6,.0f} steps, mean return {mean:.2f} while exploring; "
-                f"without, the goal is {'reached' if arrived else 'not reached'}",
+                f"without, the goal is {'reached' if is_solved else 'not reached'}",
                 flush=True,
             )
         checkpoint = Path(str(algorithm.save_to_path(str(log / "checkpoint"))))
@@ -360,8 +330,8 @@ def ur5(settings: Settings) -> None:
     with Policy.load(bundle) as policy:
         env = gym.make(UR5, disable_env_checker=True, **cast(Any, arguments))
         obs, _ = env.reset(seed=10_000)
-        ended, step = False, 0
-        while not ended:
+        is_over, step = False, 0
+        while not is_over:
             if step % 10 == 0:
                 out = graph_outputs(bundle, obs)
                 mean, log_std = np.split(out["action_dist_inputs"][0], 2)
@@ -370,7 +340,7 @@ def ur5(settings: Settings) -> None:
                     f"std {np.exp(log_std).round(2)}, sent {policy.act(obs).round(2)}"
                 )
             obs, _, terminated, truncated, _ = env.step(policy.act(obs))
-            ended, step = terminated or truncated, step + 1
+            is_over, step = terminated or truncated, step + 1
         env.close()
     film(settings, bundle, UR5, **arguments)
 

@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import logging
-import os
 import resource
 import shutil
 import sys
@@ -27,12 +25,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-# Said before Ray is imported, so that it holds for every process of the cluster that is started here.
-os.environ.setdefault("RAY_AUTH_MODE", "token")
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-
+import shared.ray_settings as ray_settings  # before Ray  # isort: skip
 import evaluate_shipped
-import ray
 import shared.resources as resources
 import torch
 import yaml
@@ -41,10 +35,11 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.tune.registry import get_trainable_cls
-from shared.training_run import main_with_sentences
+from shared.training_run import main_with_sentences, ray_session
 
 from rlservo import Policy, export_checkpoint
 
+assert ray_settings
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 MILESTONE = 0.95  # the success rate whose time is printed
 SUMS = ("episodes", "judged", "return", "length", "success")
@@ -96,8 +91,8 @@ def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any 
     chunks = [*(prev_episode_chunks or ()), episode]  # an episode is cut where a sampling phase ended
     total, length = sum(chunk.get_return() for chunk in chunks), sum(map(len, chunks))
     info = episode.get_infos(-1) or {}
-    success, judged = info.get("is_success", False), "is_success" in info
-    for key, value in zip(SUMS, (1, judged, total, length, success), strict=True):
+    success, judgements = info.get("is_success", False), "is_success" in info
+    for key, value in zip(SUMS, (1, judgements, total, length, success), strict=True):
         metrics_logger.log_value(("shipped", key), float(value), reduce="sum")
 
 
@@ -124,8 +119,8 @@ class Validation:
             algorithm.save_to_path(str(checkpoint))
             bundle = export_checkpoint(checkpoint, Path(folder), name="candidate", notify=lambda line: None)
             with Policy.load(bundle.path) as policy:
-                measured = evaluate_shipped.evaluate(policy, settings, self.episodes, self.seed)
-        return sum(one.successes or 0 for one in measured) / sum(one.episodes for one in measured)
+                evaluations = evaluate_shipped.evaluate(policy, settings, self.episodes, self.seed)
+        return sum(one.successes or 0 for one in evaluations) / sum(one.episodes for one in evaluations)
 
 
 def change_setting(settings: dict[str, Any], change: str) -> None:
@@ -158,13 +153,13 @@ def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
             recent.append(sums)
             while sum(one["episodes"] for one in recent) - recent[0]["episodes"] >= window:
                 recent.popleft()
-        count, judged, total, length, successes = (sum(one[key] for one in recent) for key in SUMS)
+        count, judgements, total, length, successes = (sum(one[key] for one in recent) for key in SUMS)
         yield Row(
             env_steps=int(result["num_env_steps_sampled_lifetime"]),
             episodes=episodes,
             mean_return=total / count if count else float("nan"),
             mean_length=length / count if count else float("nan"),
-            success=successes / judged if judged else float("nan"),
+            success=successes / judgements if judgements else float("nan"),
             wall_s=time.monotonic() - began,
             cpu_s=cpu_seconds() - cpu_before,
         )
@@ -197,8 +192,8 @@ def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
                     f"wall {row.wall_s:6.0f} s  CPU {row.cpu_s:6.0f} s",
                     flush=True,
                 )
-                filled = row.episodes >= stop["episodes"]
-                if filled and not reached_milestone and row.success >= MILESTONE:
+                is_full = row.episodes >= stop["episodes"]
+                if is_full and not reached_milestone and row.success >= MILESTONE:
                     reached_milestone = True
                     print(
                         f"{MILESTONE:.0%} success over {stop['episodes']} training episodes after {row.env_steps:,} "
@@ -206,15 +201,15 @@ def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
                     )
                 value = getattr(row, stop["metric"])
                 if validation is not None:
-                    if not filled or not validation.is_due(row):
+                    if not is_full or not validation.is_due(row):
                         value = float("-inf")
                     else:
                         value = validation.success(algorithm, settings)
                         print(f"{value:.1%} success of the exported policy over {validation.episodes} episodes")
-                if filled and value > best:
+                if is_full and value > best:
                     best = value
                     algorithm.save_to_path(str(checkpoint.resolve()))
-                if (filled and value >= stop["value"]) or row.env_steps >= stop["env_steps"]:
+                if (is_full and value >= stop["value"]) or row.env_steps >= stop["env_steps"]:
                     break
     except KeyboardInterrupt:
         print("interrupted: what has been reached is kept")
@@ -251,10 +246,10 @@ def install(name: str, folder: Path) -> None:
     """Replace the shipped checkpoint and curve by those of `folder`."""
     from rlservo.export.commands.prune import prune_checkpoint
 
-    pruned = folder / "pruned"
-    shutil.rmtree(pruned, ignore_errors=True)
-    prune_checkpoint(folder / "checkpoint", pruned, notify=print)
-    shutil.copytree(pruned, SHIPPED / name, dirs_exist_ok=True)
+    small = folder / "pruned"
+    shutil.rmtree(small, ignore_errors=True)
+    prune_checkpoint(folder / "checkpoint", small, notify=print)
+    shutil.copytree(small, SHIPPED / name, dirs_exist_ok=True)
     for curve in ("curve.csv", "curve.png"):
         shutil.copyfile(folder / curve, SHIPPED / name / curve)
 
@@ -284,12 +279,8 @@ def main() -> None:
     # Checkpoints hold functions of this file. Pickled by value, they load where it does not exist.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
     torch.set_num_threads(1)
-    # Never another cluster that runs on this machine.
-    ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-    try:
+    with ray_session(num_cpus=1):
         rows = train(settings, seed, folder)
-    finally:
-        ray.shutdown()
     draw(rows, f"{args.name}, {settings['algorithm']}, seed {seed}", folder / "curve.png")
     print(f"best checkpoint: {folder / 'checkpoint'}")
     if args.install:

@@ -1,7 +1,4 @@
-"""Interface of everything that acts: a control loop sees `Policy` and `PolicyClient` alike.
-
-This is an interface only.
-"""
+"""Interface of everything that acts: a control loop sees `Policy` and `PolicyClient` alike."""
 
 from __future__ import annotations
 
@@ -19,7 +16,23 @@ Observation: TypeAlias = ArrayLike | Mapping[str, Any] | tuple[Any, ...]
 nested space maps and tuples of such."""
 
 
-class ActingPolicy(Protocol):
+class Closeable(Protocol):
+    """Something that holds resources until `close`, as a context manager until the block ends."""
+
+    def close(self) -> None:
+        """Free what it holds (a session, a connection, a file). It cannot be used any more."""
+        ...
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class ActingPolicy(Closeable, Protocol):
     """Something that turns an observation into an action.
 
     ```python
@@ -52,13 +65,3 @@ class ActingPolicy(Protocol):
     def reset(self) -> None:
         """Start an episode: recurrent state back to its initial value. Nothing to do for a stateless policy."""
         ...
-
-    def close(self) -> None:
-        """Free what the policy holds (a session, a connection). It does not act any more."""
-        ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...

@@ -7,12 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
-import secrets
-import shutil
-import subprocess
-import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -26,6 +20,8 @@ import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
+from cache import cached, versions
+from checkpoints import APP, TRAINED_WITH
 from rlservo.export.contract import bundle as bundle_files
 from rlservo.export.contract.contract import (
     BakedStep,
@@ -38,10 +34,11 @@ from rlservo.export.contract.contract import (
     TensorSpec,
 )
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, Element
-from rlservo.serve_app.versions.loaded_policies import Library
-from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 
+ROOT = Path(__file__).resolve().parents[1]
 OBS = 27
 HIDDEN = 256
 ACTIONS = 6
@@ -329,30 +326,45 @@ def discrete_policy() -> Callable[..., Path]:
     return write_discrete_policy
 
 
+EXPORTED_WITH = versions("ray", "torch", "onnx", "onnxscript", "onnxruntime", "gymnasium", "numpy")
+PRODUCT = [ROOT / folder for folder in ("export", "serve_app", "envs")]  # what an export runs through
 RECURRENT = ("lstm_box", "lstm_previous", "act_nested")
+SHIPPED = {  # by the name they are served under
+    "ur5": "ur5_positioning",
+    "mir100": "mir100_navigation",
+    "mir100_obstacle_avoidance": "mir100_obstacle_avoidance",
+}
 
 
 @pytest.fixture(scope="session")
-def recurrent(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A repository of three LSTM policies, trained for one iteration by RLlib and exported.
+def recurrent(wide_zoo: Path) -> Path:
+    """A repository of three LSTM policies, trained for one iteration by RLlib and exported. Not to be written to.
 
     lstm_box: 3 numbers to a Box; lstm_previous: sees its last actions and rewards; act_nested: nested both ways.
     """
-    from rlservo.export.commands.export import export_checkpoint
 
-    scripts = Path(__file__).resolve().with_name("zoo")
-    root = tmp_path_factory.mktemp("recurrent")
-    folder = Path(tempfile.mkdtemp(prefix="zoo-"))  # a short path: Ray's sockets live below it
-    environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
-    command = [sys.executable, "-W", "ignore", str(scripts / "train_wide_zoo.py"), str(folder), *RECURRENT]
-    try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
-        assert done.returncode == 0, done.stderr[-3000:]
+    def export(out: Path) -> None:
+        from rlservo.export.commands.export import export_checkpoint
+
         for name in RECURRENT:
-            export_checkpoint(folder / name, root, name=name, app_dir=scripts / "app", notify=lambda line: None)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-    return root
+            export_checkpoint(wide_zoo / name, out, name=name, app_dir=APP, notify=lambda line: None)
+
+    return cached("recurrent-policies", [*RECURRENT, *TRAINED_WITH, *PRODUCT, EXPORTED_WITH], export)
+
+
+@pytest.fixture(scope="session")
+def shipped() -> Path:
+    """A repository of the shipped policies for robo-gym's tasks, by the names in SHIPPED. Not to be written to."""
+    checkpoints = ROOT / "examples" / "checkpoints"
+
+    def export(out: Path) -> None:
+        from rlservo.export.commands.export import export_checkpoint
+
+        for name, checkpoint in SHIPPED.items():
+            export_checkpoint(checkpoints / checkpoint, out, name=name, notify=lambda line: None)
+
+    made_of = [checkpoints / checkpoint for checkpoint in SHIPPED.values()]
+    return cached("shipped-policies", [*SHIPPED, *made_of, *PRODUCT, EXPORTED_WITH], export)
 
 
 class MemoryLedger:
@@ -364,7 +376,7 @@ class MemoryLedger:
     def newest(self) -> int:
         return max(self.plans, default=0)
 
-    def read(self, generation: int) -> bytes | None:
+    def fetch(self, generation: int) -> bytes | None:
         return self.plans.get(generation)
 
     def append(self, generation: int, content: bytes) -> bool:
@@ -372,12 +384,12 @@ class MemoryLedger:
 
 
 @pytest.fixture(scope="session")
-def controlled() -> Callable[..., AbstractContextManager[Control]]:
+def controlled() -> Callable[..., AbstractContextManager[ReplicaVersions]]:
     """Control over what is served of some folders, for an application that can be administered."""
 
     @contextlib.contextmanager
-    def control_of(*folders: Path, config: Any = None) -> Iterator[Control]:
-        control = Control(Library(Repository(list(folders))), MemoryLedger(), replica="only")
+    def control_of(*folders: Path, config: Any = None) -> Iterator[ReplicaVersions]:
+        control = ReplicaVersions(LoadedPolicies(Repository(list(folders))), MemoryLedger(), replica="only")
         try:
             asyncio.run(control.configure({} if config is None else config))
             yield control

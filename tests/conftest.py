@@ -1,47 +1,51 @@
-"""robo-gym's own environment, for the tests that drive our servers with the original client.
-
-robo-gym pins a protobuf that Ray cannot use, so it lives in a virtual environment of its own, built once into the
-user's cache folder. Where that fails (no network, say) these tests skip with the reason, unless
-RLSERVO_REQUIRE_ROBO_GYM is set, as it is in CI.
-"""
+"""How the tests are spread over pytest-xdist's processes. What they share is in the plugins below."""
 
 from __future__ import annotations
 
-import fcntl
-import os
-import subprocess
-import sys
-import venv
-from pathlib import Path
+from typing import Any
 
 import pytest
+from xdist.scheduler import LoadScopeScheduling
 
-pytest_plugins = ["bundles", "servers"]
+pytest_plugins = ["checkpoints", "bundles", "clusters", "environments", "servers"]
 
-ROBO_GYM = ["robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1"]
-# What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and
-# pip would settle that with an old robo-gym-server-modules that has no pin and does not work.
-CLIENT = ["httpcore>=1.0.6", "pydantic>=2.6"]
+# Tests that share what is costly to make, by the beginning of their id. All others share their file's own.
+TOGETHER = {
+    "tests/system/test_serving.py": "live server",
+    "tests/system/test_serving_fuzz.py": "live server",
+    "tests/system/test_serving_grpc.py": "live server",
+    "tests/system/test_serving_network.py": "live server",
+    "tests/system/test_serving_protocols.py": "live server",
+    "tests/system/test_serving_sessions.py": "live server",
+    "tests/serve_app/protocols/test_access.py::test_on_ray_serve": "live server",
+    "tests/serve_app/protocols/test_web_pages.py::test_on_ray_serve": "live server",
+    "tests/system/test_robo_gym_client.py": "shipped server",
+    "tests/system/test_served_policies.py": "shipped server",
+    "tests/system/test_cluster_check.py": "cluster",
+    "tests/system/test_policies_under_load.py": "cluster",
+    "tests/examples/test_shipped_policies.py": "one Ray",
+    "tests/examples/test_tour.py": "one Ray",
+    "tests/examples/test_training_scripts.py": "one Ray",
+}
 
 
-@pytest.fixture(scope="session")
-def robo_gym_python() -> Path:
-    """Return the Python of an environment with robo-gym, and without Ray, MuJoCo and rlservo."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rlservo-tests"
-    folder = cache / f"robo-gym-2.0.1-python{sys.version_info[0]}.{sys.version_info[1]}"
-    python, complete = folder / "bin" / "python", folder / "complete"
-    wanted = " ".join([*ROBO_GYM, *CLIENT])
-    cache.mkdir(parents=True, exist_ok=True)
-    with (cache / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # another test run may be building it
-        if not (complete.exists() and complete.read_text() == wanted):
-            venv.create(folder, with_pip=True, clear=True)
-            install = [str(python), "-m", "pip", "install", "-q", *ROBO_GYM, *CLIENT]
-            done = subprocess.run(install, capture_output=True, text=True, timeout=500)
-            if done.returncode != 0:
-                reason = f"robo-gym's environment cannot be built: {done.stderr.strip()[-500:]}"
-                if os.environ.get("RLSERVO_REQUIRE_ROBO_GYM"):
-                    pytest.fail(reason)
-                pytest.skip(reason)
-            complete.write_text(wanted)
-    return python
+class ByFile(LoadScopeScheduling):
+    """All tests of a file in one process, or those that are together."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        shared = (group for beginning, group in TOGETHER.items() if nodeid.startswith(beginning))
+        return next(shared, nodeid.partition("::")[0])
+
+
+@pytest.hookimpl(optionalhook=True)  # -p no:xdist
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByFile:
+    """Take the place of `--dist`: marks (loadgroup) do not reach xdist 3.8 under pytest 9.2."""
+    config.option.loadscopereorder = False  # the order below, not the files with the most tests first
+    return ByFile(config, log)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files with slow tests first: none of them is the last that the others wait for."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)

@@ -1,14 +1,21 @@
-"""Servers for tests: an application on uvicorn, `rlservo serve`, and Pythons for other clients."""
+"""Servers for tests: an application on uvicorn, and `rlservo serve`, in a thread and in processes of its own."""
 
 from __future__ import annotations
 
 import contextlib
+import http.client
+import json
+import os
+import secrets
+import shutil
+import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +25,32 @@ import pytest
 import uvicorn
 
 from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.processes import check_port, free_ports, port_holder
 from rlservo.serve_app.server.api_keys import new_key
+
+ROOT = Path(__file__).resolve().parents[1]
+SPOOR = "RLSERVO_TEST"  # inherited by every process a test starts, however far down
+STREAM_IDLE_S = 8.0  # of the live server
+CONNECTIONS_PER_ADDRESS = 300
+
+# Runs the launcher in a process's main thread, as the command line does, and tells when it is ready.
+LAUNCH = """
+import json, pathlib, sys
+from rlservo.export.contract.errors import RlservoError
+from rlservo.serve_app.ray_serve import launcher
+launcher.START_TIMEOUT_S = 480  # a busy machine
+plan = json.loads(sys.argv[1])
+key_file = plan.pop("admin_key_file")
+try:
+    launcher.serve_policies(
+        **plan,
+        admin_key_file=key_file and pathlib.Path(key_file),
+        on_ready=lambda served: print("READY", served.url, flush=True),
+    )
+except RlservoError as error:
+    print("FAILED", error.message, flush=True)
+    sys.exit(1)
+"""
 
 
 @contextlib.contextmanager
@@ -44,10 +75,159 @@ def served() -> Callable[[Any], AbstractContextManager[int]]:
     return over_uvicorn
 
 
+@contextlib.contextmanager
+def served_in_thread(dirs: Sequence[Path], **options: Any) -> Iterator[int]:
+    """Run `serve_policies` in a thread; gives the port. An event ends it, and nothing listens there afterwards."""
+    (port,) = free_ports(1)
+    ready, stop = threading.Event(), threading.Event()
+    failures: list[BaseException] = []
+
+    def serve() -> None:
+        try:
+            serve_policies(dirs, port=port, on_ready=lambda _: ready.set(), stop=stop, **options)
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        while not ready.wait(0.1):
+            assert thread.is_alive(), failures
+        yield port
+    finally:
+        stop.set()
+        thread.join(60)
+    assert failures == [] and not thread.is_alive() and port_holder(port) is None
+
+
+@dataclass
+class Run:
+    """A program with a temporary folder of its own, and all that it started."""
+
+    process: subprocess.Popen[str]
+    port: int
+    spoor: str
+    grpc_port: int | None = None
+    key_file: Path | None = None
+
+    def wait_until_ready(self) -> None:
+        """Wait for the launcher's own word."""
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line.startswith("READY"), line + self.process.stdout.read()
+
+    @property
+    def folder(self) -> Path:
+        return _folder(self.spoor)
+
+    def processes(self, part: str = "") -> list[int]:
+        """Return those of its processes whose command line has this in it."""
+        return [pid for pid, name in trail(self.spoor).items() if part in name]
+
+    def left(self) -> list[str]:
+        """Return the command lines of processes this run started that still live."""
+        return [name for pid, name in trail(self.spoor).items() if pid != self.process.pid]
+
+    def end(self, *signals: signal.Signals, folders: bool = True) -> int:
+        """Send signals, wait for the end, assert that nothing is left; return the exit code."""
+        for number in signals:
+            self.process.send_signal(number)
+            time.sleep(0.3)
+        code = self.process.wait(timeout=90)
+        self._nothing_is_left(folders=folders)
+        return code
+
+    def _nothing_is_left(self, *, folders: bool) -> None:
+        """Assert that no process, no listener and, with `folders`, no file is left within 20 seconds."""
+        deadline = time.monotonic() + 20
+        while True:
+            left = self.left() + ([str(path) for path in self.folder.glob("*")] if folders else [])
+            if not left or time.monotonic() > deadline:
+                break
+            time.sleep(0.1)
+        assert left == []
+        assert self.key_file is None or not self.key_file.exists()
+        assert port_holder(self.port) is None
+        check_port("127.0.0.1", self.port)
+
+
+def trail(spoor: str) -> dict[int, str]:
+    """Return the command lines of the processes that carry a mark."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            with contextlib.suppress(OSError):
+                if f"{SPOOR}={spoor}".encode() in (entry / "environ").read_bytes().split(b"\0"):
+                    found[int(entry.name)] = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+    return found
+
+
+def _folder(spoor: str) -> Path:
+    return Path(tempfile.gettempdir()) / f"t{spoor}"
+
+
+@contextlib.contextmanager
+def running(arguments: Sequence[str], port: int, **environment: str) -> Iterator[Run]:
+    """Start a program with a temporary folder of its own, and end whatever is left of it in the end."""
+    spoor = secrets.token_hex(2)
+    temporary = _folder(spoor)
+    temporary.mkdir()
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    variables.update({SPOOR: spoor, "TMPDIR": str(temporary), **environment})
+    process = subprocess.Popen(
+        arguments,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=variables,
+        cwd=ROOT,
+        # A shell's background job starts with Ctrl-C ignored, and so would all it starts, `serve run` among them.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        yield Run(process, port, spoor)
+    finally:
+        for pid in trail(spoor):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def launched(
+    *dirs: Path,
+    replicas: int = 1,
+    with_grpc: bool = False,
+    with_admin_key: bool = False,
+    settings: Mapping[str, Any] | None = None,
+    prefix: tuple[str, ...] = (),
+    **environment: str,
+) -> Iterator[Run]:
+    """Start `serve_policies` in processes of its own. Whoever calls ends it, or whatever is left of it is killed."""
+    port, grpc_port = free_ports(2)
+    with tempfile.TemporaryDirectory() as keys:
+        key_file = Path(keys, "admin.key") if with_admin_key else None
+        plan = {
+            "dirs": list(map(str, dirs)),
+            "port": port,
+            "grpc_port": grpc_port if with_grpc else None,
+            "replicas": replicas,
+            "settings": dict(settings or {}),
+            "admin_key_file": key_file and str(key_file),
+        }
+        with running([*prefix, sys.executable, "-c", LAUNCH, json.dumps(plan)], port, **environment) as run:
+            run.key_file, run.grpc_port = key_file, plan["grpc_port"]
+            yield run
+
+
 @dataclass(frozen=True)
 class LiveServer:
     """A policy server on Ray Serve, with a key, gRPC and a log file."""
 
+    run: Run
     port: int
     grpc_port: int
     key: str
@@ -59,57 +239,78 @@ class LiveServer:
 
 
 @pytest.fixture(scope="session")
-def live_server(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
-    """Start `rlservo serve` once for all the tests that need nothing special of it."""
-    port, grpc_port = free_ports(2)
+def live_server(policies: Path, recurrent: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
+    """`rlservo serve`, once for all the tests that need nothing special of it; no admin key.
+
+    It is started as a shell script's background job is: with SIGINT ignored. And with a RAY_ADDRESS that leads nowhere.
+    SIGINT ends it, in order, with nothing left.
+    """
     key, line = new_key("tests")
     log = tmp_path_factory.mktemp("log") / "server.jsonl"
-    ready, stop = threading.Event(), threading.Event()
-    failures: list[Exception] = []
+    settings = {
+        "api_keys": line,
+        "default_policy": "ur5",
+        "log_file": str(log),
+        "log_requests": True,
+        "stream_idle_s": STREAM_IDLE_S,
+        "max_connections_per_address": CONNECTIONS_PER_ADDRESS,
+    }
+    ignoring = ("sh", "-c", "trap '' INT; exec \"$@\"", "sh")
+    with launched(
+        policies, recurrent, with_grpc=True, settings=settings, prefix=ignoring, RAY_ADDRESS="127.0.0.1:1"
+    ) as run:
+        run.wait_until_ready()
+        assert run.grpc_port is not None
+        yield LiveServer(run, run.port, run.grpc_port, key, log)
+        assert run.end(signal.SIGINT) == 0
 
-    def serve() -> None:
-        try:
-            serve_policies(
-                [policies],
-                port=port,
-                grpc_port=grpc_port,
-                settings={"api_keys": line, "default_policy": "ur5", "log_file": str(log), "log_requests": True},
-                on_ready=lambda _: ready.set(),
-                stop=stop,
-            )
-        except Exception as error:
-            failures.append(error)
-            ready.set()
 
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        assert ready.wait(120) and not failures, failures
-        yield LiveServer(port, grpc_port, key, log)
-    finally:
-        stop.set()
-        thread.join(60)
-    assert not thread.is_alive()
+@dataclass(frozen=True)
+class ShippedServer:
+    """The shipped policies behind `rlservo serve`, as a user starts it."""
+
+    url: str
+    runtime: Path  # where it keeps its operator's key
 
 
 @pytest.fixture(scope="session")
-def client_environment(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """Install packages that cannot share our environment into one of their own; gives its Python, or skips."""
-    made: dict[tuple[str, ...], Path] = {}
+def shipped_server(shipped: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ShippedServer]:
+    """`rlservo serve` with the policies of `shipped`. SIGTERM ends it, with nothing left."""
+    (port,) = free_ports(1)
+    runtime = tmp_path_factory.mktemp("runtime")
+    command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(shipped), "--port", str(port)]
+    with running(command, port, XDG_RUNTIME_DIR=str(runtime)) as run:
+        assert run.process.stdout is not None
+        printed: list[str] = []
+        drain = threading.Thread(target=printed.extend, args=(run.process.stdout,), daemon=True)
+        drain.start()  # so that the pipe never fills
+        wait_until_served(run)
+        yield ShippedServer(f"http://127.0.0.1:{port}", runtime)
+        run.end(signal.SIGTERM)
+        drain.join()
+    assert list((runtime / "rlservo").iterdir()) == []  # the key went with the server
 
-    def install(*packages: str) -> Path:
-        if packages not in made:
-            made[packages] = new(*packages)
-        return made[packages]
 
-    def new(*packages: str) -> Path:
-        folder = tmp_path_factory.mktemp("client")
-        commands = [[sys.executable, "-m", "venv", str(folder)]]
-        commands.append([str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", *packages])
-        for command in commands:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-            if done.returncode != 0:
-                pytest.skip(f"{', '.join(packages)} cannot be installed here: {done.stderr.strip()[-300:]}")
-        return folder / "bin" / "python"
+def ask(port: int, method: str, path: str, body: Any = None, key: str = "") -> tuple[int, Any]:
+    """Send one request; return the status and the document, or the bytes of what is none."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    try:
+        content = body if body is None or isinstance(body, bytes) else json.dumps(body)
+        headers = {"content-type": "application/json", **({"authorization": f"Bearer {key}"} if key else {})}
+        connection.request(method, path, content, headers)
+        reply = connection.getresponse()
+        received = reply.read()
+        return reply.status, json.loads(received) if received[:1] in (b"{", b"[") else received
+    finally:
+        connection.close()
 
-    return install
+
+def wait_until_served(run: Run, timeout_s: float = 180) -> None:
+    """Wait until a server answers that it is ready."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline and run.process.poll() is None:
+        with contextlib.suppress(OSError, http.client.HTTPException):
+            if ask(run.port, "GET", "/v2/health/ready")[0] == 200:
+                return
+        time.sleep(0.2)
+    raise AssertionError("the server did not become ready")

@@ -20,9 +20,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "export/rllib": {"export/contract", "export/checkpoints", "export/recipe"},
     "export/graph": {"export/contract", "export/recipe"},
     "export/proof": {"export/contract", "export/recipe"},
-    "export/commands": {
-        "export/contract", "export/checkpoints", "export/recipe", "export/rllib", "export/graph", "export/proof",
-    },
     "serve_app/interface.py": {"export/contract"},
     "serve_app/runtime": {"export/contract", "serve_app/interface.py"},
     "serve_app/wire": {"export/contract"},
@@ -30,6 +27,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "serve_app/replay": {"export/contract", "serve_app/recording", "serve_app/runtime"},
     "serve_app/client": {"export/contract", "serve_app/interface.py", "serve_app/recording", "serve_app/wire"},
     "serve_app/rollout": {"export/contract", "serve_app/interface.py", "serve_app/recording"},
+    "export/commands": {
+        "export/contract", "export/checkpoints", "export/recipe", "export/rllib", "export/graph", "export/proof",
+        "serve_app/rollout",
+    },
     "serve_app/versions": {"export/contract", "serve_app/interface.py", "serve_app/runtime"},
     "serve_app/episodes": {"export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/wire"},
     "serve_app/server": {
@@ -42,7 +43,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "serve_app/ray_serve": {
         "export/contract", "serve_app/versions", "serve_app/server", "serve_app/protocols", "serve_app/wire",
     },
-    "envs": set(),
+    "envs": {"serve_app/wire"},
     "deploy": {"envs", "export", "serve_app"},
     "export/__init__.py": set(),
     "serve_app/__init__.py": set(),
@@ -58,7 +59,10 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "torch": ("export/graph/", "export/proof/", "export/rllib/"),
     "mujoco": ("envs/",),
     "grpc": ("envs/robot_server/", "serve_app/protocols/", "serve_app/ray_serve/"),
-    "google.protobuf": ("envs/robot_server/", "serve_app/protocols/oip_messages.py", "serve_app/protocols/oip_grpc.py"),
+    "google.protobuf": (
+        "envs/robot_server/", "serve_app/protocols/oip_grpc.py", "serve_app/wire/protobuf_messages.py",
+    ),
+    "google.protobuf.message_factory": ("serve_app/wire/protobuf_messages.py",),
     "mcap": ("serve_app/recording/log_file.py", "serve_app/recording/reader.py"),
     "pyarrow": ("serve_app/recording/parquet_export.py", "serve_app/recording/lerobot_export.py", "export/"),
     "minari": ("serve_app/recording/minari_export.py",),
@@ -66,7 +70,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "httpcore": ("serve_app/client/deadline_backend.py", "serve_app/client/http_transport.py"),
     "websockets": ("serve_app/client/websocket_connection.py", "serve_app/ray_serve/http_connections.py"),
     "pickle": ("export/checkpoints/unpickle.py",),
-    "onnxruntime": ("export/contract/onnx_session.py", "serve_app/runtime/"),
+    "onnxruntime": ("export/contract/ort_session.py", "serve_app/runtime/"),
     "asyncio": (
         "serve_app/versions/", "serve_app/episodes/", "serve_app/server/", "serve_app/protocols/",
         "serve_app/ray_serve/",

@@ -12,7 +12,6 @@ import pytest
 import rlservo
 
 ROOT = Path(__file__).resolve().parent.parent
-UR5 = ROOT / "examples" / "checkpoints" / "ur5_positioning"
 NAMES = [
     "ActingPolicy",
     "AdminClient",
@@ -63,8 +62,7 @@ def test_importing_it_imports_nothing(folder: Path) -> None:
     assert python(program, cwd=folder).splitlines() == ["[]", "['rlservo', 'rlservo.envs', 'rlservo.envs.discovery']"]
 
 
-def test_first_action_needs_no_event_loop_and_no_server(tmp_path: Path) -> None:
-    rlservo.export_checkpoint(UR5, tmp_path, name="ur5", notify=lambda _sentence: None)
+def test_first_action_needs_no_event_loop_and_no_server(shipped: Path) -> None:
     program = """
         import os, sys, time
         os.environ["ORT_DISABLE_TELEMETRY"] = "1"
@@ -76,7 +74,7 @@ def test_first_action_needs_no_event_loop_and_no_server(tmp_path: Path) -> None:
         assert action.shape == (5,), action
         print(f"{spent:.3f}", *sorted({name.partition(".")[0] for name in set(sys.modules) - before}))
     """
-    spent, *modules = python(program, tmp_path / "ur5").split()
+    spent, *modules = python(program, shipped / "ur5").split()
     print(f"from numpy and onnxruntime to the first action: {spent} s of CPU time")
     unwanted = {"asyncio", "fastapi", "gymnasium", "httpcore", "httpx", "multiprocessing", "ray", "rich", "ssl",
                 "starlette", "torch", "typer", "websockets"}  # fmt: skip

@@ -6,9 +6,12 @@ import ast
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+
+from cache import cached
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("envs", "export", "serve_app", "deploy", "examples")
@@ -70,15 +73,20 @@ def requirements() -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("minor", CLASSIFIER.findall(project()))
 def test_base_and_client_run_on_every_python_that_is_named(minor: str, ur5: Path, tmp_path: Path) -> None:
-    python = tmp_path / "environment" / "bin" / "python"
-    commands = (
-        [interpreter(minor), "-m", "venv", str(tmp_path / "environment")],
-        [str(python), "-m", "pip", "install", "--quiet", *requirements()],
-    )
-    for command in commands:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=INSTALLED_S)
-        if done.returncode != 0:
-            pytest.skip(f"Python 3.{minor} cannot have the requirements: {done.stderr.strip()[-300:]}")
+    named = interpreter(minor)
+
+    def install(folder: Path) -> None:
+        for command in (
+            [named, "-m", "venv", "--without-pip", str(folder)],
+            [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet",
+             *requirements()],
+        ):  # fmt: skip
+            done = subprocess.run(command, capture_output=True, text=True, timeout=INSTALLED_S)
+            if done.returncode != 0:
+                pytest.skip(f"Python 3.{minor} cannot have the requirements: {done.stderr.strip()[-300:]}")
+
+    said = subprocess.run([named, "-VV"], capture_output=True, text=True, timeout=60).stdout
+    python = cached(f"base-python3.{minor}", [said, *requirements()], install) / "bin" / "python"
     package = tmp_path / "path" / "rlservo"  # what setuptools' package-dir makes of the tree
     package.mkdir(parents=True)
     for source in [*(ROOT / "deploy" / "package").glob("*.py"), *(ROOT / name for name in FOLDERS[:4])]:

@@ -15,19 +15,17 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from typing_extensions import Self
 
 from rlservo.deploy.demo.picture import Robot, RobotRun, Trace, draw_picture, film
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.interface import Observation
+from rlservo.serve_app.interface import ActingPolicy, Observation
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.rollout.control_loop import rollout
 
@@ -68,7 +66,7 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
     repository = out / "policies"
     shutil.rmtree(repository, ignore_errors=True)  # the only thing here that an earlier run would get in the way of
     out.mkdir(parents=True, exist_ok=True)
-    started = time.monotonic()
+    start = time.monotonic()
 
     console.rule("1  export: RLlib checkpoint to policy bundle")
     for robot in ROBOTS:
@@ -89,17 +87,16 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
                 if report.interrupted:
                     raise KeyboardInterrupt
                 longest = max(report.episodes, key=lambda row: (bool(row.success), row.steps))
-                frames = film(policy, robot.env_id, seed=FIRST_SEED + longest.index, note=console.print)
+                seed = FIRST_SEED + longest.index
+                frames = film(policy, robot.env_id, seed=seed, steps=longest.steps, note=console.print)
                 runs.append(RobotRun(robot, report, traces, frames))
     picture = draw_picture(out / "demo.png", runs)
     console.rule("4  result")
     console.print(_table(runs))
-    console.print(
-        f"picture: {picture}   bundles: {repository}   {time.monotonic() - started:.0f} s in all", markup=False
-    )
+    console.print(f"picture: {picture}   bundles: {repository}   {time.monotonic() - start:.0f} s in all", markup=False)
 
 
-class _Recorder:
+class _Recorder(ActingPolicy):
     """Passes every call on to the policy and notes the observations, episode by episode."""
 
     def __init__(self, policy: PolicyClient, traces: list[Trace]) -> None:
@@ -121,21 +118,13 @@ class _Recorder:
     def close(self) -> None:
         self._policy.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
 
 def _command(console: Console, *words: str) -> None:
     """Show and run one rlservo command; its output goes to the terminal."""
     _show(console, *words)
-    done = subprocess.run([sys.executable, "-m", "rlservo.deploy.cli", *words])
-    if done.returncode != 0:
-        raise RlservoError(f"`rlservo {words[0]}` ended with exit code {done.returncode}")
+    result = subprocess.run([sys.executable, "-m", "rlservo.deploy.cli", *words])
+    if result.returncode != 0:
+        raise RlservoError(f"`rlservo {words[0]}` ended with exit code {result.returncode}")
 
 
 def _show(console: Console, *words: str) -> None:
@@ -150,7 +139,7 @@ def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
     _show(console, *words)
     url = f"http://127.0.0.1:{port}"
     with log.open("wb") as stream:
-        # A session of its own: a Ctrl-C at the terminal reaches us alone, and we pass it on once.
+        # Not in our process group: a Ctrl-C at the terminal reaches us alone, and we pass it on once.
         server = subprocess.Popen(
             [sys.executable, "-m", "rlservo.deploy.cli", *words],
             stdout=stream,

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.interface import ActingPolicy
 from rlservo.serve_app.rollout.environment import make_env
+from rlservo.serve_app.rollout.episode import run_episode
 from rlservo.serve_app.rollout.report import RolloutReport
-from rlservo.serve_app.rollout.video import rgb_frame
+from rlservo.serve_app.rollout.video import FilmedEnv
 
 Trace: TypeAlias = list[float]  # distance to the target [m] before each action of one episode
 Frame: TypeAlias = NDArray[np.uint8]  # (height, width, 3)
@@ -41,8 +42,12 @@ class RobotRun:
     frames: list[Frame]
 
 
-def film(policy: ActingPolicy, env_id: str, *, seed: int, note: Callable[[str], object]) -> list[Frame]:
-    """Return the first, middle and last picture of one episode; none, with a note, where the machine cannot draw."""
+def film(policy: ActingPolicy, env_id: str, *, seed: int, steps: int, note: Callable[[str], object]) -> list[Frame]:
+    """Return the first, middle and last picture of an episode that had so many steps with this seed.
+
+    None, with a note, where the machine cannot draw. Only these are drawn: a picture costs more than a step and its
+    action together.
+    """
     try:
         env = make_env(env_id, {}, render=True)
     except UsageError as error:
@@ -50,29 +55,22 @@ def film(policy: ActingPolicy, env_id: str, *, seed: int, note: Callable[[str], 
         return []
     frames: list[Frame] = []
     try:
-        obs, _ = env.reset(seed=seed)
-        policy.reset()
-        frames.append(rgb_frame(env))
-        ended = False
-        while not ended:
-            obs, _, terminated, truncated, _ = env.step(policy.act(obs))
-            frames.append(rgb_frame(env))
-            ended = terminated or truncated
+        run_episode(FilmedEnv(env, frames.append, (0, steps // 2, steps)), policy, index=0, seed=seed)
     except UsageError as error:
         note(f"no pictures of the robots: {error.message}")
         return []
     finally:
         env.close()
-    return [frames[0], frames[len(frames) // 2], frames[-1]]
+    return frames
 
 
 def draw_picture(file: Path, runs: list[RobotRun]) -> Path:
     """Write the picture as PNG and return its path."""
     from matplotlib.figure import Figure  # the object interface: no window system, no global state
 
-    filmed = any(run.frames for run in runs)
-    columns = 4 if filmed else 1
-    figure = Figure(figsize=(4.0 * columns + (1.5 if filmed else 4.0), 3.6 * len(runs)), layout="constrained")
+    has_frames = any(run.frames for run in runs)
+    columns = 4 if has_frames else 1
+    figure = Figure(figsize=(4.0 * columns + (1.5 if has_frames else 4.0), 3.6 * len(runs)), layout="constrained")
     grid = figure.add_gridspec(len(runs), columns, width_ratios=[1, 1, 1, 1.3][-columns:])
     for row, run in enumerate(runs):
         for column, frame in enumerate(run.frames):

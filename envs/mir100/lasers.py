@@ -1,7 +1,6 @@
 """The two laser scanners, by casting rays at the walls and cubes of the model.
 
-It knows where the robot is from the simulation's state and nothing of velocities, commands or contacts. A reading is
-what robo-gym's robot server gives on: Gaussian noise added by the sensor, clipped to the scanner's range.
+A reading is what robo-gym's robot server gives on: Gaussian noise added by the sensor, clipped to the scanner's range.
 """
 
 from __future__ import annotations

@@ -117,9 +117,9 @@ class Mir100Navigation(gym.Env[Observation, NDArray[np.float32]]):
         super().reset(seed=seed)
         options = options or {}
         check_option_names(options, RESET_OPTIONS)
-        given_start, given_target = options.get("start_pose"), options.get("target_pose")
-        start = self._random_start() if given_start is None else as_vector("start_pose", given_start, 3).tolist()
-        target = self._random_target(start) if given_target is None else as_vector("target_pose", given_target, 3)
+        start_pose, target_pose = options.get("start_pose"), options.get("target_pose")
+        start = self._random_start() if start_pose is None else as_vector("start_pose", start_pose, 3).tolist()
+        target = self._random_target(start) if target_pose is None else as_vector("target_pose", target_pose, 3)
         self.simulation.rng = self.np_random
         self._place(start, target.tolist() if isinstance(target, np.ndarray) else target)
         self._steps = 0

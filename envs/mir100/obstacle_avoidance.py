@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
 
 from rlservo.envs.checks import InvalidResetError
 from rlservo.envs.mir100.navigation import Mir100Navigation
 from rlservo.envs.mir100.parameters import LENGTH, WIDTH
+from rlservo.envs.mir100.simulation import ROOM_VIEW
 from rlservo.envs.mir100.worlds import LAB_6X8, Pose
 
 SAFETY_RADIUS = 0.40  # [m], of a corner of the robot from a cube's centre
@@ -98,7 +98,7 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
     WORLD = LAB_6X8.name
     LASER_COUNT = 16
     SUCCESS_REWARD = 100.0
-    VIEW: ClassVar[dict[str, Any]] = {"lookat": (0.0, 0.0, 0.0), "distance": 9.5, "azimuth": 180.0, "elevation": -55.0}
+    VIEW = ROOM_VIEW
 
     def _random_start(self) -> Pose:
         x = self.np_random.uniform(-2.0, 2.0)
@@ -120,20 +120,20 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
             self.simulation.place(start, target=target, cubes=self._random_cubes())
             if self._failure() is None:
                 return
-        touched = " and ".join(self.simulation.touched())
+        contacts = " and ".join(self.simulation.contacts())
         raise InvalidResetError(
             f"reset option 'start_pose' is {[round(value, 3) for value in start]}: the robot "
-            f"{f'touches {touched}' if touched else f'is within {MIN_READING} m of something'} there, "
+            f"{f'touches {contacts}' if contacts else f'is within {MIN_READING} m of something'} there, "
             f"wherever the cubes stand; expected a pose inside the room, clear of the walls"
         )
 
     def _failure(self) -> str | None:
-        failed = (
+        is_failure = (
             self.simulation.in_collision
             or float(self.simulation.scan.min()) < MIN_READING
             or self._corner_is_near_a_cube()
         )
-        return "collision" if failed else None
+        return "collision" if is_failure else None
 
     def _corner_is_near_a_cube(self) -> bool:
         x, y, yaw = self.simulation.pose

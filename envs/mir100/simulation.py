@@ -1,7 +1,7 @@
 """The simulated robot: put it somewhere, command velocities, let a control cycle pass, read pose, lasers and contacts.
 
-It follows robo-gym's robot server and the diff_drive_controller below it. It knows nothing of observations, rewards or
-Gymnasium. Poses are x, y [m] and yaw [rad] of base_link in the map frame.
+It follows robo-gym's robot server and the diff_drive_controller below it. Poses are x, y [m] and yaw [rad] of base_link
+in the map frame.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ TIMEOUT_SUBSTEPS = round(COMMAND_TIMEOUT_S / TIMESTEP)
 LINEAR_INCREMENT = MAX_LINEAR_ACCELERATION * TIMESTEP  # [m/s] a substep
 HALF_STEP = TIMESTEP / 2  # [s]
 ANGULAR_INCREMENT = MAX_ANGULAR_ACCELERATION * TIMESTEP  # [rad/s] a substep
+# Of a camera: the whole room from above.
+ROOM_VIEW: dict[str, Any] = {"lookat": (0.0, 0.0, 0.0), "distance": 9.5, "azimuth": 180.0, "elevation": -55.0}
 
 Vector = NDArray[np.float64]
 
@@ -106,45 +108,45 @@ class Mir100Simulation:
         """
         if not (math.isfinite(linear) and math.isfinite(angular)):
             raise ValueError(f"the velocity command is ({linear:g} m/s, {angular:g} rad/s): expected finite numbers")
-        accepted = not self.is_blocked
+        is_accepted = not self.is_blocked
         self._command = (
             (
                 max(-MAX_LINEAR_VELOCITY, min(MAX_LINEAR_VELOCITY, linear)),
                 max(-MAX_ANGULAR_VELOCITY, min(MAX_ANGULAR_VELOCITY, angular)),
             )
-            if accepted
+            if is_accepted
             else (0.0, 0.0)
         )
         self._command_age = 0
-        return accepted
+        return is_accepted
 
     def advance(self) -> None:
         """Let one control cycle of 0.1 s pass. `in_collision` tells of a contact at any moment of it."""
         model, data, step = self.model, self.data, mujoco.mj_step
         ctrl = data.ctrl
         linear, angular = self._setpoint
-        touched = False
+        in_contact = False
         for _ in range(SUBSTEPS):
             if self._command_age >= TIMEOUT_SUBSTEPS:
                 self._command = (0.0, 0.0)
             self._command_age += 1
-            wanted_linear, wanted_angular = self._command
-            linear += max(-LINEAR_INCREMENT, min(LINEAR_INCREMENT, wanted_linear - linear))
-            angular += max(-ANGULAR_INCREMENT, min(ANGULAR_INCREMENT, wanted_angular - angular))
+            target_linear, target_angular = self._command
+            linear += max(-LINEAR_INCREMENT, min(LINEAR_INCREMENT, target_linear - linear))
+            angular += max(-ANGULAR_INCREMENT, min(ANGULAR_INCREMENT, target_angular - angular))
             ctrl[0] = linear
             ctrl[1] = linear * angular * HALF_STEP  # the motors act along the heading at the step's start, and a chord
             ctrl[2] = angular  # of the arc points half a step's turn to the left of that
             step(model, data)
             if data.ncon:
-                touched = True
+                in_contact = True
         self._setpoint = (linear, angular)
         # mj_step leaves poses and contacts of its start: bring them up to where the robot is now.
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
-        self.in_collision = touched or data.ncon > 0
+        self.in_collision = in_contact or data.ncon > 0
         self._scan_is_fresh = False
 
-    # -- reading
+    # -- state
 
     @property
     def pose(self) -> Pose:
@@ -211,7 +213,7 @@ class Mir100Simulation:
             state[start : start + 3] = cube
         return state
 
-    def touched(self) -> list[str]:
+    def contacts(self) -> list[str]:
         """Return the names of the walls and cubes the robot touches now, for messages."""
         model: Any = self.model
         names = {model.geom(geom).name for contact in self.data.contact[: self.data.ncon] for geom in contact.geom}

@@ -47,20 +47,11 @@ class SparseFixNavigationMir100Sim(NoObstacleNavigationMir100Sim):
     robo-gym has no such task.
     """
 
-    def __init__(
-        self,
-        ip: str | None = None,
-        lower_bound_port: int | None = None,
-        upper_bound_port: int | None = None,
-        gui: bool = False,
-        *,
-        fix_interval: int = FIX_INTERVAL,
-        **arguments: Any,
-    ) -> None:
+    def __init__(self, *, fix_interval: int = FIX_INTERVAL, **arguments: Any) -> None:
         if isinstance(fix_interval, bool) or not isinstance(fix_interval, int) or fix_interval < 1:
             raise ValueError(f"fix_interval is {fix_interval!r}: expected a whole number of control cycles, 1 or more")
         self._fix_interval = fix_interval
-        super().__init__(ip, lower_bound_port, upper_bound_port, gui, **arguments)
+        super().__init__(**arguments)
 
     def _observation(self, distance: float, bearing: float) -> Observation:
         observation = super()._observation(distance, bearing)

@@ -20,18 +20,18 @@ class Clock:
         self._cycle_s = cycle_s
         self._due: float | None = None  # when the last cycle ends
 
-    def missed(self) -> int:
+    def count_missed_cycles(self) -> int:
         """Return how many cycles have passed without a command, and count them as passed."""
         if not self._real or self._due is None:
             return 0
-        late = time.monotonic() - self._due
-        if late <= GRACE_S:
+        delay_s = time.monotonic() - self._due
+        if delay_s <= GRACE_S:
             return 0
-        cycles = int(late / self._cycle_s)
+        cycles = int(delay_s / self._cycle_s)
         self._due += cycles * self._cycle_s
         return min(cycles, round(MAX_CATCH_UP_S / self._cycle_s))
 
-    def passed(self, cycles: int) -> float | None:
+    def count_cycles(self, cycles: int) -> float | None:
         """Count cycles that were simulated just now. Return what to `wait` for before answering."""
         if not self._real:
             return None
@@ -44,6 +44,6 @@ class Clock:
 
     @staticmethod
     def wait(due: float | None) -> None:
-        """Sleep until a moment that `passed` returned."""
+        """Sleep until a moment that `count_cycles` returned."""
         if due is not None:
             time.sleep(max(0.0, due - time.monotonic()))

@@ -9,15 +9,15 @@ ESTABLISHED = "01"
 
 def count_connections(port: int) -> int | None:
     """Return the number of established TCP connections to local port `port`; None where there is no /proc to ask."""
-    count, asked = 0, False
-    wanted = f"{port:04X}"
+    count, has_table = 0, False
+    suffix = f"{port:04X}"
     for table in (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6")):
         try:
             lines = table.read_text().splitlines()[1:]
         except OSError:
             continue
-        asked = True
+        has_table = True
         for line in lines:
             _, local, _, state = line.split(maxsplit=4)[:4]
-            count += state == ESTABLISHED and local.endswith(f":{wanted}")
-    return count if asked else None
+            count += state == ESTABLISHED and local.endswith(f":{suffix}")
+    return count if has_table else None

@@ -52,21 +52,21 @@ def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host
     package, file = words[1:3]
     if package not in LAUNCH_FILES:
         raise ValueError(f"package {package[:200]!r} is not known: expected one of {', '.join(LAUNCH_FILES)}")
-    known_file, read = LAUNCH_FILES[package]
+    known_file, parse = LAUNCH_FILES[package]
     if file != known_file:
         raise ValueError(f"launch file {file[:200]!r} of {package} is not known: expected {known_file}")
     arguments: dict[str, str] = {}
     for word in words[3:]:
-        name, assigned, value = word.partition(":=")
-        if not assigned or not _NAME.fullmatch(name):
+        name, separator, value = word.partition(":=")
+        if not separator or not _NAME.fullmatch(name):
             raise ValueError(f"{word[:200]!r} is no launch argument: expected name:=value")
         if len(value) > MAX_VALUE or not value.isprintable():  # it may stand in the log, on a line of its own
             raise ValueError(f"{name} is {value[:200]!r}: expected at most {MAX_VALUE:,} printable characters")
         arguments[name] = value
-    return read(arguments, gui, clock, host)
+    return parse(arguments, gui, clock, host)
 
 
-def _read_ur(arguments: Mapping[str, str], gui: bool, clock: str, host: str) -> URSettings:
+def _parse_ur(arguments: Mapping[str, str], gui: bool, clock: str, host: str) -> URSettings:
     objects = {name for name in arguments if _OBJECT.fullmatch(name)}
     _check_names(arguments, UR_KNOWN | objects, UR_ONLY)
     if "ur_model" not in arguments:
@@ -105,7 +105,7 @@ def _objects(arguments: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _read_mir100(arguments: Mapping[str, str], gui: bool, clock: str, host: str) -> Mir100Settings:
+def _parse_mir100(arguments: Mapping[str, str], gui: bool, clock: str, host: str) -> Mir100Settings:
     _check_names(arguments, MIR100_KNOWN, MIR100_ONLY)
     return Mir100Settings(
         host=host,
@@ -117,8 +117,8 @@ def _read_mir100(arguments: Mapping[str, str], gui: bool, clock: str, host: str)
 
 
 LAUNCH_FILES: dict[str, tuple[str, Callable[[Mapping[str, str], bool, str, str], Settings]]] = {
-    "ur_robot_server": ("ur_robot_server.launch", _read_ur),
-    "mir100_robot_server": ("sim_robot_server.launch", _read_mir100),
+    "ur_robot_server": ("ur_robot_server.launch", _parse_ur),
+    "mir100_robot_server": ("sim_robot_server.launch", _parse_mir100),
 }
 
 
@@ -126,15 +126,15 @@ def _check_names(arguments: Mapping[str, str], known: set[str], only: Mapping[st
     expected = known | WINDOWS | set(only)
     unknown = [name for name in arguments if name not in expected]
     if unknown:
-        named = ", ".join(name[:50] for name in unknown[:5]) + (f" and {len(unknown) - 5} more" if unknown[5:] else "")
+        more = f" and {len(unknown) - 5} more" if unknown[5:] else ""
         raise ValueError(
-            f"launch arguments that are not known: {named}; "
+            f"launch arguments that are not known: {', '.join(name[:50] for name in unknown[:5])}{more}; "
             f"expected some of {', '.join(sorted(name for name in expected if not _OBJECT.fullmatch(name)))}, "
             "object_<i>_model_name, object_<i>_frame"
         )
-    for name, allowed in only.items():
-        if name in arguments and arguments[name].lower() not in allowed:
-            raise ValueError(f"{name}:={arguments[name]} is not simulated: expected {name}:={allowed[0]}, the default")
+    for name, values in only.items():
+        if name in arguments and arguments[name].lower() not in values:
+            raise ValueError(f"{name}:={arguments[name]} is not simulated: expected {name}:={values[0]}, the default")
 
 
 def _port(arguments: Mapping[str, str]) -> int:

@@ -1,7 +1,4 @@
-"""robo-gym's server manager without ROS: starts robot servers, each a process of its own, and ends every one of them.
-
-The first half knows nothing of gRPC; the second is the service on the wire.
-"""
+"""robo-gym's server manager without ROS: starts robot servers, each a process of its own, and ends them all."""
 
 from __future__ import annotations
 
@@ -50,8 +47,8 @@ class RobotServers:
         self._starting = 0
         # Ports of servers that ended without a `kill` of their own: they crashed, or everything was killed. A client
         # kills its own before it starts another, tries ten times, and fails if that does not succeed (robo-gym 2.0.1).
-        self._ended: set[int] = set()
-        self._closed = threading.Event()
+        self._dead_ports: set[int] = set()
+        self._closing = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="watch-robot-servers", daemon=True)
         self._watcher.start()
 
@@ -68,7 +65,7 @@ class RobotServers:
         """
         settings = parse_launch_line(line, gui=gui, clock=self._clock, host=self._host)
         with self._lock:
-            if self._closed.is_set():
+            if self._closing.is_set():
                 raise ValueError("this server manager is ending")
             if len(self._running) + self._starting >= self._max_servers:
                 raise ValueError(f"{self._max_servers} robot servers are running, which is this manager's limit")
@@ -81,8 +78,8 @@ class RobotServers:
             with self._lock:
                 self._starting -= 1
         with self._lock:
-            if not self._closed.is_set():
-                self._ended.discard(server.port)
+            if not self._closing.is_set():
+                self._dead_ports.discard(server.port)
                 self._running[server.port] = server
                 log.info("%s on port %d (process %d)", _title(settings), server.port, server.pid)
                 return server.port
@@ -93,9 +90,9 @@ class RobotServers:
         """End the robot server on `port`, or forgive that it has ended already. Raises ValueError for other ports."""
         with self._lock:
             server = self._running.pop(port, None)
-            has_ended = port in self._ended
-            self._ended.discard(port)
-            ports = ", ".join(str(known) for known in sorted(self._running)) or "none"
+            has_ended = port in self._dead_ports
+            self._dead_ports.discard(port)
+            ports = ", ".join(str(number) for number in sorted(self._running)) or "none"
         if server is not None:
             server.end()
             log.info("%s on port %d ended", _title(server.settings), port)
@@ -106,7 +103,7 @@ class RobotServers:
         """End every robot server, side by side."""
         with self._lock:
             servers = list(self._running.values())
-            self._ended.update(self._running)
+            self._dead_ports.update(self._running)
             self._running.clear()
         if servers:
             with futures.ThreadPoolExecutor(len(servers)) as pool:
@@ -116,7 +113,7 @@ class RobotServers:
     def close(self) -> None:
         """End everything and start nothing more."""
         with self._lock:
-            self._closed.set()
+            self._closing.set()
         self._watcher.join()
         self.kill_all()
 
@@ -125,25 +122,25 @@ class RobotServers:
 
         Or one whose last client may still ask for its end: that would end the new server.
         """
-        unwanted: list[ServerProcess] = []
+        rejects: list[ServerProcess] = []
         try:
             while True:
                 server = ServerProcess(settings, orphan_s=self._orphan_s)
-                if settings.port or not (server.port in MANAGER_PORTS or server.port in self._ended):
+                if settings.port or not (server.port in MANAGER_PORTS or server.port in self._dead_ports):
                     return server
-                unwanted.append(server)  # ended only after the next has a port, or that would be the same one
+                rejects.append(server)  # ended only after the next has a port, or that would be the same one
         finally:
-            for server in unwanted:
+            for server in rejects:
                 server.end()
 
     def _watch(self) -> None:
-        while not self._closed.wait(WATCH_INTERVAL_S):
+        while not self._closing.wait(WATCH_INTERVAL_S):
             with self._lock:
-                ended = [(port, server) for port, server in self._running.items() if server.exit_code is not None]
-                for port, _ in ended:
+                exits = [(port, server) for port, server in self._running.items() if server.exit_code is not None]
+                for port, _ in exits:
                     del self._running[port]
-                    self._ended.add(port)
-            for port, server in ended:
+                    self._dead_ports.add(port)
+            for port, server in exits:
                 server.kill()  # collects the process and its pipes
                 log.warning("%s on port %d ended by itself: %s", _title(server.settings), port, _why(server.exit_code))
 
@@ -163,12 +160,12 @@ class ManagerService:
             "VerifyConnection": lambda _: ManagerStatus(alive=True),
         }
         return grpc.method_handlers_generic_handler(
-            SERVER_MANAGER, {name: self._guarded(name, call) for name, call in calls.items()}
+            SERVER_MANAGER, {name: self._answering(name, call) for name, call in calls.items()}
         )
 
     def _start(self, request: bytes) -> Any:
-        wanted = ServerRequest.FromString(request)
-        return ServerRequest(success=True, port=self._servers.start(wanted.cmd, gui=wanted.gui))
+        message = ServerRequest.FromString(request)
+        return ServerRequest(success=True, port=self._servers.start(message.cmd, gui=message.gui))
 
     def _kill(self, request: bytes) -> Any:
         self._servers.kill(ServerRequest.FromString(request).port)
@@ -180,7 +177,7 @@ class ManagerService:
         return ServerRequest(success=True)
 
     @staticmethod
-    def _guarded(name: str, call: Callable[[bytes], Any]) -> grpc.RpcMethodHandler:
+    def _answering(name: str, call: Callable[[bytes], Any]) -> grpc.RpcMethodHandler:
         def answer(request: bytes, _context: grpc.ServicerContext) -> bytes:
             try:
                 message = call(request)
@@ -193,8 +190,8 @@ class ManagerService:
                 message = ServerRequest(
                     success=False, info=f"{type(error).__name__} in the server manager, see its log"
                 )
-            serialized: bytes = message.SerializeToString()
-            return serialized
+            reply: bytes = message.SerializeToString()
+            return reply
 
         return grpc.unary_unary_rpc_method_handler(answer)
 

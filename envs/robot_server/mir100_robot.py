@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rlservo.envs.mir100.parameters import BEAM_COUNT, CYCLE_S
-from rlservo.envs.mir100.simulation import Mir100Simulation
+from rlservo.envs.mir100.simulation import ROOM_VIEW, Mir100Simulation
 from rlservo.envs.rendering import Camera
 from rlservo.envs.robot_server.robot import RobotState
 from rlservo.envs.robot_server.settings import Mir100Settings
@@ -26,7 +26,7 @@ class Mir100Robot:
 
     def __init__(self, settings: Mir100Settings) -> None:
         self.simulation = Mir100Simulation(settings.world_name, rng=np.random.default_rng(settings.seed))
-        self._camera: Camera | None = None
+        self.camera = Camera(self.simulation.model, self.simulation.data, **ROOM_VIEW)
 
     @property
     def cycle_s(self) -> float:
@@ -37,9 +37,9 @@ class Mir100Robot:
         """Return the 1,030 numbers; the original has no names for them."""
         return RobotState(values=self.simulation.state().tolist())
 
-    def set_state(self, wanted: RobotState) -> int:
+    def set_state(self, target: RobotState) -> int:
         """Put target and robot at rest, and cubes where there are any and they are given; it counts as two cycles."""
-        values = wanted.values
+        values = target.values
         if not (len(values) == STATE_LENGTH or ROBOT.stop <= len(values) <= CUBES.start):
             raise ValueError(
                 f"the state has {len(values)} elements: expected {STATE_LENGTH}, or {ROBOT.stop} to {CUBES.start} "
@@ -67,17 +67,3 @@ class Mir100Robot:
         """Let cycles pass without a command: the last one holds until it is 0.5 s old."""
         for _ in range(cycles):
             self.simulation.advance()
-
-    def show(self) -> None:
-        """Show the robot in a window, or refresh it."""
-        if self._camera is None:
-            sim = self.simulation
-            self._camera = Camera(
-                sim.model, sim.data, lookat=(0.0, 0.0, 0.0), distance=9.5, azimuth=180.0, elevation=-55.0
-            )
-        self._camera.show()
-
-    def close(self) -> None:
-        """Close the window."""
-        if self._camera is not None:
-            self._camera.close()

@@ -1,13 +1,12 @@
-"""Interface of a robot behind a robot server: put it somewhere, command it for one cycle, look at it.
-
-It knows nothing of gRPC, protobuf or time on the wall.
-"""
+"""Interface of a robot behind a robot server: put it somewhere, command it for one cycle, look at it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
+
+from rlservo.envs.rendering import Camera
 
 CLOCKS = ("fast", "real")
 
@@ -26,6 +25,11 @@ class Robot(Protocol):
     """A simulated robot with the server's vocabulary. Every method raises ValueError for what it cannot honour."""
 
     @property
+    def camera(self) -> Camera:
+        """The window that shows the robot."""
+        ...
+
+    @property
     def cycle_s(self) -> float:
         """How long a control cycle lasts [s]."""
         ...
@@ -34,7 +38,7 @@ class Robot(Protocol):
         """Return the state of this moment."""
         ...
 
-    def set_state(self, wanted: RobotState) -> int:
+    def set_state(self, target: RobotState) -> int:
         """Reset the robot and what is around it. Return how many cycles that took."""
         ...
 
@@ -44,12 +48,4 @@ class Robot(Protocol):
 
     def idle(self, cycles: int) -> None:
         """Let cycles pass in which no command arrived."""
-        ...
-
-    def show(self) -> None:
-        """Show the robot in a window, or refresh it."""
-        ...
-
-    def close(self) -> None:
-        """Close the window."""
         ...

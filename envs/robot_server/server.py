@@ -62,7 +62,7 @@ class RobotServer:
     def stop(self) -> None:
         """Refuse new calls, abort what runs on for a tenth of a second, and free the port."""
         self._server.stop(grace=0.1).wait(timeout=1.0)
-        self.robot.close()
+        self.robot.camera.close()
 
 
 def make_robot(settings: Settings) -> Robot:

@@ -37,7 +37,7 @@ class ServerProcess:
             start_new_session=True,  # Ctrl-C in our terminal is ours to handle
         )
         try:
-            self.port = self._read_port(time.monotonic() + START_TIMEOUT_S)
+            self.port = self._receive_port(time.monotonic() + START_TIMEOUT_S)
         except BaseException:
             self.kill()
             raise
@@ -70,21 +70,21 @@ class ServerProcess:
                 with contextlib.suppress(OSError):
                     pipe.close()
 
-    def _read_port(self, deadline: float) -> int:
+    def _receive_port(self, deadline: float) -> int:
         """Wait for the line that says which port, or why not."""
         assert self._process.stdout is not None
         pipe = self._process.stdout.fileno()
-        said = b""
+        output = b""
         with selectors.DefaultSelector() as selector:
             selector.register(pipe, selectors.EVENT_READ)
-            while b"\n" not in said:
+            while b"\n" not in output:
                 if not selector.select(max(0.0, deadline - time.monotonic())):
                     raise StartFailedError(f"the robot server did not come up within {START_TIMEOUT_S:g} s")
                 part = os.read(pipe, 4096)
                 if not part:
                     raise StartFailedError(f"the robot server ended while starting (exit code {self._process.wait()})")
-                said += part
-        line = said.decode(errors="replace").splitlines()[0]
+                output += part
+        line = output.decode(errors="replace").splitlines()[0]
         if line.startswith(FAILED):
             raise StartFailedError(line.removeprefix(FAILED))
         if not line.startswith(READY):

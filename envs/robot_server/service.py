@@ -37,9 +37,9 @@ class RobotService:
             "SendAction": self.send_action,
             "SendActionGetState": self.send_action_get_state,
         }
-        failed = {"GetState": State, "SendActionGetState": State, "SetState": Success, "SendAction": Success}
+        failure = {"GetState": State, "SendActionGetState": State, "SetState": Success, "SendAction": Success}
         return grpc.method_handlers_generic_handler(
-            ROBOT_SERVER, {name: self._guarded(name, call, failed[name]) for name, call in calls.items()}
+            ROBOT_SERVER, {name: self._answering(name, call, failure[name]) for name, call in calls.items()}
         )
 
     def get_state(self, request: bytes) -> Any:
@@ -51,16 +51,16 @@ class RobotService:
 
     def set_state(self, request: bytes) -> Any:
         """Answer SetState."""
-        given = State.FromString(request)
-        wanted = RobotState(
-            values=list(given.state),
-            names=dict(given.state_dict),
-            float_params=dict(given.float_params),
-            string_params=dict(given.string_params),
+        message = State.FromString(request)
+        target = RobotState(
+            values=list(message.state),
+            names=dict(message.state_dict),
+            float_params=dict(message.float_params),
+            string_params=dict(message.string_params),
         )
         with self._turn:
             with self._state_lock:
-                due = self._clock.passed(self._robot.set_state(wanted))
+                due = self._clock.count_cycles(self._robot.set_state(target))
                 self._show()
             self._clock.wait(due)
         return Success(success=True)
@@ -80,41 +80,41 @@ class RobotService:
             with self._state_lock:
                 self._catch_up()
                 self._robot.act(action)
-                due = self._clock.passed(1)
+                due = self._clock.count_cycles(1)
                 state = self._robot.state() if with_state else RobotState()
                 self._show()
             self._clock.wait(due)
         return state
 
     def _catch_up(self) -> None:
-        missed = self._clock.missed()
-        if missed:
-            self._robot.idle(missed)
+        cycles = self._clock.count_missed_cycles()
+        if cycles:
+            self._robot.idle(cycles)
 
     def _show(self) -> None:
         if not self._gui:
             return
         try:
-            self._robot.show()
+            self._robot.camera.show()
         except Exception as error:  # whatever a display can do; the robot goes on without a window
             log.warning("no window: %s", error)
             self._gui = False
 
-    def _guarded(self, name: str, call: Callable[[bytes], Any], failed: Any) -> grpc.RpcMethodHandler:
+    def _answering(self, name: str, call: Callable[[bytes], Any], failure: Any) -> grpc.RpcMethodHandler:
         def answer(request: bytes, _context: grpc.ServicerContext) -> bytes:
             try:
                 message = call(request)
             except DecodeError:
                 log.error("%s: %d bytes that are no such message", name, len(request))
-                message = failed(success=False)
+                message = failure(success=False)
             except ValueError as error:
                 log.error("%s: %s", name, error)
-                message = failed(success=False)
+                message = failure(success=False)
             except Exception:
                 log.exception("%s failed", name)
-                message = failed(success=False)
-            serialized: bytes = message.SerializeToString()
-            return serialized
+                message = failure(success=False)
+            reply: bytes = message.SerializeToString()
+            return reply
 
         return grpc.unary_unary_rpc_method_handler(answer)
 

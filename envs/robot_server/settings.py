@@ -138,6 +138,6 @@ def settings_from_json(line: str) -> Settings:
     return kind(**values)
 
 
-def _one_of(name: str, value: str, known: Collection[str], *, suffix: str = "") -> None:
-    if value.removesuffix(suffix) not in known:
-        raise ValueError(f"{name} {value!r} does not exist: expected one of {', '.join(known)}")
+def _one_of(name: str, value: str, names: Collection[str], *, suffix: str = "") -> None:
+    if value.removesuffix(suffix) not in names:
+        raise ValueError(f"{name} {value!r} does not exist: expected one of {', '.join(names)}")

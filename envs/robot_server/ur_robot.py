@@ -18,7 +18,7 @@ from rlservo.envs.ur.object_paths import object_path
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
 from rlservo.envs.ur.rs_modes import ROS_ORDER, positions_in_list, state_length
 from rlservo.envs.ur.server_state import state_dict, state_list
-from rlservo.envs.ur.simulation import SETTLE_CYCLES, URSimulation
+from rlservo.envs.ur.simulation import SETTLE_CYCLES, VIEW, URSimulation
 
 INITIAL_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad], until the first SetState
 ROS_JOINTS = [JOINTS[index] for index in ROS_ORDER]
@@ -39,12 +39,12 @@ class URRobot:
             objects=settings.object_names,
             table=settings.table,
         )
-        self._turned = settings.reference_frame == "base"
-        self._to_base_link = np.array([-1.0, -1.0, 1.0] if self._turned else [1.0, 1.0, 1.0])
+        self.camera = Camera(self.simulation.model, self.simulation.data, **VIEW)
+        self._is_turned = settings.reference_frame == "base"
+        self._to_base_link = np.array([-1.0, -1.0, 1.0] if self._is_turned else [1.0, 1.0, 1.0])
         self._rng = np.random.default_rng(settings.seed)
         self._float_params: dict[str, float] = {}
         self._string_params: dict[str, str] = {}
-        self._camera: Camera | None = None
         self.simulation.place(INITIAL_JOINTS)
 
     @property
@@ -56,15 +56,15 @@ class URRobot:
         """Return the state of the server's mode, as a list and by names."""
         mode = self._settings.rs_mode
         return RobotState(
-            values=state_list(self.simulation, mode, turned=self._turned),
-            names=state_dict(self.simulation, mode, turned=self._turned),
+            values=state_list(self.simulation, mode, is_turned=self._is_turned),
+            names=state_dict(self.simulation, mode, is_turned=self._is_turned),
         )
 
-    def set_state(self, wanted: RobotState) -> int:
+    def set_state(self, target: RobotState) -> int:
         """Put the arm where the state says, set the objects going, and let 20 cycles pass."""
-        joints = self._wanted_joints(wanted)
-        floats = {**self._float_params, **wanted.float_params}
-        strings = {**self._string_params, **wanted.string_params}
+        joints = self._target_joints(target)
+        floats = {**self._float_params, **target.float_params}
+        strings = {**self._string_params, **target.string_params}
         paths = {}
         for index in range(self.simulation.object_count):
             function = strings.get(f"object_{index}_function")
@@ -83,10 +83,10 @@ class URRobot:
         for joint, value in zip(ROS_JOINTS, action, strict=True):
             if not math.isfinite(value):
                 raise ValueError(f"the action for {joint} is {value:g}: expected a finite number [rad]")
-        wanted = np.array([action[index] for index in ROS_ORDER])
+        target = np.array([action[index] for index in ROS_ORDER])
         if self._settings.action_mode == "delta_pos":
-            wanted += self.simulation.joint_positions
-        self.simulation.command(np.clip(wanted, -LIMITS, LIMITS))
+            target += self.simulation.joint_positions
+        self.simulation.command(np.clip(target, -LIMITS, LIMITS))
         self.simulation.advance()
 
     def idle(self, cycles: int) -> None:
@@ -95,38 +95,24 @@ class URRobot:
         for _ in range(cycles):
             self.simulation.advance()
 
-    def show(self) -> None:
-        """Show the arm in a window, or refresh it."""
-        if self._camera is None:
-            sim = self.simulation
-            self._camera = Camera(
-                sim.model, sim.data, lookat=(0.0, 0.05, 0.42), distance=2.3, azimuth=145.0, elevation=-18.0
-            )
-        self._camera.show()
-
-    def close(self) -> None:
-        """Close the window."""
-        if self._camera is not None:
-            self._camera.close()
-
-    def _wanted_joints(self, wanted: RobotState) -> NDArray[np.float64]:
+    def _target_joints(self, target: RobotState) -> NDArray[np.float64]:
         names = [f"{joint}_joint_position" for joint in JOINTS]
-        if all(name in wanted.names for name in names):
-            joints = np.array([wanted.names[name] for name in names], dtype=np.float64)
-        elif wanted.values:
-            mode, count = self._settings.rs_mode, len(wanted.values)
+        if all(name in target.names for name in names):
+            joints = np.array([target.names[name] for name in names], dtype=np.float64)
+        elif target.values:
+            mode, count = self._settings.rs_mode, len(target.values)
             part = positions_in_list(mode) if count == state_length(mode) else OLD_LIST_POSITIONS
             if count < part.stop:
                 raise ValueError(
                     f"the state has {count} elements: expected {state_length(mode)}, those of rs_mode {mode!r}"
                 )
-            in_list = list(wanted.values[part])
+            in_list = list(target.values[part])
             joints = np.array([in_list[index] for index in ROS_ORDER], dtype=np.float64)
         else:
-            missing = ", ".join(name for name in names if name not in wanted.names)
+            missing = ", ".join(name for name in names if name not in target.names)
             raise ValueError(f"state_dict lacks {missing}, and state is empty: expected where to put the arm")
         for joint, position, limit in zip(JOINTS, joints.tolist(), POSITION_LIMITS, strict=True):
             if not abs(position) <= limit + ROUNDING:
                 raise ValueError(f"the position of {joint} is {position:g} rad: expected within +-{limit:g} rad")
-        clipped: NDArray[np.float64] = np.clip(joints, -LIMITS, LIMITS)
-        return clipped
+        within_limits: NDArray[np.float64] = np.clip(joints, -LIMITS, LIMITS)
+        return within_limits

@@ -6,25 +6,54 @@ jr-robotics/robo-gym 2.0.1, envs/ur/ur_base_env.py.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypedDict
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.envs.checks import EnvDescription, InvalidResetError, as_vector, check_action, check_option_names, element
+from rlservo.envs.checks import (
+    ElementInfo,
+    EnvDescription,
+    InvalidResetError,
+    as_vector,
+    check_action,
+    check_option_names,
+    element,
+)
 from rlservo.envs.rendering import RENDER_MODES, Camera
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
-from rlservo.envs.ur.simulation import URSimulation
+from rlservo.envs.ur.simulation import VIEW, URSimulation
 
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
 POSITION_BOUND = 1.1  # of a normalised joint position: its limit and robo-gym's tolerance
 
 Observation = NDArray[np.float32]
 Vector = NDArray[np.float64]
-Fixed = tuple[bool, bool, bool, bool, bool, bool]  # JOINTS
+
+
+class ArmArguments(TypedDict, total=False):
+    """Constructor arguments that every task of the arm takes."""
+
+    fix_base: bool
+    fix_shoulder: bool
+    fix_elbow: bool
+    fix_wrist_1: bool
+    fix_wrist_2: bool
+    fix_wrist_3: bool
+    ur_model: str
+    rs_state_to_info: bool
+    gui: bool
+    max_velocity_scale_factor: float | None
+    action_cycle_rate: float | None
+    render_mode: str | None
+    rs_address: str | None
+    ip: str | None
+    lower_bound_port: int | None
+    upper_bound_port: int | None
 
 
 class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
@@ -39,53 +68,73 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
     RS_MODE: ClassVar[str]  # what `info["rs_state"]` holds
     OBJECTS: ClassVar[tuple[str, ...]]
     TABLE: ClassVar[bool]
+    ACTION_ELEMENT: ClassVar[tuple[str, str]]  # what follows the joint's name, and its unit
+    MAX_VELOCITY_SCALE: ClassVar[float] = 0.2
+    RATE_HZ: ClassVar[float] = 20.0
 
     def __init__(
         self,
         *,
-        fixed: Fixed,
-        ur_model: str,
-        rs_state_to_info: bool,
-        gui: bool,
-        max_velocity_scale_factor: float,
-        action_cycle_rate: float,
-        render_mode: str | None,
+        fix_base: bool = False,
+        fix_shoulder: bool = False,
+        fix_elbow: bool = False,
+        fix_wrist_1: bool = False,
+        fix_wrist_2: bool = False,
+        fix_wrist_3: bool = True,
+        ur_model: str = "ur5",
+        rs_state_to_info: bool = True,
+        gui: bool = False,
+        max_velocity_scale_factor: float | None = None,
+        action_cycle_rate: float | None = None,
+        render_mode: str | None = None,
+        rs_address: str | None = None,
+        ip: str | None = None,
+        lower_bound_port: int | None = None,
+        upper_bound_port: int | None = None,
     ) -> None:
+        """The tasks' data sheets say what each argument means; None takes the task's own value."""
+        del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
+        fixed = np.array((fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3))
+        scale = self.MAX_VELOCITY_SCALE if max_velocity_scale_factor is None else max_velocity_scale_factor
+        rate_hz = self.RATE_HZ if action_cycle_rate is None else action_cycle_rate
         if gui and render_mode is None:
             render_mode = "human"  # what robo-gym's `gui` shows
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(f"render_mode {render_mode!r} does not exist: expected one of {', '.join(RENDER_MODES)}")
-        if all(fixed):
+        if fixed.all():
             raise ValueError("all six joints are fixed: there is nothing left to act on")
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": action_cycle_rate}
+        self.metadata = {**self.metadata, "render_fps": rate_hz}
         self.simulation = URSimulation(
             ur_model,
-            max_velocity_scale=max_velocity_scale_factor,
-            cycle_s=1.0 / action_cycle_rate,
+            max_velocity_scale=scale,
+            cycle_s=1.0 / rate_hz,
             objects=self.OBJECTS,
             table=self.TABLE,
         )
-        self._free = np.flatnonzero(~np.array(fixed))
-        self._fixed = np.flatnonzero(np.array(fixed))
+        self._free = np.flatnonzero(~fixed)
+        self._fixed = np.flatnonzero(fixed)
         self._rs_state_to_info = rs_state_to_info
-        self._elements = action_elements(fixed, self._action_element())
+        self._elements = self._action_elements(fixed.tolist())
 
         low, high = self._observation_bounds()
         self.observation_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
         self._actions = gym.spaces.Box(-1.0, 1.0, (len(self._free),), dtype=np.float32)
         self.action_space = self._actions
 
-        self._camera = Camera(
-            self.simulation.model,
-            self.simulation.data,
-            lookat=(0.0, 0.05, 0.42),
-            distance=2.3,
-            azimuth=145.0,
-            elevation=-18.0,
-        )
+        self._camera = Camera(self.simulation.model, self.simulation.data, **VIEW)
         self._start: Vector = np.array(self.START_JOINTS)
         self._steps = 0
+
+    @classmethod
+    def describe(cls, *, action_cycle_rate: float | None = None, **arguments: Any) -> EnvDescription:
+        """Name the elements for the constructor arguments given, without building a simulator."""
+        fixed = [bool(arguments.get(f"fix_{joint}", joint == "wrist_3")) for joint in JOINTS]
+        return {
+            "observation": [element(name, unit) for name, unit in cls._observation_elements()],
+            "action": cls._action_elements(fixed),
+            "control_rate_hz": cls.RATE_HZ if action_cycle_rate is None else action_cycle_rate,
+        }
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -103,10 +152,10 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Command the joints, let one cycle pass, and judge the outcome."""
-        given = check_action(action, self._actions, self._elements)
+        values = check_action(action, self._actions, self._elements)
         self._steps += 1
         command = np.empty(6)  # all joints
-        command[self._free] = given
+        command[self._free] = values
         command[self._fixed] = self._fixed_values()[self._fixed]
         self.simulation.command(self._to_joint_positions(command))
         self.simulation.advance()
@@ -131,8 +180,8 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     @classmethod
     @abstractmethod
-    def _action_element(cls) -> tuple[str, str]:
-        """Return what an action element is called after its joint's name, and its unit."""
+    def _observation_elements(cls) -> list[tuple[str, str]]:
+        """Return name and unit of each observation element."""
 
     @abstractmethod
     def _observation_bounds(self) -> tuple[Vector, Vector]:
@@ -160,13 +209,19 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     # -- parts
 
+    @classmethod
+    def _action_elements(cls, fixed: Sequence[bool]) -> list[ElementInfo]:
+        """Name the elements of an action: one for each joint that is not fixed."""
+        name, unit = cls.ACTION_ELEMENT
+        return [element(f"{joint}_{name}", unit) for joint, is_fixed in zip(JOINTS, fixed, strict=True) if not is_fixed]
+
     def _place_arm(self, options: Mapping[str, Any]) -> Vector:
         """Put the arm where the options say and return that."""
-        given = options.get("joint_positions")
-        return self._place_arm_at(np.array(self.START_JOINTS) if given is None else self._check_joints(given))
+        values = options.get("joint_positions")
+        return self._place_arm_at(np.array(self.START_JOINTS) if values is None else self._check_joints(values))
 
-    def _check_joints(self, given: Any) -> Vector:
-        joints = as_vector("joint_positions", given, 6)
+    def _check_joints(self, values: Any) -> Vector:
+        joints = as_vector("joint_positions", values, 6)
         for joint, position, limit in zip(JOINTS, joints, POSITION_LIMITS, strict=True):
             if abs(position) > limit:
                 raise InvalidResetError(
@@ -181,18 +236,8 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
         return joints
 
 
-def action_elements(fixed: Fixed, what: tuple[str, str]) -> list[Any]:
-    """Name the elements of an action: one for each joint that is not fixed."""
-    name, unit = what
-    return [element(f"{joint}_{name}", unit) for joint, is_fixed in zip(JOINTS, fixed, strict=True) if not is_fixed]
-
-
-def describe(
-    observation: Sequence[tuple[str, str]], fixed: Fixed, action: tuple[str, str], rate: float
-) -> EnvDescription:
-    """Return the description of a task whose observation elements (name, unit) are given."""
-    return {
-        "observation": [element(name, unit) for name, unit in observation],
-        "action": action_elements(fixed, action),
-        "control_rate_hz": rate,
-    }
+def polar(point: Vector) -> tuple[float, float, float]:
+    """Return r [m], theta = acos(z/r) and phi = atan2(y, x) [rad] of a point (3,); theta is 0 at the origin."""
+    x, y, z = point.tolist()
+    r = math.sqrt(x * x + y * y + z * z)
+    return r, math.acos(max(-1.0, min(1.0, z / r))) if r > 0.0 else 0.0, math.atan2(y, x)

@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from typing_extensions import Unpack
 
-from rlservo.envs.checks import EnvDescription, InvalidResetError, as_vector
-from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, describe
+from rlservo.envs.checks import InvalidResetError, as_vector
+from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, ArmArguments, Observation, URArmEnv, Vector, polar
 from rlservo.envs.ur.object_paths import object_path
 from rlservo.envs.ur.parameters import JOINTS
 
@@ -93,64 +94,20 @@ class BasicAvoidanceURSim(URArmEnv):
     RS_MODE = "1moving2points"
     OBJECTS = ("sphere50",)
     TABLE = True
+    ACTION_ELEMENT = ("offset", "rad")
 
-    def __init__(
-        self,
-        rs_address: str | None = None,
-        fix_base: bool = False,
-        fix_shoulder: bool = False,
-        fix_elbow: bool = False,
-        fix_wrist_1: bool = False,
-        fix_wrist_2: bool = False,
-        fix_wrist_3: bool = True,
-        ur_model: str = "ur5",
-        include_polar_to_elbow: bool = False,
-        rs_state_to_info: bool = True,
-        *,
-        ip: str | None = None,
-        lower_bound_port: int | None = None,
-        upper_bound_port: int | None = None,
-        gui: bool = False,
-        max_velocity_scale_factor: float = 0.2,
-        action_cycle_rate: float = 20.0,
-        render_mode: str | None = None,
-    ) -> None:
-        del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
+    def __init__(self, *, include_polar_to_elbow: bool = False, **arguments: Unpack[ArmArguments]) -> None:
         self._include_polar_to_elbow = include_polar_to_elbow
-        super().__init__(
-            fixed=(fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3),
-            ur_model=ur_model,
-            rs_state_to_info=rs_state_to_info,
-            gui=gui,
-            max_velocity_scale_factor=max_velocity_scale_factor,
-            action_cycle_rate=action_cycle_rate,
-            render_mode=render_mode,
-        )
+        super().__init__(**arguments)
         self._previous_action: Vector = np.zeros(6)
 
     @classmethod
-    def describe(
-        cls,
-        fix_base: bool = False,
-        fix_shoulder: bool = False,
-        fix_elbow: bool = False,
-        fix_wrist_1: bool = False,
-        fix_wrist_2: bool = False,
-        fix_wrist_3: bool = True,
-        action_cycle_rate: float = 20.0,
-        **_unrelated: Any,
-    ) -> EnvDescription:
-        """Name the elements for the constructor arguments given, without building a simulator."""
-        fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
+    def _observation_elements(cls) -> list[tuple[str, str]]:
         observation = [("object_r", "m"), ("object_theta", "rad"), ("object_phi", "rad")]
         observation += [(f"{joint}_position_normalized", "1") for joint in JOINTS]
         observation += [(f"{joint}_offset_normalized", "1") for joint in JOINTS]
         observation += [("object_to_elbow_r", "m"), ("object_to_elbow_theta", "rad"), ("object_to_elbow_phi", "rad")]
-        return describe(observation, fixed, cls._action_element(), action_cycle_rate)
-
-    @classmethod
-    def _action_element(cls) -> tuple[str, str]:
-        return "offset", "rad"
+        return observation
 
     def _observation_bounds(self) -> tuple[Vector, Vector]:
         elbow = np.full(3, np.inf) if self._include_polar_to_elbow else np.zeros(3)
@@ -165,8 +122,8 @@ class BasicAvoidanceURSim(URArmEnv):
         if position is not None:
             self._start_object("fixed_position", dict(zip("xyz", as_vector("fixed_object_position", position, 3))))  # noqa: B905
             return
-        given = any(name in options for name in ("z_amplitude", "z_offset"))
-        for _ in range(1 if given else REDRAWS):
+        is_given = any(name in options for name in ("z_amplitude", "z_offset"))
+        for _ in range(1 if is_given else REDRAWS):
             wave = {
                 "x": OBJECT_X,
                 "y": OBJECT_Y,
@@ -174,7 +131,7 @@ class BasicAvoidanceURSim(URArmEnv):
                 "z_amplitude": self._drawn_or_given(options, "z_amplitude", Z_AMPLITUDE_RANGE),
                 "z_offset": self._drawn_or_given(options, "z_offset", Z_OFFSET_RANGE),
             }
-            if self._start_object("triangle_wave", wave, refuse=given):
+            if self._start_object("triangle_wave", wave, refuse=is_given):
                 return
         raise InvalidResetError(f"{REDRAWS} random motions of the ball all hit the arm at the given joint positions")
 
@@ -235,13 +192,6 @@ class BasicAvoidanceURSim(URArmEnv):
         if self._steps >= self.MAX_STEPS:
             return reward, False, True, _ending("success", ball)
         return reward, False, False, {}
-
-
-def polar(point: Vector) -> tuple[float, float, float]:
-    """Return r [m], theta = acos(z/r) and phi = atan2(y, x) [rad] of a point (3,); theta is 0 at the origin."""
-    x, y, z = point.tolist()
-    r = math.sqrt(x * x + y * y + z * z)
-    return r, math.acos(max(-1.0, min(1.0, z / r))) if r > 0.0 else 0.0, math.atan2(y, x)
 
 
 def _ending(status: str, ball: Vector) -> dict[str, Any]:

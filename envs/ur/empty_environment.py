@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rlservo.envs.checks import EnvDescription
-from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, describe
+from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector
 from rlservo.envs.ur.parameters import JOINTS
 
 
@@ -69,59 +68,13 @@ class EmptyEnvironmentURSim(URArmEnv):
     RS_MODE = "only_robot"
     OBJECTS = ()
     TABLE = False
-
-    def __init__(
-        self,
-        rs_address: str | None = None,
-        fix_base: bool = False,
-        fix_shoulder: bool = False,
-        fix_elbow: bool = False,
-        fix_wrist_1: bool = False,
-        fix_wrist_2: bool = False,
-        fix_wrist_3: bool = True,
-        ur_model: str = "ur5",
-        rs_state_to_info: bool = True,
-        *,
-        ip: str | None = None,
-        lower_bound_port: int | None = None,
-        upper_bound_port: int | None = None,
-        gui: bool = False,
-        max_velocity_scale_factor: float = 0.2,
-        action_cycle_rate: float = 20.0,
-        render_mode: str | None = None,
-    ) -> None:
-        del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
-        super().__init__(
-            fixed=(fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3),
-            ur_model=ur_model,
-            rs_state_to_info=rs_state_to_info,
-            gui=gui,
-            max_velocity_scale_factor=max_velocity_scale_factor,
-            action_cycle_rate=action_cycle_rate,
-            render_mode=render_mode,
-        )
+    ACTION_ELEMENT = ("position_normalized", "1")
 
     @classmethod
-    def describe(
-        cls,
-        fix_base: bool = False,
-        fix_shoulder: bool = False,
-        fix_elbow: bool = False,
-        fix_wrist_1: bool = False,
-        fix_wrist_2: bool = False,
-        fix_wrist_3: bool = True,
-        action_cycle_rate: float = 20.0,
-        **_unrelated: Any,
-    ) -> EnvDescription:
-        """Name the elements for the constructor arguments given, without building a simulator."""
-        fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
+    def _observation_elements(cls) -> list[tuple[str, str]]:
         observation = [(f"{joint}_position_normalized", "1") for joint in JOINTS]
         observation += [(f"{joint}_velocity", "rad/s") for joint in JOINTS]
-        return describe(observation, fixed, cls._action_element(), action_cycle_rate)
-
-    @classmethod
-    def _action_element(cls) -> tuple[str, str]:
-        return "position_normalized", "1"
+        return observation
 
     def _observation_bounds(self) -> tuple[Vector, Vector]:
         high = np.concatenate([np.full(6, POSITION_BOUND), np.full(6, np.inf)])

@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from typing_extensions import Unpack
 
-from rlservo.envs.checks import EnvDescription, InvalidResetError, as_vector
-from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, describe
+from rlservo.envs.checks import InvalidResetError, as_vector
+from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, ArmArguments, Observation, URArmEnv, Vector, polar
 from rlservo.envs.ur.parameters import JOINTS
 
 START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
@@ -92,39 +93,14 @@ class EndEffectorPositioningURSim(URArmEnv):
     RS_MODE = "1object"
     OBJECTS = ("sphere50_no_collision",)
     TABLE = True
+    ACTION_ELEMENT = ("position_normalized", "1")
+    MAX_VELOCITY_SCALE = 0.1
+    RATE_HZ = 10.0
 
     def __init__(
-        self,
-        rs_address: str | None = None,
-        fix_base: bool = False,
-        fix_shoulder: bool = False,
-        fix_elbow: bool = False,
-        fix_wrist_1: bool = False,
-        fix_wrist_2: bool = False,
-        fix_wrist_3: bool = True,
-        ur_model: str = "ur5",
-        rs_state_to_info: bool = True,
-        restrict_wrist_1: bool = True,
-        *,
-        ip: str | None = None,
-        lower_bound_port: int | None = None,
-        upper_bound_port: int | None = None,
-        gui: bool = False,
-        randomize_start: bool = False,
-        max_velocity_scale_factor: float = 0.1,
-        action_cycle_rate: float = 10.0,
-        render_mode: str | None = None,
+        self, *, restrict_wrist_1: bool = True, randomize_start: bool = False, **arguments: Unpack[ArmArguments]
     ) -> None:
-        del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
-        super().__init__(
-            fixed=(fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3),
-            ur_model=ur_model,
-            rs_state_to_info=rs_state_to_info,
-            gui=gui,
-            max_velocity_scale_factor=max_velocity_scale_factor,
-            action_cycle_rate=action_cycle_rate,
-            render_mode=render_mode,
-        )
+        super().__init__(**arguments)
         self._restrict_wrist_1 = restrict_wrist_1
         self._randomize_start = randomize_start
         self._target: Vector = np.zeros(3)
@@ -132,41 +108,25 @@ class EndEffectorPositioningURSim(URArmEnv):
         self._success_joints: Vector | None = None
 
     @classmethod
-    def describe(
-        cls,
-        fix_base: bool = False,
-        fix_shoulder: bool = False,
-        fix_elbow: bool = False,
-        fix_wrist_1: bool = False,
-        fix_wrist_2: bool = False,
-        fix_wrist_3: bool = True,
-        action_cycle_rate: float = 10.0,
-        **_unrelated: Any,
-    ) -> EnvDescription:
-        """Name the elements for the constructor arguments given, without building a simulator."""
-        fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
+    def _observation_elements(cls) -> list[tuple[str, str]]:
         observation = [("target_r", "m"), ("target_theta", "rad"), ("target_phi", "rad")]
         observation += [(f"{joint}_position_normalized", "1") for joint in JOINTS]
         observation += [(f"{joint}_velocity", "rad/s") for joint in JOINTS]
         observation += [(f"target_{axis}", "m") for axis in "xyz"]
         observation += [(f"ee_{axis}", "m") for axis in "xyz"]
         observation += [(f"{joint}_previous_action", "1") for joint in JOINTS]
-        return describe(observation, fixed, cls._action_element(), action_cycle_rate)
-
-    @classmethod
-    def _action_element(cls) -> tuple[str, str]:
-        return "position_normalized", "1"
+        return observation
 
     def _observation_bounds(self) -> tuple[Vector, Vector]:
-        unbounded = np.full(6, np.inf)
-        high = np.concatenate([unbounded[:3], np.full(6, POSITION_BOUND), unbounded, unbounded, np.full(6, 1.01)])
+        infinite = np.full(6, np.inf)
+        high = np.concatenate([infinite[:3], np.full(6, POSITION_BOUND), infinite, infinite, np.full(6, 1.01)])
         return -high, high
 
     # -- a new episode
 
     def _place_arm(self, options: Mapping[str, Any]) -> Vector:
-        given = options.get("joint_positions")
-        centre = np.array(START_JOINTS) if given is None else as_vector("joint_positions", given, 6)
+        joints_option = options.get("joint_positions")
+        centre = np.array(START_JOINTS) if joints_option is None else as_vector("joint_positions", joints_option, 6)
         if options.get("continue_on_success") and self._success_joints is not None:
             centre, randomize = self._success_joints, False
         else:
@@ -175,8 +135,8 @@ class EndEffectorPositioningURSim(URArmEnv):
         if not randomize:
             return self._place_arm_at(centre)
         for _ in range(REDRAWS):
-            drawn = self.np_random.uniform(centre - START_RANGE, centre + START_RANGE)
-            joints: Vector = np.clip(drawn, -LIMITS, LIMITS)
+            draw = self.np_random.uniform(centre - START_RANGE, centre + START_RANGE)
+            joints: Vector = np.clip(draw, -LIMITS, LIMITS)
             if not self.simulation.place(joints):
                 return joints
         raise InvalidResetError(f"{REDRAWS} random starts around the given joint positions all collide")
@@ -212,11 +172,8 @@ class EndEffectorPositioningURSim(URArmEnv):
     def _observation(self) -> Observation:
         sim = self.simulation
         tool = sim.tool_position
-        x, y, z = ((self._target - tool) @ sim.tool_rotation).tolist()  # the target in the tool0 frame
-        r = math.sqrt(x * x + y * y + z * z)
-        theta = math.acos(max(-1.0, min(1.0, z / r))) if r > 0.0 else 0.0
         observation = np.empty(27, dtype=np.float32)
-        observation[0:3] = r, theta, math.atan2(y, x)
+        observation[0:3] = polar((self._target - tool) @ sim.tool_rotation)  # in the tool0 frame
         observation[3:9] = sim.joint_positions / LIMITS
         observation[9:15] = sim.joint_velocities
         observation[15:18] = self._target

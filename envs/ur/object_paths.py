@@ -1,7 +1,7 @@
 """Paths of moving objects: robo-gym's object functions as positions of one round trip, 100 a second.
 
 Functions, parameter names and figures: jr-robotics/robo-gym-robot-servers, simulation_objects/scripts/
-objects_controller.py. It knows nothing of MuJoCo; positions are in whatever frame the parameters are.
+objects_controller.py. Positions are in whatever frame the parameters are.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class Parameters:
     def __init__(self, index: int, values: Mapping[str, float]) -> None:
         self._index, self._values = index, values
 
-    def number(self, name: str, shared: str | None = None) -> float:
+    def number(self, name: str, shared_name: str | None = None) -> float:
         """Return `object_<i>_<name>` (or the parameter `shared`, which older servers had for all objects)."""
         full = f"object_{self._index}_{name}"
         value = self._values.get(full)
-        if value is None and shared is not None:
-            value = self._values.get(shared)
+        if value is None and shared_name is not None:
+            value = self._values.get(shared_name)
         if value is None:
             raise ValueError(f"float_params lacks {full!r}, which the object's function needs")
         if not math.isfinite(value):
@@ -45,9 +45,9 @@ class Parameters:
         """Return x, y, z [m] of the parameters with that suffix."""
         return np.array([self.number(f"{axis}{suffix}") for axis in "xyz"])
 
-    def count(self, name: str, low: int, shared: str | None = None) -> int:
+    def count(self, name: str, low: int, shared_name: str | None = None) -> int:
         """Return a whole number of at least `low` (rounded down, as the original does)."""
-        value = self.number(name, shared)
+        value = self.number(name, shared_name)
         if not low <= value <= MAX_POINTS:
             raise ValueError(
                 f"float_params['object_{self._index}_{name}'] is {value:g}: expected {low} to {MAX_POINTS:,}"
@@ -77,14 +77,14 @@ def object_path(function: str, index: int, values: Mapping[str, float], rng: np.
     return FUNCTIONS[function](Parameters(index, values), rng)
 
 
-def fixed_position(given: Parameters, _rng: np.random.Generator) -> Path:
+def fixed_position(parameters: Parameters, _rng: np.random.Generator) -> Path:
     """Stay at x, y, z."""
-    return given.point()[None, :]
+    return parameters.point()[None, :]
 
 
-def triangle_wave(given: Parameters, _rng: np.random.Generator) -> Path:
+def triangle_wave(parameters: Parameters, _rng: np.random.Generator) -> Path:
     """Go up and down at x, y: from z_offset - z_amplitude to z_offset + z_amplitude and back, z_frequency [Hz]."""
-    frequency = given.number("z_frequency")
+    frequency = parameters.number("z_frequency")
     if not UPDATE_RATE_HZ / MAX_POINTS <= frequency <= UPDATE_RATE_HZ:
         raise ValueError(
             f"the triangle wave's z_frequency is {frequency:g} Hz: "
@@ -93,21 +93,21 @@ def triangle_wave(given: Parameters, _rng: np.random.Generator) -> Path:
     count = int(UPDATE_RATE_HZ / frequency)
     phase = np.linspace(0.0, 1.0, count)  # both ends included, so the lowest position comes twice
     path = np.empty((count, 3))
-    path[:, 0], path[:, 1] = given.number("x"), given.number("y")
-    path[:, 2] = given.number("z_offset") + given.number("z_amplitude") * (1.0 - np.abs(2.0 - 4.0 * phase))
+    path[:, 0], path[:, 1] = parameters.number("x"), parameters.number("y")
+    path[:, 2] = parameters.number("z_offset") + parameters.number("z_amplitude") * (1.0 - np.abs(2.0 - 4.0 * phase))
     return path
 
 
-def spline_3d(given: Parameters, rng: np.random.Generator) -> Path:
+def spline_3d(parameters: Parameters, rng: np.random.Generator) -> Path:
     """Follow a closed curve through n_points random points of a box, in n_sampling_points steps."""
-    return interpolate(_random_points(given, rng), _sampling_points(given))
+    return interpolate(_random_points(parameters, rng), _sampling_points(parameters))
 
 
-def spline_3d_ur5_workspace(given: Parameters, rng: np.random.Generator) -> Path:
+def spline_3d_ur5_workspace(parameters: Parameters, rng: np.random.Generator) -> Path:
     """Follow such a curve that keeps away from the arm's base."""
-    count = _sampling_points(given)
+    count = _sampling_points(parameters)
     for _ in range(REDRAWS):
-        points = _random_points(given, rng)
+        points = _random_points(parameters, rng)
         points[0, :2] = rng.choice((-1.0, 1.0), 2) * rng.uniform(*FIRST_POINT, 2)
         points[-1] = points[0]
         path = interpolate(points, count)
@@ -120,17 +120,17 @@ def spline_3d_ur5_workspace(given: Parameters, rng: np.random.Generator) -> Path
     )
 
 
-def fixed_position_a_b(given: Parameters, _rng: np.random.Generator) -> Path:
+def fixed_position_a_b(parameters: Parameters, _rng: np.random.Generator) -> Path:
     """Stay at a for hold_a [s], then at b for hold_b [s]."""
-    return _not_empty(_hold(given, "a"), _hold(given, "b"))
+    return _not_empty(_hold(parameters, "a"), _hold(parameters, "b"))
 
 
-def interpolated_a_b_c(given: Parameters, _rng: np.random.Generator) -> Path:
+def interpolated_a_b_c(parameters: Parameters, _rng: np.random.Generator) -> Path:
     """Stay at a, move straight to b, stay, move to c, stay; then start again at a."""
-    a, b, c = given.point("_a"), given.point("_b"), given.point("_c")
-    to_b = np.linspace(a, b, given.count("n_sampling_points_ab", 0))
-    to_c = np.linspace(b, c, given.count("n_sampling_points_bc", 0))
-    return _not_empty(_hold(given, "a"), to_b, _hold(given, "b"), to_c, _hold(given, "c"))
+    a, b, c = parameters.point("_a"), parameters.point("_b"), parameters.point("_c")
+    to_b = np.linspace(a, b, parameters.count("n_sampling_points_ab", 0))
+    to_c = np.linspace(b, c, parameters.count("n_sampling_points_bc", 0))
+    return _not_empty(_hold(parameters, "a"), to_b, _hold(parameters, "b"), to_c, _hold(parameters, "c"))
 
 
 FUNCTIONS: dict[str, Callable[[Parameters, np.random.Generator], Path]] = {
@@ -185,21 +185,21 @@ def _second_derivatives(knots: NDArray[np.float64], points: NDArray[np.float64])
     return second
 
 
-def _random_points(given: Parameters, rng: np.random.Generator) -> NDArray[np.float64]:
-    low, high = given.point("_min"), given.point("_max")
+def _random_points(parameters: Parameters, rng: np.random.Generator) -> NDArray[np.float64]:
+    low, high = parameters.point("_min"), parameters.point("_max")
     if (low > high).any():
         raise ValueError(f"the spline's box is from {low.tolist()} to {high.tolist()} m: expected min below max")
-    points = rng.uniform(low, high, (given.count("n_points", 4), 3))
+    points = rng.uniform(low, high, (parameters.count("n_points", 4), 3))
     points[-1] = points[0]  # closed
     return points
 
 
-def _sampling_points(given: Parameters) -> int:
-    return given.count("n_sampling_points", 2, shared="n_sampling_points")
+def _sampling_points(parameters: Parameters) -> int:
+    return parameters.count("n_sampling_points", 2, shared_name="n_sampling_points")
 
 
-def _hold(given: Parameters, where: str) -> Path:
-    return np.repeat(given.point(f"_{where}")[None, :], given.samples(f"hold_{where}"), axis=0)
+def _hold(parameters: Parameters, where: str) -> Path:
+    return np.repeat(parameters.point(f"_{where}")[None, :], parameters.samples(f"hold_{where}"), axis=0)
 
 
 def _not_empty(*parts: Path) -> Path:

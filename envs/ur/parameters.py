@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
-LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
 POSITION_LIMITS = (2 * math.pi, 2 * math.pi, math.pi, 2 * math.pi, 2 * math.pi, 2 * math.pi)  # [rad], +-
 
@@ -31,7 +30,7 @@ class URParameters:
     d6: float
     shoulder_offset: float  # the upper arm's centre line, along the shoulder axis
     elbow_offset: float  # the forearm's centre line, along the elbow axis
-    masses: tuple[float, ...]  # LINKS
+    masses: tuple[float, ...]  # [kg] of base, shoulder, upper_arm, forearm, wrist_1, wrist_2, wrist_3
     velocity_limits: tuple[float, ...]  # JOINTS
     effort_limits: tuple[float, ...]  # JOINTS
     workspace_radius: float

@@ -1,6 +1,6 @@
 """The modes of robo-gym's robot server for the arm: what a state holds, and where.
 
-Source: jr-robotics/robo-gym-robot-servers, ur_robot_server. It imports nothing heavy.
+Source: jr-robotics/robo-gym-robot-servers, ur_robot_server.
 """
 
 from __future__ import annotations

@@ -59,49 +59,49 @@ class Arm(Protocol):
         ...
 
 
-def state_dict(arm: Arm, rs_mode: str, *, turned: bool = False) -> dict[str, float]:
+def state_dict(arm: Arm, rs_mode: str, *, is_turned: bool = False) -> dict[str, float]:
     """Return the state by names. `turned` gives poses in the controller's `base` frame instead of base_link."""
     mode = rs_mode_of(rs_mode)
     values: dict[str, float] = {}
     for index in range(mode.objects):
-        values |= zip(_TRANSFORM_NAMES[f"object_{index}"], _object(arm, index, turned), strict=True)
+        values |= zip(_TRANSFORM_NAMES[f"object_{index}"], _object(arm, index, is_turned), strict=True)
     values |= zip(_POSITIONS, arm.joint_positions.tolist(), strict=True)
     values |= zip(_VELOCITIES, arm.joint_velocities.tolist(), strict=True)
-    values |= zip(_TRANSFORM_NAMES["ee"], _transform(arm.tool_position, arm.tool_rotation, turned), strict=True)
+    values |= zip(_TRANSFORM_NAMES["ee"], _transform(arm.tool_position, arm.tool_rotation, is_turned), strict=True)
     values["in_collision"] = float(arm.in_collision)
     if mode.forearm:
-        forearm = _transform(arm.forearm_position, arm.forearm_rotation, turned)
+        forearm = _transform(arm.forearm_position, arm.forearm_rotation, is_turned)
         values |= zip(_TRANSFORM_NAMES["forearm"], forearm, strict=True)
     return values
 
 
-def state_list(arm: Arm, rs_mode: str, *, turned: bool = False) -> list[float]:
+def state_list(arm: Arm, rs_mode: str, *, is_turned: bool = False) -> list[float]:
     """Return the state as a list: objects, positions, velocities, end effector, collision, forearm."""
     mode = rs_mode_of(rs_mode)
     values: list[float] = []
     for index in range(mode.objects):
-        values += _object(arm, index, turned)
+        values += _object(arm, index, is_turned)
     for joints in (arm.joint_positions.tolist(), arm.joint_velocities.tolist()):
         values += [joints[index] for index in ROS_ORDER]
-    values += _transform(arm.tool_position, arm.tool_rotation, turned)
+    values += _transform(arm.tool_position, arm.tool_rotation, is_turned)
     values.append(float(arm.in_collision))
     if mode.forearm:
-        values += _transform(arm.forearm_position, arm.forearm_rotation, turned)
+        values += _transform(arm.forearm_position, arm.forearm_rotation, is_turned)
     return values
 
 
-def _object(arm: Arm, index: int, turned: bool) -> Transform:
+def _object(arm: Arm, index: int, is_turned: bool) -> Transform:
     x, y, z = arm.object_position(index).tolist()
     # Objects are placed in the reference frame and never turn in it.
-    return (-x, -y, z, 0.0, 0.0, 0.0, 1.0) if turned else (x, y, z, 0.0, 0.0, 0.0, 1.0)
+    return (-x, -y, z, 0.0, 0.0, 0.0, 1.0) if is_turned else (x, y, z, 0.0, 0.0, 0.0, 1.0)
 
 
-def _transform(position: Vector, rotation: Vector, turned: bool) -> Transform:
+def _transform(position: Vector, rotation: Vector, is_turned: bool) -> Transform:
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, rotation.reshape(9))
     w, x, y, z = quaternion.tolist()
     px, py, pz = position.tolist()
-    if turned:  # by pi about z: `base` against base_link
+    if is_turned:  # by pi about z: `base` against base_link
         return -px, -py, pz, -y, x, w, -z
     return px, py, pz, x, y, z, w
 

@@ -1,8 +1,8 @@
 """The simulated arm: put it somewhere, command joint positions, let a control cycle pass, read where everything is.
 
 It follows robo-gym's robot server: a command becomes a one-point joint trajectory, and the next command replaces it;
-objects stand or move along paths. The Gymnasium environments and the robot server both run on it. It knows nothing of
-observations, rewards, Gymnasium or gRPC. Poses are in `base_link`, which stands unrotated on the table.
+objects stand or move along paths. The Gymnasium environments and the robot server both run on it. Poses are in
+`base_link`, which stands unrotated on the table.
 """
 
 from __future__ import annotations
@@ -22,6 +22,9 @@ from rlservo.envs.ur.server_state import state_dict
 MIN_TRAJECTORY_S = 0.5  # [s], the robot server never plans a shorter one
 SETTLE_CYCLES = 20  # the robot server lets so many pass after it has set a state
 UPDATE_SUBSTEPS = round(1.0 / (UPDATE_RATE_HZ * TIMESTEP))  # of physics, between two positions of a moving object
+
+# Of a camera.
+VIEW: dict[str, Any] = {"lookat": (0.0, 0.05, 0.42), "distance": 2.3, "azimuth": 145.0, "elevation": -18.0}
 
 MAX_PAYLOAD = 20.0  # [kg], more than the largest arm carries (ur16e: 16 kg)
 

@@ -53,9 +53,11 @@ def trace_writer(folder: Path) -> Callable[..., None]:
 
 
 def _piece(episode: Any) -> dict[str, Any]:
-    sent = episode.extra_model_outputs
+    outputs = episode.extra_model_outputs
     # What the environment was sent, where it is not what the network gave (scaled or clipped).
-    actions = episode.get_extra_model_outputs("actions_for_env") if "actions_for_env" in sent else episode.get_actions()
+    actions = (
+        episode.get_extra_model_outputs("actions_for_env") if "actions_for_env" in outputs else episode.get_actions()
+    )
     return {
         "episode": episode.id_,
         "t": episode.t_started,
@@ -74,7 +76,7 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
-def read_traces(folder: Path) -> Iterator[Trace]:
+def load_traces(folder: Path) -> Iterator[Trace]:
     """Yield the episodes of every file in `folder`, their pieces put together.
 
     Observations and actions are as `json` reads them; of a Dict space RLlib gives one map of arrays over time, and such

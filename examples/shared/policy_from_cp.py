@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from rlservo.export.commands.export import LOADING_RUNS_CODE
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.rollout.control_loop import success_of
 from rlservo.serve_app.rollout.environment import check_fit, make_env
+from rlservo.serve_app.rollout.episode import success_of
 from rlservo.serve_app.runtime.policy import Policy
 from shared.help_text import DefaultsFormatter
 
@@ -100,10 +100,10 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
     ):
         if not isinstance(ours, Box) or ours.shape != theirs.shape:
             raise UsageError(
-                f"the policy in {path} has {_named(ours)} for its {side} space, {env.spec.id} has {_named(theirs)}: it "
-                "was trained for another environment"
+                f"the policy in {path} has {_space_name(ours)} for its {side} space, {env.spec.id} has "
+                f"{_space_name(theirs)}: it was trained for another environment"
             )
-    loop = restored.loop()
+    loop = restored.start_loop()
     low, high = (np.asarray(side, np.float64) for side in (env.action_space.low, env.action_space.high))
     transform = leaf_transform(recipe.action_space, recipe.transform)
 
@@ -112,14 +112,14 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
         action = out["action"][0]
         # A Gaussian's or tanh's mean is the first half of its inputs: that is what RLlib scales and then clips.
         mean = np.asarray(out["action_dist_inputs"][0], np.float64)[: action.size].reshape(action.shape)
-        wanted = low + (mean + 1.0) * (high - low) / 2.0 if transform == "unsquash" else mean
-        outside = bool(((wanted < low - 1e-6) | (wanted > high + 1e-6)).any())
+        unclipped = low + (mean + 1.0) * (high - low) / 2.0 if transform == "unsquash" else mean
+        outside = bool(((unclipped < low - 1e-6) | (unclipped > high + 1e-6)).any())
         return action, outside and recipe.distribution == "diag_gaussian"
 
     return act
 
 
-def _named(space: Space[Any]) -> str:
+def _space_name(space: Space[Any]) -> str:
     """Name a space without its bounds, which fill a screen."""
     return f"a Box of shape {space.shape}" if isinstance(space, Box) else str(space)
 
@@ -130,13 +130,13 @@ def run_episodes(env: Any, act: Act, episodes: int, seed: int) -> Count:
     successes: list[bool] = []
     for episode in range(episodes):
         obs, info = env.reset(seed=seed + episode)
-        total, steps, ended = 0.0, 0, False
-        while not ended:
+        total, steps, is_over = 0.0, 0, False
+        while not is_over:
             action, clipped = act(obs, steps == 0)
             count.actions += 1
             count.clipped += clipped
             obs, reward, terminated, truncated, info = env.step(action)
-            total, steps, ended = total + float(reward), steps + 1, terminated or truncated
+            total, steps, is_over = total + float(reward), steps + 1, terminated or truncated
         successes.append(bool(success_of(info)))
         print(f"episode {episode}: return {total:.3f}, {steps} steps, {info.get('final_status', '')}", flush=True)
     print(f"{sum(successes)} of {episodes} episodes succeeded")

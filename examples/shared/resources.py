@@ -83,19 +83,19 @@ def check_room(
     for name in sorted({name for bundle in request for name in bundle}):
         if _total(request, name) > room.total(name) + ROUNDING:
             raise UsageError(
-                f"{_amount(name, _total(request, name))} asked for ({_listed(request)}); {room.name} has "
+                f"{_amount(name, _total(request, name))} asked for ({_listing(request)}); {room.name} has "
                 f"{_amount(name, room.total(name))}: {_advice(request, room, name, config)}"
             )
     fitting = _fitting(request, room, 1 if concurrent is None else concurrent)
     if fitting == 0:
         machines = ", ".join(_bundle({name: node.get(name, 0.0) for name in ("CPU", "GPU")}) for node in room.nodes)
         raise UsageError(
-            f"{_listed(request)} asked for, each on one machine; the machines of {room.name} have {machines}: ask for "
+            f"{_listing(request)} asked for, each on one machine; the machines of {room.name} have {machines}: ask for "
             "fewer or smaller processes"
         )
     if concurrent is not None and fitting < concurrent:
         raise UsageError(
-            f"{concurrent} trials at once asked for, each of {_listed(request)}; {room.name} has room for {fitting}: "
+            f"{concurrent} trials at once asked for, each of {_listing(request)}; {room.name} has room for {fitting}: "
             "leave --max-concurrent-trials out, and as many run as fit"
         )
 
@@ -141,7 +141,7 @@ def _bundle(bundle: Bundle) -> str:
     return " and ".join(_amount(name, amount) for name, amount in bundle.items() if amount) or "0 CPUs"
 
 
-def _listed(request: Sequence[Bundle]) -> str:
+def _listing(request: Sequence[Bundle]) -> str:
     """Return the bundles in words, equal ones together: `1 process with 1 CPU, 8 with 0.5 CPUs each`."""
     parts: list[str] = []
     for words, count in Counter(_bundle(bundle) for bundle in request).items():
@@ -153,44 +153,44 @@ def _listed(request: Sequence[Bundle]) -> str:
 @contextlib.contextmanager
 def waiting_is_said() -> Iterator[None]:
     """Print a line when trials of this process have waited 10 s for resources, and again while none runs."""
-    ended = threading.Event()
-    watcher = threading.Thread(target=_watch, args=(ended,), name="watch-resources", daemon=True)
+    done = threading.Event()
+    watcher = threading.Thread(target=_watch, args=(done,), name="watch-resources", daemon=True)
     watcher.start()
     try:
         yield
     finally:
-        ended.set()
+        done.set()
         watcher.join(timeout=5.0)
 
 
-def _watch(ended: threading.Event) -> None:
+def _watch(done: threading.Event) -> None:
     job = ray.get_runtime_context().get_job_id()
     since: dict[str, float] = {}  # placement group -> when it was first seen waiting
-    said: dict[str, float] = {}  # line -> when it was printed
-    while not ended.wait(POLL_S):
+    printed_at: dict[str, float] = {}  # line -> when it was printed
+    while not done.wait(POLL_S):
         try:
             # A group's id ends with that of the job it belongs to; others' on the cluster are not ours to tell.
             ours = {key: group for key, group in placement_group_table().items() if key.endswith(job)}
-            waiting = {key for key, group in ours.items() if group["state"] in ("PENDING", "RESCHEDULING")}
+            pending = {key for key, group in ours.items() if group["state"] in ("PENDING", "RESCHEDULING")}
             now = time.monotonic()
-            since = {key: since.get(key, now) for key in waiting}
-            long = [key for key in waiting if now - since[key] >= SAID_AFTER_S]
+            since = {key: since.get(key, now) for key in pending}
+            long = [key for key in pending if now - since[key] >= SAID_AFTER_S]
             if not long:
                 continue
             runs = any(group["state"] == "CREATED" for group in ours.values())
             line = _waiting_line(list(ours[long[0]]["bundles"].values()))
         except Exception:  # Ray is ending, or its head is away: whoever trains says so
             continue
-        if line not in said or (not runs and now - said[line] >= SAID_AGAIN_S):
-            said[line] = now
+        if line not in printed_at or (not runs and now - printed_at[line] >= SAID_AGAIN_S):
+            printed_at[line] = now
             print(line, file=sys.stderr, flush=True)
 
 
 def _waiting_line(bundles: Sequence[Bundle]) -> str:
     total, free = ray.cluster_resources(), ray.available_resources()
     names = sorted({name for bundle in bundles for name in bundle})
-    wanted = " and ".join(_amount(name, _total(bundles, name)) for name in names)
+    amounts = " and ".join(_amount(name, _total(bundles, name)) for name in names)
     there = " and ".join(
         f"{_amount(name, total.get(name, 0.0))}, {free.get(name, 0.0):g} of them free" for name in names
     )
-    return f"waiting for {wanted} ({_listed(bundles)}): the cluster has {there}; Ctrl-C stops"
+    return f"waiting for {amounts} ({_listing(bundles)}): the cluster has {there}; Ctrl-C stops"

@@ -27,14 +27,14 @@ from ray.tune.search.sample import Categorical, Domain
 from rlservo.export.contract.errors import UsageError
 
 assert ray_settings
-DRAWN: dict[str, Callable[..., Any]] = {
+DISTRIBUTIONS: dict[str, Callable[..., Any]] = {
     "uniform": tune.uniform,
     "loguniform": tune.loguniform,
     "randint": tune.randint,
     "quniform": tune.quniform,
 }
 
-RENAMED = {
+NEW_NAMES = {
     "num_workers": "--num-cpus",
     "num_rollout_workers": "--num-cpus",
     "num_env_runners": "--num-cpus",
@@ -54,7 +54,7 @@ RENAMED = {
 }
 
 
-def read_settings(pairs: Sequence[str], option: str) -> dict[str, list[Any]]:
+def parse_settings(pairs: Sequence[str], option: str) -> dict[str, list[Any]]:
     """Return NAME=VALUE[,VALUE...] pairs as lists of YAML values (`1e-4` is a number, too).
 
     Raises UsageError naming the pair that is none.
@@ -86,7 +86,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def read_search_space(path: Path) -> dict[str, Any]:
+def load_search_space(path: Path) -> dict[str, Any]:
     """Return a YAML file's search space, by name, as Tune's domains.
 
     Raises UsageError when it cannot be read, naming the entry that is wrong.
@@ -108,18 +108,18 @@ def _domain(path: Path, name: str, entry: Any) -> Any:
         kind, values = next(iter(entry.items()))
         if kind == "choice" and isinstance(values, list) and values:
             return tune.choice([_number(value) for value in values])
-        if kind in DRAWN and isinstance(values, list):
+        if kind in DISTRIBUTIONS and isinstance(values, list):
             numbers = [_number(value) for value in values]
-            expected = 3 if kind == "quniform" else 2
-            if len(numbers) == expected and all(isinstance(one, int | float) for one in numbers):
+            count = 3 if kind == "quniform" else 2
+            if len(numbers) == count and all(isinstance(one, int | float) for one in numbers):
                 if numbers[0] < numbers[1] and (kind != "loguniform" or numbers[0] > 0):
-                    return DRAWN[kind](*numbers)
+                    return DISTRIBUTIONS[kind](*numbers)
                 raise UsageError(f"--search-space {path}: {name}: {kind} {values} needs low < high (above 0 for log)")
     if not isinstance(entry, list | Mapping):
         return _number(entry)
     raise UsageError(
         f"--search-space {path}: {name}: expected a value, a list, or one of "
-        f"{', '.join(['choice', *DRAWN])} with a list, got {entry}"
+        f"{', '.join(['choice', *DISTRIBUTIONS])} with a list, got {entry}"
     )
 
 
@@ -133,13 +133,13 @@ def apply(config: AlgorithmConfig, settings: Mapping[str, Any], option: str) -> 
 
     Raises UsageError for a name the algorithm does not have, naming today's or the closest ones.
     """
-    known = [name for name in vars(config) if not name.startswith("_")]
-    known += [name.removeprefix("_") for name in vars(config) if hasattr(type(config), name.removeprefix("_"))]
+    names = [name for name in vars(config) if not name.startswith("_")]
+    names += [name.removeprefix("_") for name in vars(config) if hasattr(type(config), name.removeprefix("_"))]
     for name, value in settings.items():
-        if name in RENAMED:
-            raise UsageError(f"{option} {name}: use {RENAMED[name]} instead")
-        if name not in known:
-            close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+        if name in NEW_NAMES:
+            raise UsageError(f"{option} {name}: use {NEW_NAMES[name]} instead")
+        if name not in names:
+            close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
             hint = f"did you mean {' or '.join(close)}?" if close else f"see {type(config).__name__}'s attributes"
             raise UsageError(f"{option} {name}: {type(config).__name__} has no such setting: {hint}")
         try:
@@ -161,15 +161,15 @@ def check_combinations(config: AlgorithmConfig, space: Mapping[str, Any], at_mos
 
     Raises UsageError for one that RLlib would refuse.
     """
-    combined = []
+    combinations = []
     axes = [_values(domain) for domain in space.values()]
     for values in itertools.islice(itertools.product(*axes), at_most) if space else ():
         combination = dict(zip(space, values, strict=True))
         one = config.copy(copy_frozen=False)
         apply(one, combination, "--sweep")
         validate(one, " ".join(f"{name}={value}" for name, value in combination.items()))
-        combined.append(one)
-    return combined
+        combinations.append(one)
+    return combinations
 
 
 def _values(domain: Any) -> list[Any]:

@@ -160,14 +160,14 @@ def run(task: Task, parser: argparse.ArgumentParser) -> None:
     gpus = gpus_asked_for(parser)
     training_run.pickle_by_value(sys.modules[__name__])
     if args.resume:
-        described, _ = training_run.read_run(args.resume)
-        there = {"CPU": described.num_cpus or os.cpu_count() or 1, "GPU": training_run.local_gpus()}
-        resources.check_room(described.request, Room("this machine", (there,)))
-        with training_run.ray_session(num_cpus=described.num_cpus, num_gpus=described.num_gpus):
+        run, _ = training_run.load_run(args.resume)
+        there = {"CPU": run.num_cpus or os.cpu_count() or 1, "GPU": training_run.local_gpus()}
+        resources.check_room(run.request, Room("this machine", (there,)))
+        with training_run.ray_session(num_cpus=run.num_cpus, num_gpus=run.num_gpus):
             outcome = training_run.resume(args.resume)
     else:
         training_run.check_storage(args.storage)
-        described = Run(
+        run = Run(
             args.run,
             task.env_id,
             task.env_config,
@@ -188,7 +188,7 @@ def run(task: Task, parser: argparse.ArgumentParser) -> None:
             )
             outcome = training_run.train(
                 config,
-                described,
+                run,
                 storage=args.storage,
                 stop={
                     "training_iteration": args.stop_iters,
@@ -197,14 +197,14 @@ def run(task: Task, parser: argparse.ArgumentParser) -> None:
                 },
                 checkpoint_frequency=args.checkpoint_frequency,
             )
-    training_run.report(outcome, described)
+    training_run.report(outcome, run)
     checkpoint = training_run.best_checkpoint_of(outcome)
     print(f"best checkpoint: {checkpoint}")
     training_run.export_and_run(
         checkpoint,
         outcome.folder.parent / "policies",
-        env_id=described.env_id,
-        env_config=described.rest["inference_config"],
-        episodes=described.rest["episodes"],
-        explore=described.rest["explore"],
+        env_id=run.env_id,
+        env_config=run.rest["inference_config"],
+        episodes=run.rest["episodes"],
+        explore=run.rest["explore"],
     )

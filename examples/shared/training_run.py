@@ -1,7 +1,7 @@
 """Run RLlib under Tune from a script: a private Ray, a progress table, Ctrl-C, resuming, the best checkpoint, a bundle.
 
 What `simple_trainer.py`, `training_inference_ur.py`, `training_inference_mir.py`, `tour.py` and `policy_from_cp_*.py`
-share. It knows nothing of particular environments or of the command lines; those are the scripts' own.
+share.
 
 A run is a Tune experiment folder `<storage>/<algorithm>-<environment>-<time>`: one folder per trial with its
 checkpoints, `result.json`, `progress.csv` and TensorBoard's event file, and `run.json`, which is what resuming needs to
@@ -54,7 +54,7 @@ _out = Console(soft_wrap=True, highlight=False)
 MILESTONE, MILESTONE_EPISODES = 0.95, 20  # the success rate whose time is printed, in an iteration with enough episodes
 
 
-class Interrupted(Exception):
+class InterruptError(Exception):
     """The user stopped the training; `folder` can be resumed."""
 
     def __init__(self, folder: Path) -> None:
@@ -108,7 +108,7 @@ def main_with_sentences(main: Callable[[], None], script: str) -> NoReturn:
     """Run a script's `main`: one sentence and no traceback on an error, 130 on Ctrl-C, 2 for a wrong argument."""
     try:
         main()
-    except Interrupted as stopped:
+    except InterruptError as stopped:
         print(f"stopped; go on with: python {script} --resume {stopped.folder}", flush=True)
         sys.exit(INTERRUPTED)
     except KeyboardInterrupt:
@@ -173,7 +173,7 @@ def ray_session(
             with resources.waiting_is_said():
                 yield
         finally:
-            with _undisturbed():
+            with _ignore_signals():
                 ray.shutdown()
                 if folder is not None:
                     shutil.rmtree(folder, ignore_errors=True)
@@ -245,7 +245,7 @@ def _sigterm_as_ctrl_c() -> Iterator[Callable[[], None]]:
 
 
 @contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
+def _ignore_signals() -> Iterator[None]:
     """Let no second Ctrl-C leave Ray's processes and folder behind."""
     before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -262,7 +262,7 @@ def build(config: AlgorithmConfig) -> Any:
 
 
 @contextlib.contextmanager
-def built(algorithm: Any) -> Iterator[Any]:
+def stopping(algorithm: Any) -> Iterator[Any]:
     """Stop an algorithm that was built without Tune, and remove the folder it makes in ~/ray_results (ray 2.60)."""
     try:
         yield algorithm
@@ -404,13 +404,13 @@ def train(
 def check_storage(storage: Path) -> None:
     """Raise UsageError when no folder can be made in `storage`: better now than when Ray has started."""
     try:
-        with tempfile.TemporaryDirectory(dir=_made(storage)):
+        with tempfile.TemporaryDirectory(dir=_make_folder(storage)):
             pass
     except OSError as error:
         raise UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
 
 
-def _made(storage: Path) -> Path:
+def _make_folder(storage: Path) -> Path:
     folder = storage.expanduser().resolve()
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -419,7 +419,7 @@ def _made(storage: Path) -> Path:
 def _new_folder(storage: Path, name: str) -> Path:
     """Make a folder of this name, or a longer one: jobs of an array begin in the same second."""
     try:
-        folder = _made(storage) / name
+        folder = _make_folder(storage) / name
         while True:
             with contextlib.suppress(FileExistsError):
                 folder.mkdir()
@@ -433,15 +433,15 @@ def _trial_name(trial: Any) -> str:
     return f"trial_{trial.trial_id}"
 
 
-def read_run(folder: Path) -> tuple[Run, list[str]]:
+def load_run(folder: Path) -> tuple[Run, list[str]]:
     """Return what `run.json` of a run's folder says, and the names of the swept settings.
 
     Raises UsageError when the folder is no run.
     """
     try:
-        saved = json.loads((folder / RUN_FILE).read_text())
-        swept = saved.pop("swept")
-        return Run(**saved), list(swept)
+        document = json.loads((folder / RUN_FILE).read_text())
+        swept = document.pop("swept")
+        return Run(**document), list(swept)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         near = sorted(path.parent for path in folder.parent.glob(f"*/{RUN_FILE}"))
         runs = f"; the newest there is {max(near, key=lambda path: path.stat().st_mtime)}" if near else ""
@@ -457,7 +457,7 @@ def resume(folder: Path, *, where: str = "this machine") -> Outcome:
     RlservoError when a trial fails.
     """
     folder = folder.expanduser().resolve()
-    run, swept = read_run(folder)
+    run, swept = load_run(folder)
     resources.check_room(run.request, resources.ray_room(where))
     default_config(run.algorithm)  # registers the algorithms, quietly
     if not tune.Tuner.can_restore(str(folder)):
@@ -473,7 +473,7 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
     try:
         results = tuner.fit()
     except KeyboardInterrupt:
-        raise Interrupted(folder) from None
+        raise InterruptError(folder) from None
     except Exception as error:  # before a trial has begun, or Tune's own; a trial's are in the results
         raise RlservoError(f"training failed: {_cause(error)}") from error
     trials, failed, unfinished = [], [], False
@@ -484,7 +484,7 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
             unfinished = True
         trials.append(_trial(result, run, swept))
     if unfinished or not trials:
-        raise Interrupted(folder)
+        raise InterruptError(folder)
     if len(failed) == len(trials):
         raise RlservoError(
             f"training failed: {_cause(failed[0].error)}; all of it is in {failed[0].path}/error.txt, and "
@@ -498,13 +498,13 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
 
 def _trial(result: Any, run: Run, swept: Sequence[str]) -> Trial:
     metrics = result.metrics or {}
-    scored = [
+    scores = [
         (score, Path(checkpoint.path))
         for checkpoint, at in result.best_checkpoints
         if math.isfinite(score := _metric(at, run.metric))
     ]
     newest = Path(result.checkpoint.path) if result.checkpoint else None
-    best = (max if run.mode == "max" else min)(scored, default=(math.nan, newest), key=lambda pair: pair[0])
+    best = (max if run.mode == "max" else min)(scores, default=(math.nan, newest), key=lambda pair: pair[0])
     config = result.config or {}
     return Trial(
         name=Path(result.path).name,
@@ -632,12 +632,12 @@ def export_and_run(
     from rlservo.serve_app.rollout.report import render_report
     from rlservo.serve_app.runtime.policy import Policy
 
-    exported = export_checkpoint(checkpoint, out, app_dir=app_dir, notify=print)
-    print(f"bundle: {exported.path}", flush=True)
+    bundle = export_checkpoint(checkpoint, out, app_dir=app_dir, notify=print)
+    print(f"bundle: {bundle.path}", flush=True)
     if episodes:
-        with Policy.load(exported.path) as policy:
-            done = rollout(policy, env_id, episodes=episodes, seed=seed, explore=explore, env_kwargs=env_config)
-        _out.print(render_report(done))
-        if done.interrupted:
+        with Policy.load(bundle.path) as policy:
+            result = rollout(policy, env_id, episodes=episodes, seed=seed, explore=explore, env_kwargs=env_config)
+        _out.print(render_report(result))
+        if result.interrupted:
             raise KeyboardInterrupt
-    return exported.path
+    return bundle.path

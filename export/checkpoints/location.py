@@ -1,7 +1,6 @@
 """Find the files of a checkpoint: from whatever folder a person points at to the folders the exporter reads.
 
-This file only looks at names. It opens no pickle and knows nothing of RLlib, so it can say what is wrong with a path
-before anything heavy is imported or any code in the checkpoint is run.
+Names of files are enough for it, so that a wrong path is told before RLlib is imported or code in a checkpoint runs.
 """
 
 from __future__ import annotations

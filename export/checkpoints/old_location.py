@@ -1,6 +1,6 @@
 """Find the files of an old-API-stack checkpoint: `policies/<policy id>/policy_state.pkl`, or such a folder on its own.
 
-Like `location.py` it only looks at names, opens no pickle and knows nothing of RLlib.
+As in `location.py`, names of files are enough.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Bring a checkpoint to this machine: whatever URI Ray itself reads, into a temporary folder that goes away again.
+"""Download a checkpoint from any URI that Ray itself reads into a temporary folder, removed afterwards.
 
 Like Ray's own storage it asks pyarrow first (`file://`, `s3://`, `gs://`, `hdfs://`) and then fsspec (`memory://`,
-`abfs://`, `http://`, ... where the package of that protocol is installed). It looks into nothing.
+`abfs://`, `http://`, ... where the package of that protocol is installed).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def is_uri(path: str | Path) -> bool:
 
 
 @contextlib.contextmanager
-def fetched(path: str | Path, progress: Callable[[str], None]) -> Iterator[Path]:
+def fetch(path: str | Path, progress: Callable[[str], None]) -> Iterator[Path]:
     """Give the local folder of `path`: itself, or a copy of what its URI names, removed on the way out.
 
     Raises CheckpointError when there is nothing there, UsageError when no file system here reads such URIs. Errors from
@@ -54,10 +54,10 @@ def _download(uri: str, local: Path) -> None:
 
     filesystem, inside = _filesystem(uri)
     try:
-        found: Any = filesystem.get_file_info(inside)
-        if found.type == pyarrow.fs.FileType.NotFound:
+        info: Any = filesystem.get_file_info(inside)
+        if info.type == pyarrow.fs.FileType.NotFound:
             raise CheckpointError(f"{uri} does not exist: expected the folder of an RLlib checkpoint")
-        if found.type == pyarrow.fs.FileType.File:
+        if info.type == pyarrow.fs.FileType.File:
             raise CheckpointError(f"{uri} is a file: expected the folder of an RLlib checkpoint")
         local.mkdir()
         pyarrow.fs.copy_files(inside, str(local), source_filesystem=filesystem, destination_filesystem=_here())

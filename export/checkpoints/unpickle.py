@@ -1,4 +1,4 @@
-"""Open a checkpoint's pickles, and say in one sentence why one cannot be opened.
+"""Load a checkpoint's pickles, and explain in one sentence why one cannot be loaded.
 
 Loading a pickle runs the code it names; callers say so first.
 """

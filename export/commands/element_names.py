@@ -41,10 +41,10 @@ def read_elements(
         describe = getattr(_env_class(env_id), "describe", None)
         if describe is None:
             return ElementNames()
-        told = describe(**env_config)
-        observation = _elements(told.get("observation", ()))
-        action = _elements(told.get("action", ()))
-        rate = _rate(told.get("control_rate_hz"))
+        description = describe(**env_config)
+        observation = _elements(description.get("observation", ()))
+        action = _elements(description.get("action", ()))
+        rate = _rate(description.get("control_rate_hz"))
     except (Exception, SystemExit) as error:  # importing and asking run the user's own code
         notify(
             f"the elements stay without names, which changes nothing else: environment {env_id} cannot be asked for "
@@ -77,17 +77,17 @@ def _env_class(env_id: str) -> Any:
     return found
 
 
-def _elements(told: Any) -> tuple[Element, ...]:
+def _elements(described: Any) -> tuple[Element, ...]:
     try:
-        return tuple(Element(name=one["name"], unit=one.get("unit", "")) for one in told)
+        return tuple(Element(name=one["name"], unit=one.get("unit", "")) for one in described)
     except (ValidationError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"expected a list of {{'name', 'unit'}}, got {told!r:.80}") from error
+        raise ValueError(f"expected a list of {{'name', 'unit'}}, got {described!r:.80}") from error
 
 
-def _rate(told: Any) -> float | None:
-    if told is None:
+def _rate(described: Any) -> float | None:
+    if described is None:
         return None
-    rate = float(told)
+    rate = float(described)
     if not (math.isfinite(rate) and rate > 0):
-        raise ValueError(f"control_rate_hz must be a positive number, got {told!r}")
+        raise ValueError(f"control_rate_hz must be a positive number, got {described!r}")
     return rate

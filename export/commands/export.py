@@ -7,7 +7,6 @@ there whole or not at all.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import datetime
 import logging
 import shutil
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 import rlservo
 from rlservo.export.checkpoints.facts import CheckpointFacts, read_facts
 from rlservo.export.checkpoints.location import Files, locate_checkpoint, locate_modules
-from rlservo.export.checkpoints.remote import fetched, is_uri
+from rlservo.export.checkpoints.remote import fetch, is_uri
 from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.commands.element_names import read_elements
 from rlservo.export.commands.naming import bundle_name, check_names, choose_target, default_name
@@ -38,9 +37,9 @@ from rlservo.export.contract.bundle import (
     write_golden,
 )
 from rlservo.export.contract.contract import Contract, Distribution, Parity, Provenance, TensorSpec, contract_json
-from rlservo.export.contract.errors import CheckpointError, ParityError, UsageError
+from rlservo.export.contract.errors import AgentsDifferError, ParityError, UsageError
 from rlservo.export.graph.one_thread import one_thread
-from rlservo.export.proof.parity import GraphLoop, Recorded, prove, record, record_moved, replay, ties
+from rlservo.export.proof.parity import GraphLoop, Reference, prove, record, record_perturbed, replay, ties
 from rlservo.export.recipe.describe import baked_steps
 from rlservo.export.recipe.recipe import Recipe, loose_bounds
 from rlservo.export.recipe.runners import Inputs, Outputs, Runner
@@ -48,7 +47,7 @@ from rlservo.export.recipe.samples import BATCH_SIZES, draw_batches
 from rlservo.export.recipe.to_contract import space_spec, state_spec
 
 if TYPE_CHECKING:
-    from rlservo.export.rllib.restore import Restored
+    from rlservo.export.rllib.restored_policy import RestoredPolicy
 
 logger = logging.getLogger(__name__)
 
@@ -58,12 +57,12 @@ SEED = 20240
 LOADING_RUNS_CODE = "loading {path}: checkpoints are pickles and run code when loaded; export only those you trust"
 
 
-Say: TypeAlias = Callable[[str], None]
+Notify: TypeAlias = Callable[[str], None]
 """Takes one sentence for a person."""
 
 
-def _silent(_stage: str) -> None:
-    """Nobody watches the progress."""
+def silent(_sentence: str) -> None:
+    """Show nobody how far a command is."""
 
 
 @dataclass(frozen=True)
@@ -75,16 +74,16 @@ class ExportResult:
 
 
 @dataclass(frozen=True)
-class _Order:
-    """What all bundles of one export share."""
+class _Options:
+    """Options that all bundles of one export share."""
 
     out: Path
     name: str | None
     version: str | None
     description: str
     value: bool
-    notify: Say
-    progress: Say
+    notify: Notify
+    progress: Notify
 
 
 def export_checkpoint(
@@ -98,8 +97,8 @@ def export_checkpoint(
     agent_id: str | None = None,
     app_dir: str | Path = ".",
     value: bool = True,
-    notify: Say = logger.warning,
-    progress: Say = _silent,
+    notify: Notify = logger.warning,
+    progress: Notify = silent,
 ) -> ExportResult:
     """Export one policy of an RLlib checkpoint to `out/<name>/<version>/`.
 
@@ -112,10 +111,10 @@ def export_checkpoint(
     Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
     cannot be exported, ParityError when the graph does not give RLlib's own actions. Nothing is left behind then.
     """
-    with fetched(checkpoint, progress) as local:
+    with fetch(checkpoint, progress) as local:
         files = locate_checkpoint(local, module_id, agent_id)
-        order = _Order(Path(out), name, version, description, value, notify, progress)
-        return _export([files], order, app_dir, checkpoint)[0]
+        options = _Options(Path(out), name, version, description, value, notify, progress)
+        return _export([files], options, app_dir, checkpoint)[0]
 
 
 def export_all_modules(
@@ -127,45 +126,45 @@ def export_all_modules(
     description: str = "",
     app_dir: str | Path = ".",
     value: bool = True,
-    notify: Say,
-    progress: Say = _silent,
+    notify: Notify,
+    progress: Notify = silent,
 ) -> list[ExportResult]:
     """Export every policy of a checkpoint, each to `out/<name>-<module id>/<version>/`: all of them, or none.
 
     A module whose agents are treated differently gives a bundle an agent, `<name>-<module id>-<agent id>`. The rest is
     as for `export_checkpoint`.
     """
-    with fetched(checkpoint, progress) as local:
-        order = _Order(Path(out), name, version, description, value, notify, progress)
-        return _export(locate_modules(local), order, app_dir, checkpoint, name_all=True)
+    with fetch(checkpoint, progress) as local:
+        options = _Options(Path(out), name, version, description, value, notify, progress)
+        return _export(locate_modules(local), options, app_dir, checkpoint, name_all=True)
 
 
 def _export(
-    found: Sequence[Files], order: _Order, app_dir: str | Path, checkpoint: str | Path, *, name_all: bool = False
+    policies: Sequence[Files], options: _Options, app_dir: str | Path, checkpoint: str | Path, *, name_all: bool = False
 ) -> list[ExportResult]:
-    """Write a bundle for each of `found`; they get their names when all of them are proven."""
-    check_names(order.name, order.version)
-    root = found[0].root
-    order.notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else root))
+    """Write a bundle for each of `policies`; they get their names when all of them are proven."""
+    check_names(options.name, options.version)
+    root = policies[0].root
+    options.notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else root))
     with user_code(app_dir) as folder, contextlib.ExitStack() as folders:
-        order.progress("reading the checkpoint")
-        facts = read_facts(root, order.notify)
-        base = order.name or default_name(facts.env_id, root)
+        options.progress("reading the checkpoint")
+        facts = read_facts(root, options.notify)
+        base = options.name or default_name(facts.env_id, root)
         written: list[tuple[Path, ExportResult]] = []
-        waiting = list(found)
-        while waiting:
-            files = waiting.pop(0)
-            extended = files.is_one_of_several and (name_all or not order.name)
+        queue = list(policies)
+        while queue:
+            files = queue.pop(0)
+            extended = files.is_one_of_several and (name_all or not options.name)
             name = bundle_name(base, files.module_id, files.agent_id) if extended else base
-            target = choose_target(order.out, name, order.version)
+            target = choose_target(options.out, name, options.version)
             if any(result.path == target for _, result in written):
                 raise UsageError(f"two modules would both be written to {target}: export them one by one, with --name")
             try:
-                written.append(_build(files, facts, folder, target, order, folders))
-            except CheckpointError as error:
-                if not name_all or "agents" not in error.details:
+                written.append(_build(files, facts, folder, target, options, folders))
+            except AgentsDifferError as error:
+                if not name_all:
                     raise
-                waiting[:0] = [dataclasses.replace(files, agent_id=agent) for agent in error.details["agents"]]
+                queue[:0] = [locate_checkpoint(files.root, files.module_id, agent) for agent in error.agents]
         _publish(written)
     return [result for _, result in written]
 
@@ -184,23 +183,26 @@ def _publish(written: Sequence[tuple[Path, ExportResult]]) -> None:
 
 
 def _build(
-    files: Files, facts: CheckpointFacts, app_dir: Path, target: Path, order: _Order, folders: contextlib.ExitStack
+    files: Files, facts: CheckpointFacts, app_dir: Path, target: Path, options: _Options, folders: contextlib.ExitStack
 ) -> tuple[Path, ExportResult]:
     """Return the finished bundle in a folder that only wants its name."""
-    order.progress(f"restoring '{files.module_id}' (importing torch and RLlib takes seconds)")
-    restored = _load(files, app_dir, order.notify, order.value)
+    options.progress(f"restoring '{files.module_id}' (importing torch and RLlib takes seconds)")
+    # Here and not at the top: torch and RLlib take seconds to import, and a wrong path should not have to wait for it.
+    from rlservo.export.rllib.restore import restore
+
+    restored = restore(files, app_dir, options.notify, value=options.value)
     for warning in loose_bounds(restored.recipe):
-        order.notify(warning)
-    elements = read_elements(facts.env_id, facts.env_config, restored.recipe, order.notify)
+        options.notify(warning)
+    elements = read_elements(facts.env_id, facts.env_config, restored.recipe, options.notify)
     folder = folders.enter_context(_temporary_folder(target))
     with one_thread():
         labels = [element.name for element in elements.action]
-        parity, golden = _write_graphs(folder, restored, labels, files.api_stack, order.progress)
+        parity, golden = _write_graphs(folder, restored, labels, files.api_stack, options.progress)
         recipe = restored.recipe
         contract = Contract(
             name=target.parent.name,
             version=target.name,
-            description=order.description,
+            description=options.description,
             observation_space=space_spec(recipe.observation_space, elements.observation),
             action_space=space_spec(recipe.action_space, elements.action, action=True),
             inputs=tuple(_tensor(name, values) for name, values in golden.inputs.items()),
@@ -216,13 +218,6 @@ def _build(
         )
         _write_rest(folder, contract, golden)
     return folder, ExportResult(target, contract)
-
-
-def _load(files: Files, app_dir: Path, notify: Callable[[str], None], value: bool) -> Restored:
-    # Here and not at the top: torch and RLlib take seconds to import, and a wrong path should not have to wait for it.
-    from rlservo.export.rllib.restore import restore
-
-    return restore(files, app_dir, notify, value=value)
 
 
 @contextlib.contextmanager
@@ -251,7 +246,7 @@ class _Golden:
 
 
 def _write_graphs(
-    folder: Path, restored: Restored, labels: list[str], api_stack: str, progress: Say
+    folder: Path, restored: RestoredPolicy, labels: list[str], api_stack: str, progress: Notify
 ) -> tuple[Parity, _Golden]:
     """Write both formats, prove them, and return the proof and the golden vectors."""
     from rlservo.export.graph.onnx_file import run_onnx, write_onnx
@@ -263,7 +258,7 @@ def _write_graphs(
     graph = PolicyGraph(recipe, restored.network)
     batches = draw_batches(recipe, SEED)
     progress(f"asking RLlib itself for {sum(len(batch) for batch in batches):,} actions")
-    recorded = record(restored.reference, batches, restored.loop, recipe.observation_leaves)
+    references = record(restored.start_loop, batches, recipe.observation_leaves)
     pair = next(batch for batch in batches if len(batch) == BATCH_SIZES[1])
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(len(pair), np.bool_))
     progress("writing TorchScript and ONNX")
@@ -272,46 +267,49 @@ def _write_graphs(
     onnx = run_onnx(folder / ONNX_FILE)
     script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
     progress("proving both against RLlib's actions")
-    moved = partial(record_moved, restored.reference, recorded, restored.loop)
+    perturb = partial(record_perturbed, restored.start_loop, references)
     try:
-        parity = prove(recipe, recorded, {"onnx": onnx, "torchscript": script}, labels, api_stack, moved)
+        parity = prove(recipe, references, {"onnx": onnx, "torchscript": script}, labels, api_stack, perturb)
     except ParityError as error:
-        if why := why_different(restored.reference, recorded, frozen):
+        if why := why_different(restored.start_loop, references, frozen):
             raise ParityError(f"{error.message}; {why}", error.details) from error
         raise
-    inputs = _golden_inputs(recipe, recorded, onnx)
+    inputs = _golden_inputs(recipe, references, onnx)
     outputs = onnx(inputs)
     ordered = {name: inputs[name] for name in graph.input_names}
     return parity, _Golden(ordered, {name: outputs[name] for name in graph.output_names})
 
 
-def _golden_inputs(recipe: Recipe, recorded: list[Recorded], run: Runner) -> Inputs:
+def _golden_inputs(recipe: Recipe, references: list[Reference], run: Runner) -> Inputs:
     """Return inputs of every kind; those where two choices tie stay out, as another machine may choose either.
 
-    A policy with a memory gives steps of its sequences, each with the state it met there.
+    A policy with a state gives steps of its sequences, each with the state it met there.
     """
     pools: dict[str, list[Inputs]] = {kind: [] for kind in GOLDEN_SAMPLES}
     discrete = any(not isinstance(space, Box) for space in recipe.action_leaves.values())
     everything: list[Inputs] = []
-    for one, (inputs, _) in zip(recorded, replay(recorded, run, recipe.state), strict=True):
-        clear = ~ties(recipe, one.outputs) if discrete else np.ones(len(one.batch), np.bool_)
-        pools[one.batch.kind].append({name: values[clear] for name, values in inputs.items()})
+    for reference, (inputs, _) in zip(references, replay(references, run, recipe.state), strict=True):
+        batch = reference.batch
+        clear = ~ties(recipe, reference.outputs) if discrete else np.ones(len(batch), np.bool_)
+        pools[batch.kind].append({name: values[clear] for name, values in inputs.items()})
         everything.append(inputs)
     size = sum(values[0].nbytes for values in everything[0].values())
     chosen: list[Inputs] = []
     for kind, count in GOLDEN_SAMPLES.items():
         if pools[kind]:
-            chosen.append(_some(_joined(pools[kind]), max(2, min(count, GOLDEN_BYTES // (3 * max(1, size))))))
-    golden = _joined(chosen)
+            chosen.append(_spread(_concatenate(pools[kind]), max(2, min(count, GOLDEN_BYTES // (3 * max(1, size))))))
+    golden = _concatenate(chosen)
     # A policy that never has a clear favourite still needs vectors; its runtime excuses ties as the gate does.
-    return golden if len(next(iter(golden.values()))) else _some(_joined(everything), sum(GOLDEN_SAMPLES.values()))
+    return (
+        golden if len(next(iter(golden.values()))) else _spread(_concatenate(everything), sum(GOLDEN_SAMPLES.values()))
+    )
 
 
-def _joined(parts: list[Inputs]) -> Inputs:
+def _concatenate(parts: list[Inputs]) -> Inputs:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _some(inputs: Inputs, count: int) -> Inputs:
+def _spread(inputs: Inputs, count: int) -> Inputs:
     """Return `count` rows, evenly spread."""
     rows = len(next(iter(inputs.values())))
     picked = np.unique(np.linspace(0, rows - 1, min(count, rows)).astype(int)) if rows else np.zeros(0, int)
@@ -322,7 +320,7 @@ def _tensor(name: str, values: NDArray[Any]) -> TensorSpec:
     return TensorSpec(name=name, dtype=str(values.dtype), shape=(-1, *values.shape[1:]))
 
 
-def _provenance(files: Files, facts: CheckpointFacts, restored: Restored) -> Provenance:
+def _provenance(files: Files, facts: CheckpointFacts, restored: RestoredPolicy) -> Provenance:
     from importlib.metadata import version
 
     return Provenance(

@@ -44,9 +44,9 @@ def choose_target(out: Path, name: str, version: str | None) -> Path:
     if (out.exists() and not out.is_dir()) or (policy.exists() and not policy.is_dir()):
         raise UsageError(f"{policy if out.is_dir() else out} is a file: expected a folder to write bundles into")
     present = [child.name for child in policy.iterdir()] if policy.is_dir() else []
-    taken = [entry for entry in present if re.fullmatch(VERSION_PATTERN, entry)]
+    versions = [entry for entry in present if re.fullmatch(VERSION_PATTERN, entry)]
     if version is None:
-        version = str(max((version_key(entry)[0] for entry in taken), default=0) + 1)
+        version = str(max((version_key(entry)[0] for entry in versions), default=0) + 1)
     if version in present:
         raise UsageError(f"{policy / version} exists already: versions are never overwritten; leave the version out "
                          f"for the next one")  # fmt: skip

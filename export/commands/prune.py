@@ -12,9 +12,9 @@ from pathlib import Path
 
 from rlservo.export.checkpoints.facts import read_facts
 from rlservo.export.checkpoints.location import FACTS_FILE, Files, locate_checkpoint
-from rlservo.export.checkpoints.remote import fetched
+from rlservo.export.checkpoints.remote import fetch
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.commands.export import LOADING_RUNS_CODE
+from rlservo.export.commands.export import LOADING_RUNS_CODE, silent
 from rlservo.export.contract.errors import UsageError
 
 # Beside the class and its arguments (class_and_ctor_args.pkl) and the state, metadata.json names the Ray version.
@@ -37,7 +37,7 @@ def prune_checkpoint(
     Returns the files kept, relative to `dst`. `notify` is told what was kept, and of any file that names the home
     folder. Raises CheckpointError or UnsupportedError for `src`, UsageError when `dst` exists.
     """
-    with fetched(src, lambda _: None) as local:
+    with fetch(src, silent) as local:
         return _prune(locate_checkpoint(local, module_id), Path(dst), app_dir, notify)
 
 

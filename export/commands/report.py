@@ -1,7 +1,4 @@
-"""`rlservo inspect`: a contract as tables a roboticist can read.
-
-It lays out what the contract says and judges nothing. Needs rich; no torch, ray or onnxruntime.
-"""
+"""`rlservo inspect`: a contract as tables a roboticist can read."""
 
 from __future__ import annotations
 
@@ -113,11 +110,11 @@ def _exploration(contract: Contract) -> str:
 def _space_tables(title: str, root: str, space: SpaceSpec, frozen: BakedStep | None) -> list[RenderableType]:
     """Return one table of all leaves, then one of the elements of each leaf of which more is known than its bounds."""
     leaves = leaf_specs(space, root)
-    told = [name for name, leaf in leaves.items() if leaf.elements or _seen(frozen, leaf.size)[0]]
+    detailed = [name for name, leaf in leaves.items() if leaf.elements or _seen(frozen, leaf.size)[0]]
     parts: list[RenderableType] = []
-    if len(leaves) > 1 or not told:
+    if len(leaves) > 1 or not detailed:
         parts.append(_overview(title if len(leaves) == 1 else f"{title}, in {len(leaves)} parts", leaves))
-    parts += [_elements(title if len(leaves) == 1 else name, leaves[name], frozen) for name in told]
+    parts += [_elements(title if len(leaves) == 1 else name, leaves[name], frozen) for name in detailed]
     return parts
 
 

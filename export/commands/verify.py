@@ -10,18 +10,18 @@ import datetime
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
-import gymnasium
 import numpy as np
-from numpy.typing import NDArray
+from typing_extensions import Self
 
 from rlservo.export.checkpoints.location import Files, locate_checkpoint
-from rlservo.export.checkpoints.remote import fetched, is_uri
+from rlservo.export.checkpoints.remote import fetch, is_uri
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.commands.export import LOADING_RUNS_CODE
+from rlservo.export.commands.export import LOADING_RUNS_CODE, Notify, silent
 from rlservo.export.contract.bundle import Bundle, load_bundle, write_contract
-from rlservo.export.contract.contract import Contract, Evaluation, Parity
+from rlservo.export.contract.contract import REWARD, Contract, Evaluation, Parity
 from rlservo.export.contract.errors import BundleError, UsageError, first_line
 from rlservo.export.contract.spaces import leaf_specs
 from rlservo.export.graph.one_thread import one_thread
@@ -29,7 +29,10 @@ from rlservo.export.proof.parity import GraphLoop, prove, record
 from rlservo.export.recipe.recipe import Recipe
 from rlservo.export.recipe.runners import Loop
 from rlservo.export.recipe.samples import draw_batches
-from rlservo.export.recipe.trees import build, named_leaves, space_leaves
+from rlservo.export.recipe.to_contract import space_spec
+from rlservo.export.recipe.trees import build, named_leaves
+from rlservo.serve_app.rollout.control_loop import rollout
+from rlservo.serve_app.rollout.report import RolloutReport
 
 SEED = 20241  # not the export's: other observations
 
@@ -52,8 +55,8 @@ def verify_bundle(
     episodes: int = 20,
     first_seed: int = 0,
     app_dir: str | Path = ".",
-    notify: Callable[[str], None],
-    progress: Callable[[str], None] = lambda _: None,
+    notify: Notify,
+    progress: Notify = silent,
 ) -> VerifyResult:
     """Compare a bundle with a checkpoint and, given `env_id`, run both for `episodes` seeds from `first_seed`.
 
@@ -65,22 +68,29 @@ def verify_bundle(
     if episodes < 1:
         raise UsageError(f"episodes must be 1 or more, got {episodes}")
     loaded = load_bundle(bundle)
-    with fetched(checkpoint, progress) as local:
+    with fetch(checkpoint, progress) as local:
         origin = loaded.contract.provenance
         files = locate_checkpoint(local, origin.module_id, origin.agents[0] if origin.agents else None)
         notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else files.root))
-        return _verify(loaded, files, (env_id, episodes, first_seed), app_dir, notify, progress)
+        closed_loop = None if env_id is None else _ClosedLoop(env_id, episodes, first_seed)
+        return _verify(loaded, files, closed_loop, app_dir, notify, progress)
+
+
+@dataclass(frozen=True)
+class _ClosedLoop:
+    env_id: str
+    episodes: int
+    first_seed: int
 
 
 def _verify(
     loaded: Bundle,
     files: Files,
-    driven: tuple[str | None, int, int],
+    closed_loop: _ClosedLoop | None,
     app_dir: str | Path,
-    notify: Callable[[str], None],
-    progress: Callable[[str], None],
+    notify: Notify,
+    progress: Notify,
 ) -> VerifyResult:
-    env_id, episodes, first_seed = driven
     same = files.sha256() == loaded.contract.provenance.checkpoint_sha256
     if not same:
         notify("the bundle was exported from another checkpoint: expect a difference")
@@ -94,14 +104,17 @@ def _verify(
         formats = _formats(loaded)
         labels = [element.name for element in loaded.contract.action_space.elements]
         progress("comparing both formats with RLlib's actions")
-        recorded = record(restored.reference, draw_batches(restored.recipe, SEED), restored.loop)
-        parity = prove(restored.recipe, recorded, formats, labels, files.api_stack)
+        references = record(restored.start_loop, draw_batches(restored.recipe, SEED))
+        parity = prove(restored.recipe, references, formats, labels, files.api_stack)
         evaluation = None
-        if env_id is not None:
+        if closed_loop is not None:
             run, recipe = formats["onnx"], restored.recipe
-            progress(f"running {episodes} episodes with each")
-            drivers = (lambda: GraphLoop(run, recipe.state), restored.loop)
-            evaluation = _evaluate(loaded.contract, recipe, env_id, drivers, episodes, first_seed)
+            progress(f"running {closed_loop.episodes} episodes with each")
+            bundle, checkpoint = (
+                _rollout(loaded.contract, recipe, start_loop, closed_loop)
+                for start_loop in (lambda: GraphLoop(run, recipe.state), restored.start_loop)
+            )
+            evaluation = _evaluation(bundle, checkpoint, closed_loop)
             contract = loaded.contract.model_copy(update={"evaluations": (*loaded.contract.evaluations, evaluation)})
             write_contract(loaded.path, contract)
     return VerifyResult(parity, evaluation, same)
@@ -139,85 +152,66 @@ def _shapes(leaves: dict[str, tuple[int, ...]]) -> str:
     return ", ".join(f"{name} {shape}" for name, shape in leaves.items())
 
 
-def _evaluate(
-    contract: Contract,
-    recipe: Recipe,
-    env_id: str,
-    drivers: tuple[Callable[[], Loop], Callable[[], Loop]],
-    episodes: int,
-    first_seed: int,
-) -> Evaluation:
-    try:
-        # Gymnasium's checker warns about the environment's style, which is not what is measured here.
-        env: gymnasium.Env[Any, Any] = gymnasium.make(
-            env_id, disable_env_checker=True, **contract.provenance.env_config
-        )
-    except Exception as error:  # the environment's own constructor may raise anything
-        raise UsageError(f"environment {env_id} cannot be made: {first_line(error)}") from error
-    try:
-        theirs = {name: tuple(leaf.shape) for name, leaf in space_leaves(env.observation_space, "obs").items()}
-        ours = {name: tuple(leaf.shape) for name, leaf in recipe.observation_leaves.items()}
-        if theirs != ours:
-            raise UsageError(
-                f"environment {env_id} gives observations of shape {_shapes(theirs)}, policy "
-                f"'{contract.name}' expects {_shapes(ours)}"
-            )
-        runs = [
-            [_episode(env, start(), recipe, first_seed + number) for number in range(episodes)] for start in drivers
-        ]
-    finally:
-        env.close()
-    returns = [float(np.mean([one.reward for one in run])) for run in runs]
-    success = [_success_rate(run) for run in runs]
+def _rollout(
+    contract: Contract, recipe: Recipe, start_loop: Callable[[], Loop], closed_loop: _ClosedLoop
+) -> RolloutReport:
+    report = rollout(
+        _LoopPolicy(contract, recipe, start_loop),
+        closed_loop.env_id,
+        episodes=closed_loop.episodes,
+        seed=closed_loop.first_seed,
+        env_kwargs=contract.provenance.env_config,
+    )
+    if report.interrupted:  # half a comparison is none
+        raise KeyboardInterrupt
+    return report
+
+
+def _evaluation(bundle: RolloutReport, checkpoint: RolloutReport, closed_loop: _ClosedLoop) -> Evaluation:
+    assert bundle.return_mean is not None and checkpoint.return_mean is not None, "every episode was finished"
     return Evaluation(
-        env_id=env_id,
-        episodes=episodes,
-        first_seed=first_seed,
-        return_bundle=returns[0],
-        return_checkpoint=returns[1],
-        success_rate_bundle=success[0],
-        success_rate_checkpoint=success[1],
+        env_id=closed_loop.env_id,
+        episodes=closed_loop.episodes,
+        first_seed=closed_loop.first_seed,
+        return_bundle=bundle.return_mean,
+        return_checkpoint=checkpoint.return_mean,
+        success_rate_bundle=bundle.success_rate,
+        success_rate_checkpoint=checkpoint.success_rate,
         evaluated_at=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     )
 
 
-@dataclass(frozen=True)
-class _Episode:
-    reward: float
-    success: bool | None  # None where the environment does not tell
+class _LoopPolicy:
+    """A `Loop` as an `ActingPolicy`, for one environment."""
 
+    def __init__(self, contract: Contract, recipe: Recipe, start_loop: Callable[[], Loop]) -> None:
+        # The checkpoint's own spaces: an action's Discrete has its start there, as in the environment.
+        spaces = {
+            "observation_space": space_spec(recipe.observation_space),
+            "action_space": space_spec(recipe.action_space),
+        }
+        self.contract = contract.model_copy(update=spaces)
+        self._recipe = recipe
+        self._start_loop = start_loop
+        self._loop, self._begins = start_loop(), True
 
-def _episode(env: gymnasium.Env[Any, Any], loop: Loop, recipe: Recipe, seed: int) -> _Episode:
-    obs, info = env.reset(seed=seed)
-    total, reward, first, done = 0.0, 0.0, True, False
-    spaces = recipe.observation_leaves
-    while not done:
+    def act(self, obs: Any, *, explore: bool = False, seed: int | None = None, reward: float = 0.0) -> Any:  # noqa: ARG002
+        spaces = self._recipe.observation_leaves
         inputs = {name: np.asarray(leaf, spaces[name].dtype)[None] for name, leaf in named_leaves(obs, "obs").items()}
-        if recipe.needs_reward:
-            inputs["reward"] = np.array([reward], np.float32)
-        outputs = loop.step(inputs, np.array([first]))
-        action = build(recipe.action_space, [_sent(outputs[name][0]) for name in recipe.action_leaves])
-        obs, earned, terminated, truncated, info = env.step(action)
-        reward, first = float(earned), False
-        total += reward
-        done = terminated or truncated
-    return _Episode(total, _succeeded(info))
+        if self._recipe.needs_reward:
+            inputs[REWARD] = np.array([reward], np.float32)
+        outputs = self._loop.step(inputs, np.array([self._begins]))
+        self._begins = False
+        return build(self._recipe.action_space, [outputs[name][0] for name in self._recipe.action_leaves])
 
+    def reset(self) -> None:
+        self._loop, self._begins = self._start_loop(), True
 
-def _sent(leaf: NDArray[Any]) -> Any:
-    """A Discrete action is a number to most environments, and an array to some."""
-    return leaf.item() if leaf.ndim == 0 else leaf
+    def close(self) -> None: ...
 
+    def __enter__(self) -> Self:
+        return self
 
-def _succeeded(info: dict[str, Any]) -> bool | None:
-    """Return an episode's outcome as robotics environments tell it in the last step's info, if they do."""
-    if "is_success" in info:
-        return bool(info["is_success"])
-    if "final_status" in info:
-        return bool(info["final_status"] == "success")
-    return None
-
-
-def _success_rate(run: list[_Episode]) -> float | None:
-    told = [one.success for one in run if one.success is not None]
-    return sum(told) / len(run) if told else None
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...

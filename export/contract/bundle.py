@@ -1,4 +1,4 @@
-"""The policy bundle: the one contract between the exporter and everything that runs a policy.
+"""Policy bundle: the one contract between the exporter and everything that runs a policy.
 
 A bundle is a folder `<name>/<version>/` holding
 

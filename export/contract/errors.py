@@ -1,10 +1,11 @@
-"""Every error a user of rlservo can meet, in one tree.
+"""Tree of the errors that a user of rlservo can meet.
 
 One table in `serve_app/protocols/http_errors.py` maps these to status codes, and one handler in `deploy/cli.py` maps
 them to exit codes.
 
     RlservoError                  error
     ├── CheckpointError           checkpoint-unreadable    not a checkpoint, damaged, or its code cannot be imported
+    │   ├── AgentsDifferError     checkpoint-unreadable    its agents need a bundle each: one has to be named
     │   └── UnsupportedError      checkpoint-unsupported   readable, but cannot be exported faithfully
     ├── ParityError               parity-failed            the exported graph differs from RLlib's own actions
     ├── BundleError               bundle-invalid           missing, truncated or malformed bundle
@@ -13,6 +14,7 @@ them to exit codes.
     ├── UnknownPolicyError        unknown-policy
     │   └── UnknownVersionError   unknown-version
     ├── RequestError              bad-request              the request itself is malformed
+    │   ├── StateNeededError      bad-request              ... and must carry state, which it does not
     │   ├── MediaTypeError        wrong-media-type
     │   └── TooLargeError         too-large
     ├── ObservationError          bad-observation          shape, dtype, non-finite or misnamed element
@@ -26,13 +28,14 @@ them to exit codes.
     │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
     │   ├── LateError             late                     the observation waited too long: send a newer one
     │   └── PartlyAppliedError    partly-applied           a change that some replicas could not follow
+    ├── InternalError             internal                 the server's own fault: its log says more
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 
@@ -46,11 +49,24 @@ class RlservoError(Exception):
         self.message = message
         self.details: dict[str, Any] = dict(details or {})
 
+    def prefix(self, place: str) -> None:
+        """Put where it happened in front of the message; the error stays what it is, for a bare `raise`."""
+        self.message = f"{place}: {self.message}"
+        self.args = (self.message,)
+
 
 class CheckpointError(RlservoError):
     """The path holds no checkpoint that can be read."""
 
     code = "checkpoint-unreadable"
+
+
+class AgentsDifferError(CheckpointError):
+    """A module treats its `agents` differently, and none of them was named."""
+
+    def __init__(self, message: str, agents: Sequence[str]) -> None:
+        super().__init__(message, {"agents": list(agents)})
+        self.agents = tuple(agents)
 
 
 class UnsupportedError(CheckpointError):
@@ -101,6 +117,23 @@ class RequestError(RlservoError):
     code = "bad-request"
 
 
+class StateNeededError(RequestError):
+    """The policy remembers its episode, and the request carries nothing of it.
+
+    A client may not know that before: a limit on the step of its actions is set on the server. For clients it is a
+    `bad-request` with these details.
+    """
+
+    DETAILS: ClassVar[Mapping[str, str]] = {"send": "state"}
+
+    def __init__(self, message: str, details: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message, {**(details or {}), **self.DETAILS})
+
+    @classmethod
+    def is_described_by(cls, details: Mapping[str, Any]) -> bool:
+        return details.items() >= cls.DETAILS.items()
+
+
 class MediaTypeError(RequestError):
     """The body is not of a type this endpoint reads."""
 
@@ -147,6 +180,7 @@ class UnavailableError(RlservoError):
     """The server is not ready, over capacity, or out of reach."""
 
     code = "unavailable"
+    retry_after_s: float | None = None  # [s] after which the server wants to be asked again, where it said so
 
 
 class OverloadedError(UnavailableError):
@@ -177,6 +211,12 @@ class RefusedError(ConflictError):
     """A version or a configuration cannot be served, so what ran before goes on."""
 
     code = "version-refused"
+
+
+class InternalError(RlservoError):
+    """The server failed, by a fault of its own."""
+
+    code = "internal"
 
 
 class UsageError(RlservoError):

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.spaces import DiscreteSpec, LeafSpec, MultiDiscreteSpec, SpaceSpec, leaf_specs
+
+ACTION_DIST_INPUTS = "action_dist_inputs"
+"""The graph's output of distribution parameters."""
+Q_VALUES = "q_values"
+"""The same of a policy that has Q-values in their place (DQN)."""
+
+
+def scores_name(outputs: Container[str]) -> str:
+    """Return which of a graph's outputs its actions are chosen by."""
+    return Q_VALUES if Q_VALUES in outputs else ACTION_DIST_INPUTS
 
 
 def parameter_count(leaf: LeafSpec) -> int:

@@ -1,6 +1,6 @@
 """RLlib's env-to-module connectors as torch modules: what happens to an observation before the network sees it.
 
-Each takes the observation so far, a tree of tensors `[batch, ...]`, and the policy's memory by name, in which a
+Each takes the observation so far, a tree of tensors `[batch, ...]`, and the policy's state by name, in which a
 stateful one replaces its own entry.
 """
 
@@ -15,6 +15,7 @@ import torch
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from torch import Tensor, nn
 
+from rlservo.export.contract.contract import REWARD
 from rlservo.export.recipe.recipe import Flatten, FrameStack, ObservationFilter, Preprocess, Previous, Recipe, UserStep
 from rlservo.export.recipe.trees import Tree, space_leaves, tree_leaves
 
@@ -27,7 +28,7 @@ class ObservationNode(nn.Module, abc.ABC):
     """One step before the network."""
 
     @abc.abstractmethod
-    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:
+    def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:
         """Return the next observation."""
 
 
@@ -68,7 +69,7 @@ class FlattenNode(ObservationNode):
         ]
         self.codes: list[Callable[[Tensor], Tensor]] = [_code(leaf) for leaf in kept]
 
-    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
+    def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it has no state
         if self.without:
             obs = {key: value for key, value in obs.items() if key not in self.without}
         parts = [code(leaf) for code, leaf in zip(self.codes, tree_leaves(obs), strict=True)]
@@ -83,7 +84,7 @@ def _code(space: Any) -> Callable[[Tensor], Tensor]:
         sizes = [int(n) for n in space.nvec]
         below = bool((np.asarray(space.start) < 0).any())
         return lambda leaf: torch.cat([_one_hot(leaf[:, i], n, below_zero=below) for i, n in enumerate(sizes)], dim=-1)
-    return lambda leaf: _float(leaf.flatten(1) if leaf.dim() > 1 else leaf.unsqueeze(1))
+    return lambda leaf: as_dtype(leaf.flatten(1) if leaf.dim() > 1 else leaf.unsqueeze(1), torch.float32)
 
 
 def _one_hot(leaf: Tensor, depth: int, *, below_zero: bool) -> Tensor:
@@ -101,7 +102,7 @@ class PreprocessNode(ObservationNode):
         super().__init__()
         self.leaves = list(space_leaves(step.space, "obs").values())
 
-    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
+    def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it has no state
         parts = [_preprocess(leaf, space) for leaf, space in zip(tree_leaves(obs), self.leaves, strict=True)]
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
@@ -114,7 +115,7 @@ def _preprocess(leaf: Tensor, space: Any) -> Tensor:
         index = leaf.flatten(1) - torch.from_numpy(np.asarray(space.start).ravel().astype(np.int64))
         sizes = [int(n) for n in space.nvec.ravel()]
         return torch.cat([_one_hot(index[:, i], n, below_zero=False) for i, n in enumerate(sizes)], dim=-1)
-    row = _float(leaf.flatten(1) if leaf.dim() > 1 else leaf.unsqueeze(1))
+    row = as_dtype(leaf.flatten(1) if leaf.dim() > 1 else leaf.unsqueeze(1), torch.float32)
     return (row - 128.0) / 128.0 if tuple(space.shape) == ATARI_RAM else row
 
 
@@ -145,7 +146,7 @@ class FilterNode(ObservationNode):
         self.register_buffer("scale", torch.tensor(scale, dtype=dtype))
         self.register_buffer("divisor", torch.tensor(frozen.divisor(), dtype=dtype))
 
-    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
+    def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it has no state
         if self.integer is not None:
             obs = (obs.double() - self.offset) / self.divisor
         else:
@@ -159,36 +160,36 @@ class FilterNode(ObservationNode):
 
 
 class FrameStackNode(ObservationNode):
-    """The last frames side by side; the memory holds all but the newest."""
+    """The last frames side by side; the state holds all but the newest."""
 
     def __init__(self, step: FrameStack) -> None:
         super().__init__()
         self.depth = step.shape[2]
 
-    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:
-        stacked = torch.cat((memory["frames"], obs), dim=3)
-        memory["frames"] = stacked[:, :, :, self.depth :]
+    def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:
+        stacked = torch.cat((state["frames"], obs), dim=3)
+        state["frames"] = stacked[:, :, :, self.depth :]
         return stacked
 
 
 class PreviousNode(ObservationNode):
-    """The observation beside the last actions' codes and the last rewards; the graph itself remembers its action."""
+    """The observation beside the last actions' codes and the last rewards; the graph itself keeps its action."""
 
     def __init__(self, step: Previous) -> None:
         super().__init__()
         self.step = step
 
-    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:
+    def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:
         original, actions, rewards = self.step.keys
         augmented = {original: obs}
         if self.step.actions:
-            augmented[actions] = memory["previous_actions"]
+            augmented[actions] = state["previous_actions"]
         if self.step.rewards:
-            known = memory["reward"].unsqueeze(-1)
+            latest = state[REWARD].unsqueeze(-1)
             if self.step.rewards > 1:
-                known = torch.cat((memory["previous_rewards"], known), dim=-1)
-                memory["previous_rewards"] = known[:, 1:]
-            augmented[rewards] = known
+                latest = torch.cat((state["previous_rewards"], latest), dim=-1)
+                state["previous_rewards"] = latest[:, 1:]
+            augmented[rewards] = latest
         return augmented
 
 
@@ -199,9 +200,10 @@ class UserNode(ObservationNode):
         super().__init__()
         self.function = step.function
 
-    def forward(self, obs: Tree, memory: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it remembers nothing
+    def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it has no state
         return self.function(obs)
 
 
-def _float(leaf: Tensor) -> Tensor:
-    return leaf if leaf.dtype == torch.float32 else leaf.float()
+def as_dtype(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return `tensor` as `dtype`; `to` alone leaves a node in the graph where it is so already."""
+    return tensor if tensor.dtype == dtype else tensor.to(dtype)

@@ -2,8 +2,7 @@
 
 Of torch's two exporters the TorchScript-based one comes first: for these graphs it takes 0.2 s where the
 torch.export-based one takes 3 s, and the result is as small and as fast. Where it lacks an operation (DQN's nanmean)
-the other takes over. Opset 17 or 18 with IR version 8 is read by every onnxruntime from 1.14 on. It does not judge the
-numbers.
+the other takes over. Opset 17 or 18 with IR version 8 is read by every onnxruntime from 1.14 on.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import UnsupportedError
-from rlservo.export.contract.onnx_session import open_session
+from rlservo.export.contract.ort_session import open_ort_session
 from rlservo.export.graph.operators import exact_operators
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.why_not_exportable import why_not_onnx
@@ -61,7 +60,7 @@ def _finish(file: Path) -> None:
     model.producer_name, model.producer_version = "rlservo", ""
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, str(file))
-    open_session(file)
+    open_ort_session(file)
 
 
 def _export(graph: PolicyGraph, example: Inputs, file: Path, *, dynamo: bool) -> None:
@@ -127,11 +126,11 @@ def add_metadata(file: Path, properties: Mapping[str, str]) -> None:
 
 def run_onnx(file: Path) -> Runner:
     """Return a function that runs the file in onnxruntime on one thread, as a server does."""
-    session = open_session(file)
-    names = [output.name for output in session.get_outputs()]
+    ort_session = open_ort_session(file)
+    names = [output.name for output in ort_session.get_outputs()]
 
     def run(inputs: Inputs) -> dict[str, NDArray[Any]]:
-        values = session.run(names, inputs)
+        values = ort_session.run(names, inputs)
         return {name: np.asarray(value) for name, value in zip(names, values, strict=True)}
 
     return run

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rlservo.export.contract.contract import REWARD
-from rlservo.export.graph.observation_nodes import ObservationNode, observation_nodes
+from rlservo.export.graph.observation_nodes import ObservationNode, as_dtype, observation_nodes
 from rlservo.export.recipe.recipe import Recipe, leaf_transform, parameter_count
 from rlservo.export.recipe.trees import Tree, build, map_tree, named_leaves
 
@@ -26,13 +26,12 @@ from rlservo.export.recipe.trees import Tree, build, map_tree, named_leaves
 class TracedNetwork(Protocol):
     """A module from the network's input to one tensor for each name.
 
-    Where it computes the actions itself, their `given` leaves come before the named ones. A recurrent one takes its
+    Where the recipe's mode is "given", the action's leaves come before the named ones. A recurrent one takes its
     state as a second argument, a list in the order of `Recipe.network_state`, and returns the next state's tensors
     after the named ones.
     """
 
     names: tuple[str, ...]
-    given: int
 
     def __call__(self, obs: Tree, *state: list[Tensor]) -> tuple[Tensor, ...]: ...
 
@@ -47,19 +46,19 @@ class PolicyGraph(nn.Module):
         self.steps: nn.ModuleList = observation_nodes(recipe)
         self.network = network
         self.action = ActionNode(recipe)
-        self.remembered = [state.name for state in recipe.state]
-        self.carried = len(recipe.state) - len(recipe.network_state)
-        self.recurrent = bool(recipe.network_state)
-        self.rewarded = recipe.needs_reward
+        self.action_count = len(recipe.action_leaves) if recipe.mode == "given" else 0
+        self.state_names = [state.name for state in recipe.state]
+        self.network_state_names = [state.name for state in recipe.network_state]
+        self.needs_reward = recipe.needs_reward
         self.input_names = (
             *recipe.observation_leaves,
-            *([REWARD] if self.rewarded else []),
-            *(f"state_in.{name}" for name in self.remembered),
+            *([REWARD] if self.needs_reward else []),
+            *(f"state_in.{name}" for name in self.state_names),
         )
         self.output_names = (
             *recipe.action_leaves,
             *network.names,
-            *(f"state_out.{name}" for name in self.remembered),
+            *(f"state_out.{name}" for name in self.state_names),
         )
         self.eval()
 
@@ -67,29 +66,25 @@ class PolicyGraph(nn.Module):
         """Return the outputs for observation leaves `[batch, ...]` of the space's dtype, then reward and state."""
         rest = list(inputs)
         obs: Tree = build(self.space, [rest.pop(0) for _ in range(self.leaves)])
-        memory: dict[str, Tensor] = {REWARD: rest.pop(0)} if self.rewarded else {}
-        memory.update(zip(self.remembered, rest, strict=True))
+        state: dict[str, Tensor] = {REWARD: rest.pop(0)} if self.needs_reward else {}
+        state.update(zip(self.state_names, rest, strict=True))
         for step in self.steps:
             assert isinstance(step, ObservationNode)
-            obs = step(obs, memory)
-        obs = map_tree(_single, obs)
-        state = [memory[name] for name in self.remembered[self.carried :]]
-        outputs = self.network(obs, state) if self.recurrent else self.network(obs)
-        ready, outputs = outputs[: self.network.given], outputs[self.network.given :]
-        named, after = outputs[: len(self.network.names)], outputs[len(self.network.names) :]
-        actions = self.action.finish(ready) if ready else self.action(named[0])
-        if "previous_actions" in memory:
-            memory["previous_actions"] = _remember(memory["previous_actions"], actions[0], self.action.choices)
-        memory.update(zip(self.remembered[self.carried :], after, strict=True))
-        return (*actions, *named, *(memory[name] for name in self.remembered))
+            obs = step(obs, state)
+        # RLlib hands floating-point leaves to the network in single precision, and integers as they are.
+        obs = map_tree(lambda leaf: as_dtype(leaf, torch.float32) if leaf.is_floating_point() else leaf, obs)
+        network_state = [state[name] for name in self.network_state_names]
+        outputs = self.network(obs, network_state) if network_state else self.network(obs)
+        chosen, outputs = outputs[: self.action_count], outputs[self.action_count :]
+        named, next_state = outputs[: len(self.network.names)], outputs[len(self.network.names) :]
+        actions = self.action.finish(chosen) if chosen else self.action(named[0])
+        if "previous_actions" in state:
+            state["previous_actions"] = _append_code(state["previous_actions"], actions[0], self.action.choices)
+        state.update(zip(self.network_state_names, next_state, strict=True))
+        return (*actions, *named, *(state[name] for name in self.state_names))
 
 
-def _single(leaf: Tensor) -> Tensor:
-    """RLlib hands floating-point leaves to the network in single precision, and integers as they are."""
-    return leaf.float() if leaf.dtype == torch.float64 else leaf
-
-
-def _remember(codes: Tensor, action: Tensor, choices: int) -> Tensor:
+def _append_code(codes: Tensor, action: Tensor, choices: int) -> Tensor:
     """Return the one-hot codes of the last actions with the oldest dropped and `action` added at the end."""
     latest = torch.eq(action.unsqueeze(-1), torch.arange(choices)).float()
     return torch.cat((codes[:, choices:], latest), dim=-1)
@@ -176,7 +171,7 @@ class ActionLeaf(nn.Module):
             return action
         if self.integer:
             return self._count(action)
-        action = _cast(action, self.dtype)
+        action = as_dtype(action, self.dtype)
         if self.transform == "unsquash" and self.is_scaled:
             action = action * self.half_range
         if self.transform == "unsquash" and self.is_moved:
@@ -189,7 +184,7 @@ class ActionLeaf(nn.Module):
             choice = choice + self.low
         elif self.transform == "clip":
             choice = torch.minimum(torch.maximum(choice, self.low), self.high)
-        return _cast(choice, self.dtype)
+        return as_dtype(choice, self.dtype)
 
     def _clip(self, action: Tensor) -> Tensor:
         if self.limits is not None:
@@ -204,8 +199,3 @@ def _same_everywhere(low: NDArray[np.float64], high: NDArray[np.float64]) -> tup
         (low == first_low).all() and (high == first_high).all() and np.isfinite([first_low, first_high]).all()
     )
     return (first_low, first_high) if shared else None
-
-
-def _cast(tensor: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return `tensor` as `dtype`, without a node where it is so already."""
-    return tensor if tensor.dtype == dtype else tensor.to(dtype)

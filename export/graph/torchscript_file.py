@@ -1,7 +1,7 @@
 """Write a policy graph as TorchScript, and run such a file.
 
 TorchScript is what C++ programs with libtorch and ROS nodes load; torch itself calls it deprecated in favour of
-torch.export. It does not judge the numbers.
+torch.export.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import UnsupportedError, first_line
 from rlservo.export.graph.policy_graph import PolicyGraph
-from rlservo.export.graph.why_not_exportable import TracerWarning, frozen_by_tracing, raised_at
+from rlservo.export.graph.why_not_exportable import frozen_by_tracing, raised_at, tracer_warning
 from rlservo.export.recipe.runners import Inputs, Runner
 
 
@@ -28,7 +28,7 @@ def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> list[s
     """
     with warnings.catch_warnings(record=True) as caught:
         # A constant baked in by tracing is what the parity gate is there to find; these say where it comes from.
-        warnings.simplefilter("always", TracerWarning)
+        warnings.simplefilter("always", tracer_warning())
         _ignore_deprecation()
         try:
             with torch.no_grad():

@@ -30,8 +30,10 @@ INSTEAD = {
 OTHERWISE = "compose it of arithmetic, comparisons, torch.where, torch.cat and sums along an axis"
 
 
-# torch.jit has the name, but does not list it as its own; in a torch without it, every warning says where.
-TracerWarning: type[Warning] = getattr(torch.jit, "TracerWarning", Warning)
+def tracer_warning() -> type[Warning]:
+    """Return the class of tracing's warnings; in a torch without that private name every warning counts as one."""
+    kind: type[Warning] = getattr(torch.jit, "TracerWarning", Warning)
+    return kind
 
 
 def frozen_by_tracing(caught: Sequence[warnings.WarningMessage]) -> list[str]:
@@ -39,7 +41,8 @@ def frozen_by_tracing(caught: Sequence[warnings.WarningMessage]) -> list[str]:
     places = {
         f"{one.filename}:{one.lineno}"
         for one in caught
-        if issubclass(one.category, TracerWarning) and not any(part in INSTALLED for part in Path(one.filename).parts)
+        if issubclass(one.category, tracer_warning())
+        and not any(part in INSTALLED for part in Path(one.filename).parts)
     }
     return sorted(places)
 
@@ -80,21 +83,22 @@ def _refused_operators(error: BaseException) -> list[str]:
 
 def _operators(graph: torch.nn.Module, example: Inputs) -> dict[str, str]:
     """Return every operator of a graph by ATen's name, with the place where it is first used."""
-    found: dict[str, str] = {}
+    places: dict[str, str] = {}
     names: Any = graph.input_names
     tensors = tuple(torch.from_numpy(example[name]) for name in names)
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
         try:
             traced: Any = torch.jit.trace(graph, tensors, check_trace=False)  # type: ignore[no-untyped-call]
-        except Exception:  # the exporter's own error says more
-            return found
-    for node in traced.inlined_graph.nodes():
-        space, _, name = node.kind().partition("::")
-        if space == "aten" and name not in found:
-            frames = re.findall(r"^(.+)\((\d+)\): (.+)$", node.sourceRange(), re.MULTILINE)
-            found[name] = _place((file, int(line), function) for file, line, function in frames)
-    return found
+            operators = [(node.kind(), node.sourceRange()) for node in traced.inlined_graph.nodes()]
+        except Exception:  # untraceable, or a torch whose graphs are read otherwise: the exporter's own error says more
+            return places
+    for kind, source in operators:
+        space, _, name = kind.partition("::")
+        if space == "aten" and name not in places:
+            frames = re.findall(r"^(.+)\((\d+)\): (.+)$", source, re.MULTILINE)
+            places[name] = _place((file, int(line), function) for file, line, function in frames)
+    return places
 
 
 def _place(frames: Iterable[tuple[str, int, str]]) -> str:

@@ -1,7 +1,7 @@
 """Parity gate: an exported policy gives RLlib's own numbers, or it is not written.
 
-It compares functions from observations to named outputs and does not know what is behind them. A policy with a memory
-is compared over whole sequences, each side fed with its own state.
+Functions from observations to named outputs are compared, of a policy with a state over whole sequences, each side fed
+with its own.
 
 A difference passes when it is at most `RTOL * max(|reference|, scale) + ATOL`. The scale is half the range of a
 bounded action element; elsewhere the largest number in the same row of the output, at least 1, because the rounding
@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.contract import FormatParity, Parity
 from rlservo.export.contract.errors import ParityError, UnsupportedError, first_line
-from rlservo.export.contract.scores import split_scores
+from rlservo.export.contract.scores import scores_name, split_scores
 from rlservo.export.recipe.recipe import Recipe, StateLeaf
-from rlservo.export.recipe.runners import Inputs, Loop, Outputs, Runner
+from rlservo.export.recipe.runners import Inputs, Loop, Outputs, Runner, first_step
 from rlservo.export.recipe.samples import BATCH_SIZES, Batch
 from rlservo.export.recipe.to_contract import space_spec
 
@@ -59,12 +59,12 @@ class GraphLoop:
     def __init__(self, run: Runner, state: Sequence[StateLeaf]) -> None:
         self._run = run
         self._state = {f"state_in.{leaf.name}": leaf.initial for leaf in state}
-        self._now: Inputs = {}
+        self._last: Inputs = {}
 
     def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
         """Return the graph's outputs, its next state among them."""
         outputs = self._run(self.complete(inputs, restart))
-        self._now = {name: outputs[name.replace("state_in.", "state_out.", 1)] for name in self._state}
+        self._last = {name: outputs[name.replace("state_in.", "state_out.", 1)] for name in self._state}
         return outputs
 
     def complete(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Inputs:
@@ -73,13 +73,13 @@ class GraphLoop:
         full = dict(inputs)
         for name, initial in self._state.items():
             start = np.repeat(initial[None], rows, axis=0)
-            now = self._now.get(name, start)
-            full[name] = np.where(restart.reshape((rows, *[1] * initial.ndim)), start, now).astype(initial.dtype)
+            last = self._last.get(name, start)
+            full[name] = np.where(restart.reshape((rows, *[1] * initial.ndim)), start, last).astype(initial.dtype)
         return full
 
 
 @dataclass(frozen=True)
-class Recorded:
+class Reference:
     """One batch and what RLlib computed for it."""
 
     batch: Batch
@@ -87,12 +87,9 @@ class Recorded:
 
 
 def record(
-    reference: Runner,
-    batches: Sequence[Batch],
-    loop: Callable[[], Loop] | None = None,
-    spaces: Mapping[str, Any] | None = None,
-) -> list[Recorded]:
-    """Run RLlib on every batch; sequences need `loop`, which starts RLlib's own.
+    start_loop: Callable[[], Loop], batches: Sequence[Batch], spaces: Mapping[str, Any] | None = None
+) -> list[Reference]:
+    """Run RLlib on every batch; `start_loop` starts RLlib acting step after step.
 
     The gate's wide and extreme observations leave the space, where RLlib's own pipeline may fail (the logarithm of an
     action mask below zero): then all of them are cut back into the bounds of `spaces`, which are by input name.
@@ -101,43 +98,40 @@ def record(
     pipeline fails on an observation of the policy's own space.
     """
     try:
-        return _record(reference, batches, loop)
+        return _record(start_loop, batches)
     except Exception:  # RLlib's own connectors and the user's raise anything
         inside = [replace(batch, inputs=_inside(batch.inputs, spaces or {})) for batch in batches]
     try:
-        return _record(reference, inside, loop)
+        return _record(start_loop, inside)
     except Exception as error:
         raise UnsupportedError(
             f"RLlib's own pipeline fails on an observation of the policy's space: {first_line(error)}"
         ) from error
 
 
-def _record(reference: Runner, batches: Sequence[Batch], loop: Callable[[], Loop] | None) -> list[Recorded]:
-    recorded: list[Recorded] = []
-    running: Loop | None = None
+def _record(start_loop: Callable[[], Loop], batches: Sequence[Batch]) -> list[Reference]:
+    references: list[Reference] = []
+    loop: Loop | None = None
     for batch in batches:
-        inputs = _copied(batch.inputs)
+        inputs = _copy(batch.inputs)
         if batch.restart is None:
-            outputs = reference(inputs)
+            outputs = first_step(start_loop(), inputs)
         else:
-            assert loop is not None, "a policy with a memory needs a reference that remembers"
-            if running is None or len(recorded[-1].batch) != len(batch):
-                running = loop()
-            outputs = running.step(inputs, batch.restart)
-        recorded.append(Recorded(batch, outputs))
-    return recorded
+            if loop is None or len(references[-1].batch) != len(batch):
+                loop = start_loop()
+            outputs = loop.step(inputs, batch.restart)
+        references.append(Reference(batch, outputs))
+    return references
 
 
-def record_moved(
-    reference: Runner, recorded: Sequence[Recorded], loop: Callable[[], Loop] | None = None
-) -> list[Recorded]:
+def record_perturbed(start_loop: Callable[[], Loop], references: Sequence[Reference]) -> list[Reference]:
     """Return what RLlib computes when every floating-point observation is moved up or down by its last bit."""
     rng = np.random.default_rng(0)
-    moved = [
-        replace(one.batch, inputs={name: _by_last_bit(values, rng) for name, values in one.batch.inputs.items()})
-        for one in recorded
+    batches = [
+        replace(each.batch, inputs={name: _by_last_bit(values, rng) for name, values in each.batch.inputs.items()})
+        for each in references
     ]
-    return _record(reference, moved, loop)
+    return _record(start_loop, batches)
 
 
 def _by_last_bit(values: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
@@ -157,11 +151,13 @@ def _inside(inputs: Inputs, spaces: Mapping[str, Any]) -> Inputs:
     }
 
 
-def replay(recorded: Sequence[Recorded], run: Runner, state: Sequence[StateLeaf]) -> Iterator[tuple[Inputs, Outputs]]:
-    """Run an exported graph over what was recorded; yield its full inputs and its outputs for each batch."""
+def replay(
+    references: Sequence[Reference], run: Runner, state: Sequence[StateLeaf]
+) -> Iterator[tuple[Inputs, Outputs]]:
+    """Run an exported graph over what RLlib computed; yield its full inputs and its outputs for each batch."""
     loop, size = GraphLoop(run, state), 0
-    for one in recorded:
-        inputs, restart = _copied(one.batch.inputs), one.batch.restart
+    for reference in references:
+        inputs, restart = _copy(reference.batch.inputs), reference.batch.restart
         if restart is None:
             yield inputs, run(inputs)
             continue
@@ -172,23 +168,23 @@ def replay(recorded: Sequence[Recorded], run: Runner, state: Sequence[StateLeaf]
 
 def prove(
     recipe: Recipe,
-    recorded: Sequence[Recorded],
+    references: Sequence[Reference],
     formats: Mapping[str, Runner],
     labels: Sequence[str] = (),
     api_stack: str = "new",
-    moved: Callable[[], list[Recorded]] | None = None,
+    perturb: Callable[[], list[Reference]] | None = None,
 ) -> Parity:
-    """Compare every format with what was recorded and return the largest differences.
+    """Compare every format with what RLlib computed and return the largest differences.
 
-    `labels` name the action's elements for the message; `moved` is asked, once and only where a difference is too
-    large, for what `record_moved` gives. Raises ParityError at the first output that differs, saying
+    `labels` name the action's elements for the message; `perturb` gives what `record_perturbed` does, called
+    once and only where a difference is too large. Raises ParityError at the first output that differs, saying
     which element of which sample by how much.
     """
-    rounding = _Rounding(recorded, moved)
-    results = {name: _prove_format(name, recipe, recorded, run, labels, rounding) for name, run in formats.items()}
+    rounding = _Rounding(references, perturb)
+    results = {name: _prove_format(name, recipe, references, run, labels, rounding) for name, run in formats.items()}
     return Parity(
         reference=REFERENCES[api_stack],
-        samples=sum(len(one.batch) for one in recorded),
+        samples=sum(len(reference.batch) for reference in references),
         batch_sizes=BATCH_SIZES,
         rtol=RTOL,
         atol=ATOL,
@@ -200,53 +196,57 @@ def prove(
 class _Rounding:
     """How far RLlib's own numbers move when the observations move by their last bit; asked for when first needed."""
 
-    def __init__(self, recorded: Sequence[Recorded], moved: Callable[[], list[Recorded]] | None) -> None:
-        self._recorded = recorded
-        self._ask = moved
-        self._moved: list[Recorded] | None = None
+    def __init__(self, references: Sequence[Reference], perturb: Callable[[], list[Reference]] | None) -> None:
+        self._references = references
+        self._perturb = perturb
+        self._perturbed: list[Reference] | None = None
 
     def of(self, number: int, output: str) -> NDArray[np.float64]:
         """Return the largest movement in each row of an output, broadcastable to it."""
-        if self._ask is None:
+        if self._perturb is None:
             return np.zeros(())
-        if self._moved is None:
-            self._moved = self._ask()
-        before, after = (one[number].outputs[output].astype(np.float64) for one in (self._recorded, self._moved))
+        if self._perturbed is None:
+            self._perturbed = self._perturb()
+        before, after = (
+            side[number].outputs[output].astype(np.float64) for side in (self._references, self._perturbed)
+        )
         with np.errstate(invalid="ignore"):
-            by = np.nan_to_num(np.abs(after - before), nan=0.0, posinf=0.0)
-        return np.asarray(by.max(axis=tuple(range(1, by.ndim)), keepdims=True) if by.ndim > 1 else by)
+            movement = np.nan_to_num(np.abs(after - before), nan=0.0, posinf=0.0)
+        axes = tuple(range(1, movement.ndim))
+        return np.asarray(movement.max(axis=axes, keepdims=True) if axes else movement)
 
 
 def _prove_format(
     name: str,
     recipe: Recipe,
-    recorded: Sequence[Recorded],
+    references: Sequence[Reference],
     run: Runner,
     labels: Sequence[str],
     rounding: _Rounding,
 ) -> FormatParity:
     max_abs = max_rel = 0.0
-    largest_value = max((_largest(one.outputs["value"]) for one in recorded if "value" in one.outputs), default=1.0)
+    values = [reference.outputs["value"] for reference in references if "value" in reference.outputs]
+    largest_value = max(map(_largest, values), default=1.0)
     actions = recipe.action_leaves
-    running = replay(recorded, run, recipe.state)
-    for number, one in enumerate(recorded):
-        where = f"{name}, a batch of {len(one.batch)} {one.batch.kind} observations"
-        if one.batch.restart is not None:
+    replayed = replay(references, run, recipe.state)
+    for number, reference in enumerate(references):
+        where = f"{name}, a batch of {len(reference.batch)} {reference.batch.kind} observations"
+        if reference.batch.restart is not None:
             where += f" (step {number} of the sequences)"
         try:
-            got = next(running)[1]
+            got = next(replayed)[1]
         except Exception as error:  # a shape baked into the graph ends in onnxruntime's or torch's own exceptions
             raise ParityError(f"{where}: the exported graph does not run: {str(error).splitlines()[0]}") from error
-        for output, expected in one.outputs.items():
+        for output, expected in reference.outputs.items():
             space = actions.get(output)
             _check_form(where, output, got.get(output), expected, space)
             if space is not None and not isinstance(space, Box):
-                scores = "q_values" if "q_values" in one.outputs else "action_dist_inputs"
-                _check_choices(where, output, got[output], one, recipe, partial(rounding.of, number, scores))
+                scores = scores_name(reference.outputs)
+                _check_choices(where, output, got[output], reference, recipe, partial(rounding.of, number, scores))
                 continue
             least = largest_value if output == "value" else 1.0
             moves = partial(rounding.of, number, output)
-            difference, scale = _compare(where, output, got[output], expected, space, one, labels, least, moves)
+            difference, scale = _compare(where, output, got[output], expected, space, reference, labels, least, moves)
             max_abs = max(max_abs, float(difference.max(initial=0.0)))
             max_rel = max(max_rel, float((difference / scale).max(initial=0.0)))
     return FormatParity(max_abs=max_abs, max_rel=max_rel)
@@ -269,7 +269,7 @@ def _compare(
     got: NDArray[Any],
     expected: NDArray[Any],
     space: Any,
-    one: Recorded,
+    reference: Reference,
     labels: Sequence[str],
     least_scale: float,
     moves: Callable[[], NDArray[np.float64]],
@@ -295,7 +295,7 @@ def _compare(
             f"{len(b)} samples differ",
             {
                 "output": output, "element": element, "sample": row, "exported": float(a[index]),
-                "reference": float(b[index]), "observation": _row(one.batch, row),
+                "reference": float(b[index]), "observation": _row(reference.batch, row),
             },
         )  # fmt: skip
     return difference, scale
@@ -325,13 +325,13 @@ def _check_choices(
     where: str,
     output: str,
     got: NDArray[Any],
-    one: Recorded,
+    reference: Reference,
     recipe: Recipe,
     moves: Callable[[], NDArray[np.float64]],
 ) -> None:
     """Compare discrete actions; a tie in RLlib's scores excuses a difference, and so do scores that are no numbers."""
-    columns = _columns(one.outputs[output])
-    scored = choice_scores(recipe, one.outputs).get(output) or [np.full((len(c), 1), np.inf) for c in columns]
+    columns = _columns(reference.outputs[output])
+    scored = choice_scores(recipe, reference.outputs).get(output) or [np.full((len(c), 1), np.inf) for c in columns]
     for part, (exported, wanted, scores) in enumerate(zip(_columns(got), columns, scored, strict=True)):
         width = _tie_width(scores)
         for row in np.flatnonzero(exported != wanted):
@@ -368,7 +368,7 @@ def choice_scores(recipe: Recipe, outputs: Outputs) -> dict[str, list[NDArray[np
     """
     if recipe.mode == "given":
         return {}
-    scores = outputs["q_values" if "q_values" in outputs else "action_dist_inputs"].astype(np.float64)
+    scores = outputs[scores_name(outputs)].astype(np.float64)
     return split_scores(scores, space_spec(recipe.action_space, action=True))
 
 
@@ -388,5 +388,5 @@ def _tie_width(scores: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(RTOL * np.maximum(measured.max(axis=1), 1.0) + ATOL)
 
 
-def _copied(inputs: Inputs) -> Inputs:
+def _copy(inputs: Inputs) -> Inputs:
     return {name: values.copy() for name, values in inputs.items()}

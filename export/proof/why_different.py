@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rlservo.export.proof.parity import ATOL, RTOL, Recorded
-from rlservo.export.recipe.runners import Runner
+from rlservo.export.proof.parity import ATOL, RTOL, Reference
+from rlservo.export.recipe.runners import Loop, first_step
 
 ALONE = 4  # samples that are also shown to RLlib one at a time
 
 
-def why_different(reference: Runner, recorded: Sequence[Recorded], frozen: Sequence[str]) -> str:
+def why_different(start_loop: Callable[[], Loop], references: Sequence[Reference], frozen: Sequence[str]) -> str:
     """Return a clause that says why a graph may differ from RLlib's own numbers; '' if nothing is found."""
-    if sample := _depends_on_batch(reference, recorded):
+    if sample := _depends_on_batch(start_loop, references):
         return (
             f"RLlib's own action for sample {sample[0]} is another when it is alone: the network's result depends on "
             "the other observations of the batch, which cannot be exported"
@@ -27,14 +27,16 @@ def why_different(reference: Runner, recorded: Sequence[Recorded], frozen: Seque
     return ""
 
 
-def _depends_on_batch(reference: Runner, recorded: Sequence[Recorded]) -> list[int]:
+def _depends_on_batch(start_loop: Callable[[], Loop], references: Sequence[Reference]) -> list[int]:
     """Return a sample whose action is another without the rest of its batch, if there is one."""
-    for one in recorded:
-        if one.batch.restart is not None or len(one.batch) < ALONE:
+    for reference in references:
+        batch = reference.batch
+        if batch.restart is not None or len(batch) < ALONE:
             continue
         for row in range(ALONE):
-            alone = reference({name: values[row : row + 1].copy() for name, values in one.batch.inputs.items()})
-            for name, expected in one.outputs.items():
+            inputs = {name: values[row : row + 1].copy() for name, values in batch.inputs.items()}
+            alone = first_step(start_loop(), inputs)
+            for name, expected in reference.outputs.items():
                 if not np.allclose(
                     np.nan_to_num(alone[name][0].astype(np.float64)),
                     np.nan_to_num(expected[row].astype(np.float64)),

@@ -40,26 +40,26 @@ def baked_steps(recipe: Recipe, module_class: str, module: Any) -> tuple[BakedSt
     return tuple(steps)
 
 
-def surprises(recipe: Recipe) -> list[str]:
+def unexpected_steps(recipe: Recipe) -> list[str]:
     """Return a sentence for each thing that RLlib does, and the export with it, and a person may not expect."""
-    found: list[str] = []
+    sentences: list[str] = []
     if recipe.filter is not None and recipe.filter.count == 0:
         clipped = " and clips" if recipe.filter.clip is not None else ""
-        found.append(
+        sentences.append(
             f"the observation filter has seen nothing yet: RLlib divides by 1e-6{clipped}, and so does the export"
         )
     for name, space in recipe.action_leaves.items():
         if isinstance(space, Discrete) and space.start != 0:
             which = "the action space" if name == "action" else name
-            found.append(
+            sentences.append(
                 f"{which} starts at {space.start}, but RLlib sends 0..{space.n - 1} to env.step: the export does the "
                 "same"
             )
     if recipe.needs_reward:
-        found.append(
+        sentences.append(
             "the policy was trained with previous rewards: the graph has an input 'reward', 0 at an episode's start"
         )
-    return found
+    return sentences
 
 
 def observation_step(step: ObservationStep) -> BakedStep:

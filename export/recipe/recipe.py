@@ -1,6 +1,6 @@
 """Recipe of a policy: the observation steps before the network and the action rule after it, as numbers.
 
-`new_stack.py` fills a `Recipe` in from RLlib's saved connector pipelines and `policy_graph.py` turns it into a graph.
+`export/rllib` reads a `Recipe` off RLlib's saved connectors and `policy_graph.py` turns it into a graph.
 """
 
 from __future__ import annotations
@@ -11,17 +11,13 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from gymnasium.spaces import Box, MultiDiscrete
 from numpy.typing import NDArray
 
 from rlservo.export.recipe.trees import space_leaves
 
 # ray/rllib/utils/numpy.py (ray 2.60): keeps the filter from dividing by zero.
 SMALL_NUMBER = 1e-6
-
-
-AnyDiscrete: TypeAlias = "Discrete[Any]"
-"""A Discrete of whichever integer type; quoted because only newer Gymnasium can index the class."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Sample observations for the proof: likely ones, wide ones, and extremes that make every clip engage.
 
-A policy with a memory is shown sequences, in which episodes end and begin at different steps in different rows. It
-draws numbers from a recipe's observation space and filter; it runs nothing.
+A policy with a state is shown sequences, in which episodes end and begin at different steps in different rows. The
+numbers come from a recipe's observation space and filter.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Batch:
 def draw_batches(recipe: Recipe, seed: int) -> list[Batch]:
     """Return batches of every kind and every size in BATCH_SIZES; the same seed draws the same.
 
-    For a policy with a memory they are sequences of SEQUENCE_STEPS batches of one size.
+    For a policy with a state they are sequences of SEQUENCE_STEPS batches of one size.
     """
     rng = np.random.default_rng(seed)
     if recipe.state:

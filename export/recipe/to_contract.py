@@ -1,4 +1,4 @@
-"""Translate Gymnasium's spaces, and what a policy remembers, into the contract's terms."""
+"""Translate Gymnasium's spaces, and a policy's state, into the contract's terms."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def space_spec(space: Any, elements: Sequence[Element] = (), *, action: bool = F
 
 
 def state_spec(leaf: StateLeaf) -> StateSpec:
-    """Return the contract's form of what a policy remembers."""
+    """Return the contract's form of one part of a policy's state."""
     flat = leaf.initial.ravel().tolist()
     return StateSpec(
         name=leaf.name,

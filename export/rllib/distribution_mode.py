@@ -1,4 +1,4 @@
-"""Find the rule by which a distribution's deterministic action comes out of its parameters.
+"""Find a distribution's kind, and the rule by which its deterministic action comes out of its parameters.
 
 Where it is none of the known rules, the distribution itself goes into the graph (mode "given"), if it gives the same
 action twice.
@@ -14,8 +14,23 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from rlservo.export.contract.errors import UnsupportedError, first_line
-from rlservo.export.recipe.recipe import Mode, parameter_count
+from rlservo.export.recipe.recipe import DistributionKind, Mode, parameter_count
 from rlservo.export.recipe.trees import Tree, space_leaves, tree_leaves
+
+DISTRIBUTIONS: dict[str, DistributionKind] = {
+    "TorchDiagGaussian": "diag_gaussian",
+    "TorchSquashedGaussian": "squashed_gaussian",
+    "TorchCategorical": "categorical",
+    "TorchMultiCategorical": "multi_categorical",
+    "TorchMultiDistribution": "multi",
+    "TorchMultiActionDistribution": "multi",  # the old API stack's
+}
+RLLIBS_OWN = ("ray.rllib.core.distribution.", "ray.rllib.models.torch.torch_action_dist")
+
+
+def distribution_kind(kind: type) -> DistributionKind | None:
+    """Return which of RLlib's distributions a class is; None for the user's own, whose samples are not known."""
+    return DISTRIBUTIONS.get(kind.__name__) if kind.__module__.startswith(RLLIBS_OWN) else None
 
 
 def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: Any, given: Tensor) -> Mode:

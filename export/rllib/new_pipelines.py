@@ -22,10 +22,11 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from rlservo.export.checkpoints.location import CheckpointFiles
 from rlservo.export.checkpoints.unpickle import unpickle
 from rlservo.export.contract.contract import BakedStep
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
+from rlservo.export.contract.errors import AgentsDifferError, CheckpointError, UnsupportedError
 from rlservo.export.recipe.describe import observation_step
 from rlservo.export.recipe.trees import Tree, build_like, map_tree, tree_leaves
-from rlservo.export.rllib.new_connectors import ALONE, Seat, read_observation_steps
+from rlservo.export.rllib import private_names
+from rlservo.export.rllib.new_connectors import SINGLE_AGENT, AgentSlot, read_observation_steps
 
 MAPPING = "AgentToModuleMapping"
 
@@ -75,10 +76,10 @@ class Pipelines:
 
 
 @dataclass(frozen=True)
-class SeatPipelines(Pipelines):
-    """The same among several agents, of which only the one in the seat acts."""
+class MultiAgentPipelines(Pipelines):
+    """The same among several agents, of which only the slot's acts."""
 
-    seat: Seat
+    slot: AgentSlot
     together: MultiRLModule
     """What RLlib hands to its connectors; it holds the one module."""
 
@@ -89,36 +90,36 @@ class SeatPipelines(Pipelines):
             batch = self.env_to_module(
                 rl_module=self.together, batch={}, episodes=episodes, explore=False, shared_data=shared
             )
-        return batch[self.seat.module], shared
+        return batch[self.slot.module], shared
 
     def to_env(self, given: dict[str, Any], episodes: list[Any], shared: dict[str, Any]) -> dict[str, Any]:
         """Return what comes out for the environment and for the episodes, of the one agent."""
         with torch.no_grad():
             sent = self.module_to_env(
                 rl_module=self.together,
-                batch={self.seat.module: given},
+                batch={self.slot.module: given},
                 episodes=episodes,
                 explore=False,
                 shared_data=shared,
             )
-        own = {name: [by_agent[self.seat.agent] for by_agent in rows] for name, rows in sent.items()}
+        own = {name: [by_agent[self.slot.agent] for by_agent in rows] for name, rows in sent.items()}
         acting = (Columns.ACTIONS, Columns.ACTIONS_FOR_ENV)
         return {name: _stacked(rows) if name in acting else rows for name, rows in own.items()}
 
     def begin(self, obs: Any) -> Any:
         """Return an episode that has just been reset."""
-        module = self.seat.module  # whatever the mapping says: it decides who sits here, which has been decided
+        module = self.slot.module  # whatever the mapping says: whose slot this is has been decided
         episode = MultiAgentEpisode(
             observation_space=self.env_to_module.input_observation_space,
             action_space=self.env_to_module.input_action_space,
             agent_to_module_mapping_fn=lambda _agent, _episode: module,
         )
-        episode.add_env_reset(observations={self.seat.agent: obs})
+        episode.add_env_reset(observations={self.slot.agent: obs})
         return episode
 
     def advance(self, episode: Any, obs: Any, action: Any, reward: float, extra: dict[str, Any]) -> None:
         """Tell an episode of one more step."""
-        agent = self.seat.agent
+        agent = self.slot.agent
         episode.add_env_step(
             observations={agent: obs},
             actions={agent: action},
@@ -128,28 +129,28 @@ class SeatPipelines(Pipelines):
 
 
 def pipelines_of(
-    seat: Seat, module: Any, env_to_module: Any, module_to_env: Any, observation_space: Any, action_space: Any
+    slot: AgentSlot, module: Any, env_to_module: Any, module_to_env: Any, observation_space: Any, action_space: Any
 ) -> Pipelines:
-    """Return RLlib's way to act for the seat, whose own the spaces are."""
-    if seat is ALONE:
+    """Return RLlib's way to act for the slot's agent, whose own the spaces are."""
+    if slot is SINGLE_AGENT:
         return Pipelines(module, env_to_module, module_to_env, observation_space, action_space)
     together = MultiRLModule()
-    together.add_module(seat.module, module)
-    return SeatPipelines(module, env_to_module, module_to_env, observation_space, action_space, seat, together)
+    together.add_module(slot.module, module)
+    return MultiAgentPipelines(module, env_to_module, module_to_env, observation_space, action_space, slot, together)
 
 
-def find_seat(files: CheckpointFiles, env_to_module: Any, module_to_env: Any) -> Seat:
-    """Return for which agent a module is exported; ALONE where the environment has only one.
+def find_agent_slot(files: CheckpointFiles, env_to_module: Any, module_to_env: Any) -> AgentSlot:
+    """Return for which agent a module is exported; SINGLE_AGENT where the environment has only one.
 
     A module may serve several: any stands for all where their spaces and the steps before the network are the same.
-    Raises CheckpointError when there is no such agent, or they differ and none was named: `details["agents"]` lists
-    them then. Raises UnsupportedError for modules that compute together.
+    Raises CheckpointError when there is no such agent, AgentsDifferError where they differ and none was named, and
+    UnsupportedError for modules that compute together.
     """
     mapping = next((piece for piece in env_to_module.connectors if type(piece).__name__ == MAPPING), None)
     if mapping is None:
         if files.agent_id is not None:
             raise CheckpointError(f"{files.root} was trained with one agent: leave --agent-id out")
-        return ALONE
+        return SINGLE_AGENT
     _check_separate(files)
     agents = _served(mapping, files.module_id)
     if files.agent_id is not None:
@@ -162,28 +163,27 @@ def find_seat(files: CheckpointFiles, env_to_module: Any, module_to_env: Any) ->
         agents = chosen
     if not agents:
         raise CheckpointError(f"{files.root}: no agent of the environment is served by module '{files.module_id}'")
-    seats = [Seat(agent, files.module_id) for agent in agents]
-    told = [_treatment(seat, files, env_to_module, module_to_env) for seat in seats]
-    if any(one != told[0] for one in told[1:]):
-        raise CheckpointError(
+    slots = [AgentSlot(agent, files.module_id) for agent in agents]
+    treatments = [_treatment(slot, files, env_to_module, module_to_env) for slot in slots]
+    if any(treatment != treatments[0] for treatment in treatments[1:]):
+        raise AgentsDifferError(
             f"{files.root}: module '{files.module_id}' serves the agents {_listed(agents)}, whose spaces or "
             "observation filters differ: name the one to export for with --agent-id",
-            {"agents": [str(agent) for agent in agents]},
+            [str(agent) for agent in agents],
         )
-    return dataclasses.replace(seats[0], agents=tuple(str(agent) for agent in agents))
+    return dataclasses.replace(slots[0], agents=tuple(str(agent) for agent in agents))
 
 
 def _served(mapping: Any, module_id: str) -> list[Any]:
     """Return the agents that a module serves, as RLlib asks it; all that it could serve where that is drawn anew."""
     agents = list(mapping.input_observation_space.spaces)
+    module_of = private_names.get(mapping, "_agent_to_module_mapping_fn")
     try:
-        named = [
-            agent for agent in agents if mapping._agent_to_module_mapping_fn(agent, MultiAgentEpisode()) == module_id
-        ]
+        served = [agent for agent in agents if module_of(agent, MultiAgentEpisode()) == module_id]
     except Exception:  # the user's own function may want more of an episode than a new one has
-        named = []
-    if named:
-        return named
+        served = []
+    if served:
+        return served
     wanted = (mapping.observation_space[module_id], mapping.action_space[module_id])
     return [
         agent
@@ -192,10 +192,10 @@ def _served(mapping: Any, module_id: str) -> list[Any]:
     ]
 
 
-def _treatment(seat: Seat, files: CheckpointFiles, env_to_module: Any, module_to_env: Any) -> tuple[Any, ...]:
+def _treatment(slot: AgentSlot, files: CheckpointFiles, env_to_module: Any, module_to_env: Any) -> tuple[Any, ...]:
     """Return all that may differ between agents that share a module."""
-    steps: list[BakedStep] = [observation_step(step) for step in read_observation_steps(env_to_module, files, seat)]
-    return seat.part(env_to_module.input_observation_space), seat.part(module_to_env.input_action_space), steps
+    steps: list[BakedStep] = [observation_step(step) for step in read_observation_steps(env_to_module, files, slot)]
+    return slot.part(env_to_module.input_observation_space), slot.part(module_to_env.input_action_space), steps
 
 
 def _check_separate(files: CheckpointFiles) -> None:

@@ -1,17 +1,17 @@
 """Restore a policy of RLlib's new API stack, and run it as RLlib itself would.
 
-Restoring starts nothing: no `ray.init`, no environment, no worker. The module and both connector pipelines come from
-their own folders in the checkpoint; `new_connectors.py` reads off them what they do. `Checkpoint.reference` is the
-truth every export is compared with: RLlib's own pipelines around RLlib's own forward pass.
+The module and both connector pipelines come from their own folders in the checkpoint; `new_connectors.py` reads off
+them what they do. `NewStackLoop` is RLlib's own pipelines around RLlib's own forward pass.
 """
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +33,9 @@ from rlservo.export.checkpoints.facts import read_config
 from rlservo.export.checkpoints.location import CTOR_FILE, STATE_STEMS, CheckpointFiles
 from rlservo.export.checkpoints.unpickle import explain, unpickle
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError, first_line
-from rlservo.export.recipe.describe import surprises
+from rlservo.export.contract.scores import Q_VALUES
 from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLeaf
-from rlservo.export.recipe.runners import Inputs
+from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.recipe.trees import (
     Tree,
@@ -47,18 +47,14 @@ from rlservo.export.recipe.trees import (
     space_leaves,
     tree_leaves,
 )
-from rlservo.export.rllib.distribution_mode import find_mode
+from rlservo.export.rllib import private_names
+from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_heads
-from rlservo.export.rllib.new_connectors import check_spaces, read_action_steps, read_observation_steps
-from rlservo.export.rllib.new_pipelines import Pipelines, find_seat, own_copy, pipelines_of
+from rlservo.export.rllib.new_connectors import read_action_steps, read_observation_steps
+from rlservo.export.rllib.new_pipelines import Pipelines, find_agent_slot, own_copy, pipelines_of
+from rlservo.export.rllib.restored_policy import RestoredPolicy
+from rlservo.export.rllib.supported_spaces import check_spaces
 
-DISTRIBUTIONS: dict[str, DistributionKind] = {
-    "TorchDiagGaussian": "diag_gaussian",
-    "TorchSquashedGaussian": "squashed_gaussian",
-    "TorchCategorical": "categorical",
-    "TorchMultiCategorical": "multi_categorical",
-    "TorchMultiDistribution": "multi",
-}
 PIPELINE_SETTINGS = (
     "normalize_actions",
     "clip_actions",
@@ -85,23 +81,23 @@ class Network(nn.Module):
     """
 
     def __init__(
-        self, module: Any, names: tuple[str, ...], given: int = 0, rule: Callable[[Tensor], Tree] | None = None
+        self, module: Any, names: tuple[str, ...], *, acts: bool = False, rule: Callable[[Tensor], Tree] | None = None
     ) -> None:
+        """`acts` says that the module, or with `rule` its distribution, gives the action's leaves."""
         super().__init__()
         self.module = module
         self.names = names
-        self.given = given
-        """How many action leaves the module, or the distribution's own rule, gives ready-made."""
+        self._acts = acts
         self._rule = rule
         self.state = module.get_initial_state() if module.is_stateful() else None
 
     def forward(self, obs: Tree, *state: list[Tensor]) -> tuple[Tensor, ...]:
         """Return one tensor `[batch, ...]` for each of `names`, given the network's input `[batch, ...]`."""
         stateful = self.state is not None
-        found: dict[str, Tensor] = {}
-        ready: list[Tensor] = []
-        after: list[Tensor] = []
-        given: dict[str, Any] = {}
+        named: dict[str, Tensor] = {}
+        actions: list[Tensor] = []
+        next_state: list[Tensor] = []
+        outputs: dict[str, Any] = {}
         # A value alone does not say what to do: then the forward pass is run for the actions or the state.
         for name in self.names if set(self.names) - {"value"} else ("", *self.names):
             # A user's forward may change its batch, so each call gets its own.
@@ -109,35 +105,35 @@ class Network(nn.Module):
             if stateful:
                 batch[Columns.STATE_IN] = build_like(self.state, state[0])
             if name == "value":
-                found[name] = self.module.compute_values(batch)
-            elif name == "q_values":
-                given = self.module.compute_q_values(batch)
-                found[name] = given[QF_PREDS]
+                named[name] = self.module.compute_values(batch)
+            elif name == Q_VALUES:
+                outputs = self.module.compute_q_values(batch)
+                named[name] = outputs[QF_PREDS]
             else:
-                given = self.module._forward_inference(batch)
+                outputs = self.module.forward_inference(batch)
                 if name:
-                    found[name] = given[Columns.ACTION_DIST_INPUTS]
-        if self.given:
-            chosen = self._rule(given[Columns.ACTION_DIST_INPUTS].clone()) if self._rule else given[Columns.ACTIONS]
-            ready = tree_leaves(chosen)
+                    named[name] = outputs[Columns.ACTION_DIST_INPUTS]
+        if self._acts:
+            rule = self._rule
+            actions = tree_leaves(rule(named[Columns.ACTION_DIST_INPUTS].clone()) if rule else outputs[Columns.ACTIONS])
         if stateful:
-            after = tree_leaves(given[Columns.STATE_OUT])
-            ready = [leaf.squeeze(1) for leaf in ready]
-            found = {name: leaf.squeeze(1) for name, leaf in found.items()}
-        return (*ready, *found.values(), *after)
+            next_state = tree_leaves(outputs[Columns.STATE_OUT])
+            actions = [leaf.squeeze(1) for leaf in actions]
+            named = {name: leaf.squeeze(1) for name, leaf in named.items()}
+        return (*actions, *named.values(), *next_state)
 
 
-class RllibLoop:
+class NewStackLoop:
     """RLlib acting step after step, as `SingleAgentEnvRunner._sample` does it (ray 2.60): exploration off."""
 
     def __init__(self, pipelines: Pipelines, recipe: Recipe, network: Network) -> None:
-        self._pipelines = pipelines
+        self.pipelines = pipelines
         self._recipe = recipe
         self._network = network
         self._episodes: list[Any] = []
         self._last: list[tuple[Any, dict[str, Any]]] = []
 
-    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
         """Return what RLlib computes for one step of every row, by output name."""
         rows = _rows(self._recipe.observation_space, inputs, len(restart))
         rewards = inputs.get("reward", np.zeros(len(restart)))
@@ -145,78 +141,54 @@ class RllibLoop:
             self._episodes = [None] * len(rows)
         for row, obs in enumerate(rows):
             if restart[row] or self._episodes[row] is None:
-                self._episodes[row] = self._pipelines.begin(obs)
+                self._episodes[row] = self.pipelines.begin(obs)
             else:
                 action, extra = self._last[row]
-                self._pipelines.advance(self._episodes[row], obs, action, float(rewards[row]), extra)
+                self.pipelines.advance(self._episodes[row], obs, action, float(rewards[row]), extra)
         # RLlib's log-probability of a nested deterministic action does not fit more than one environment (ray 2.60):
         # there, it acts for one at a time.
         alone = is_nested(self._recipe.action_space)
         groups = [[row] for row in range(len(rows))] if alone else [list(range(len(rows)))]
         self._last = []
-        found = [self._decide([self._episodes[row] for row in group]) for group in groups]
-        return {name: np.concatenate([one[name] for one in found]) for name in found[0]}
+        outputs = [self._decide([self._episodes[row] for row in group]) for group in groups]
+        return {name: np.concatenate([one[name] for one in outputs]) for name in outputs[0]}
 
-    def _decide(self, episodes: list[Any]) -> dict[str, NDArray[Any]]:
+    def _decide(self, episodes: list[Any]) -> Outputs:
         """Return what RLlib computes for these episodes, and remember what they have to be told with the next step."""
-        batch, shared = self._pipelines.to_module(episodes)
-        given = self._pipelines.forward(batch)
-        outputs = self._outputs(batch, given)
-        sent = self._pipelines.to_env(given, episodes, shared)
+        batch, shared = self.pipelines.to_module(episodes)
+        forward = self.pipelines.forward(batch)
+        outputs = self._outputs(batch, forward)
+        columns = self.pipelines.to_env(forward, episodes, shared)
         # The episodes remember the module's own actions; the environment gets those that have been scaled.
-        own = sent.pop(Columns.ACTIONS)
-        action = sent.pop(Columns.ACTIONS_FOR_ENV, own)
+        own = columns.pop(Columns.ACTIONS)
+        action = columns.pop(Columns.ACTIONS_FOR_ENV, own)
         self._last += [
-            (_pick(own, row), {key: values[row] for key, values in sent.items()}) for row in range(len(episodes))
+            (_pick(own, row), {key: values[row] for key, values in columns.items()}) for row in range(len(episodes))
         ]
-        named = {name: np.asarray(leaf) for name, leaf in named_leaves(action, "action").items()}
-        return {**named, **outputs}
+        actions = {name: np.asarray(leaf) for name, leaf in named_leaves(action, "action").items()}
+        return {**actions, **outputs}
 
-    def _outputs(self, batch: dict[str, Any], given: dict[str, Any]) -> dict[str, NDArray[Any]]:
+    def _outputs(self, batch: dict[str, Any], forward: dict[str, Any]) -> Outputs:
         """Return the network's outputs: those of the forward pass, copied, and those that take a pass of their own."""
-        module, stateful = self._pipelines.module, self._network.state is not None
-        found: dict[str, NDArray[Any]] = {}
+        module, stateful = self.pipelines.module, self._network.state is not None
+        outputs: Outputs = {}
         with torch.no_grad():
             for name in self._network.names:
                 if name == "value":
                     tensor = module.compute_values(own_copy(batch))
-                elif name == "q_values":
+                elif name == Q_VALUES:
                     tensor = module.compute_q_values(own_copy(batch))[QF_PREDS]
                 else:
-                    tensor = given[Columns.ACTION_DIST_INPUTS]
-                found[name] = (tensor.squeeze(1) if stateful else tensor).numpy().copy()
-        after = tree_leaves(given[Columns.STATE_OUT]) if stateful else []
-        for leaf, tensor in zip(self._recipe.network_state, after, strict=True):
-            found[f"state_out.{leaf.name}"] = tensor.numpy().copy()
-        return found
+                    tensor = forward[Columns.ACTION_DIST_INPUTS]
+                outputs[name] = (tensor.squeeze(1) if stateful else tensor).numpy().copy()
+        next_state = tree_leaves(forward[Columns.STATE_OUT]) if stateful else []
+        for leaf, tensor in zip(self._recipe.network_state, next_state, strict=True):
+            outputs[f"state_out.{leaf.name}"] = tensor.numpy().copy()
+        return outputs
 
 
 def _pick(tree: Tree, row: int) -> Tree:
     return map_tree(lambda leaf: leaf[row], tree)
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """A restored policy: the recipe around its network, the network for tracing, and RLlib's own way to act."""
-
-    recipe: Recipe
-    network: Network
-    module_class: str
-    pipelines: Pipelines
-    agents: tuple[str, ...] = ()
-
-    def reference(self, inputs: Inputs) -> dict[str, NDArray[Any]]:
-        """Return what RLlib computes for a batch of raw observations `[batch, ...]` by input name, by output name.
-
-        `action` is what RLlib would pass to `env.step`: exploration off, filter frozen. Every row is an episode's
-        first step.
-        """
-        rows = len(next(iter(inputs.values())))
-        return self.loop().step(inputs, np.ones(rows, np.bool_))
-
-    def loop(self) -> RllibLoop:
-        """Return RLlib acting step after step, which a policy with a memory is compared with."""
-        return RllibLoop(self.pipelines, self.recipe, self.network)
 
 
 def _rows(space: Any, inputs: Inputs, count: int) -> list[Any]:
@@ -225,7 +197,7 @@ def _rows(space: Any, inputs: Inputs, count: int) -> list[Any]:
     return [build(space, [inputs[name][row] for name in names]) for row in range(count)]
 
 
-def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, value: bool = True) -> Checkpoint:
+def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, value: bool = True) -> RestoredPolicy:
     """Restore one policy; `value` False leaves the value head out.
 
     Raises CheckpointError when it cannot be read, UnsupportedError when exporting it would lose something.
@@ -244,35 +216,32 @@ def load_checkpoint(files: CheckpointFiles, notify: Callable[[str], None], *, va
         raise UnsupportedError(f"module {name} is not exported: {why}")
     module.eval().requires_grad_(False)
     no_value = _check_weights(files, module)
-    seat = find_seat(files, env_to_module, module_to_env)
-    observation_space = seat.part(env_to_module.input_observation_space)
-    action_space: Any = seat.part(module_to_env.input_action_space) or module.action_space
+    slot = find_agent_slot(files, env_to_module, module_to_env)
+    observation_space = slot.part(env_to_module.input_observation_space)
+    action_space: Any = slot.part(module_to_env.input_action_space) or module.action_space
     check_spaces(observation_space, action_space)
-    steps = read_observation_steps(env_to_module, files, seat)
+    steps = read_observation_steps(env_to_module, files, slot)
     transform, action_steps = read_action_steps(module_to_env, action_space)
     state = _network_state(module)
-    pipelines = pipelines_of(seat, module, env_to_module, module_to_env, observation_space, action_space)
-    # What the module gives decides the rule, and asking it takes observations.
-    asked = Recipe(observation_space, action_space, steps, "argmax", transform, None, state, action_steps)
-    given = _forward_once(pipelines, asked)
-    distribution, mode, names = _action_rule(module, given, action_space, notify)
-    recipe = Recipe(observation_space, action_space, steps, mode, transform, distribution, state, action_steps)
-    for surprise in surprises(recipe):
-        notify(surprise)
+    pipelines = pipelines_of(slot, module, env_to_module, module_to_env, observation_space, action_space)
+    # What the module's forward pass gives decides the rule, and running it takes observations.
+    draft = Recipe(observation_space, action_space, steps, "argmax", transform, None, state, action_steps)
+    distribution, mode, names = _action_rule(module, _forward_once(pipelines, draft), action_space, notify)
+    recipe = dataclasses.replace(draft, mode=mode, distribution=distribution)
     if value and isinstance(module, ValueFunctionAPI):
         if no_value:
             notify(f"the checkpoint holds no value head ({no_value}): the export has no output 'value'")
         else:
             names = (*names, "value")
-    traced = _twin(module, files)
+    traced = _second_module(module, files)
     replace_heads(traced)
-    given_leaves = len(recipe.action_leaves) if mode == "given" else 0
     rule = _deterministic(module) if Columns.ACTION_DIST_INPUTS in names else None
-    network = Network(traced, names, given_leaves, rule)
-    return Checkpoint(recipe, network, f"{type(module).__module__}.{name}", pipelines, seat.agents)
+    network = Network(traced, names, acts=mode == "given", rule=rule)
+    module_class = f"{type(module).__module__}.{name}"
+    return RestoredPolicy(recipe, network, module_class, partial(NewStackLoop, pipelines, recipe, network), slot.agents)
 
 
-def _twin(module: Any, files: CheckpointFiles) -> Any:
+def _second_module(module: Any, files: CheckpointFiles) -> Any:
     """Return a second module of the same weights, to trace: the first is the reference's."""
     try:
         return copy.deepcopy(module)
@@ -293,10 +262,10 @@ def _build_pipelines(files: CheckpointFiles, module: Any, notify: Callable[[str]
             "default"
         )
     else:
-        given = read_config(unpickle(files.root / CTOR_FILE).get("ctor_args_and_kwargs"))
+        saved = read_config(unpickle(files.root / CTOR_FILE).get("ctor_args_and_kwargs"))
         for name in PIPELINE_SETTINGS:
-            if name in given:
-                setattr(config, name, given[name])
+            if name in saved:
+                private_names.replace(config, name, saved[name])
         notify(
             "the checkpoint has no environment runner (recorded data): the pipelines are built from its configuration"
         )
@@ -381,28 +350,28 @@ def _network_state(module: Any) -> tuple[StateLeaf, ...]:
 
 
 def _action_rule(
-    module: Any, given: dict[str, Any], action_space: Any, notify: Callable[[str], None]
+    module: Any, forward: dict[str, Any], action_space: Any, notify: Callable[[str], None]
 ) -> tuple[DistributionKind | None, Mode, tuple[str, ...]]:
     """Return the distribution's kind, how its mode is computed and the outputs' names, by asking the class."""
     name = type(module).__name__
     has_q_values = isinstance(module, QNetAPI)  # SAC's module has them, too, but gives a distribution
-    if has_q_values and Columns.ACTION_DIST_INPUTS not in given:
-        return None, "argmax", ("q_values",)
-    if Columns.ACTIONS in given:
+    if has_q_values and Columns.ACTION_DIST_INPUTS not in forward:
+        return None, "argmax", (Q_VALUES,)
+    if Columns.ACTIONS in forward:
         notify(f"module {name} computes its actions itself: the export does the same, and cannot explore")
         return None, "given", ()
-    if Columns.ACTION_DIST_INPUTS not in given:
+    if Columns.ACTION_DIST_INPUTS not in forward:
         raise UnsupportedError(
             f"module {name} gives neither '{Columns.ACTIONS}' nor '{Columns.ACTION_DIST_INPUTS}': its inference "
-            f"forward gives {', '.join(sorted(given))}"
+            f"forward gives {', '.join(sorted(forward))}"
         )
     kind = module.get_inference_action_dist_cls()
-    mode = find_mode(_deterministic(module), kind.__name__, action_space, given[Columns.ACTION_DIST_INPUTS])
+    mode = find_mode(_deterministic(module), kind.__name__, action_space, forward[Columns.ACTION_DIST_INPUTS])
     exploring = module.get_exploration_action_dist_cls()
-    distribution = None if mode == "given" else _distribution_kind(exploring)
+    distribution = None if mode == "given" else distribution_kind(_unbound(exploring))
     if distribution is None:
         notify(f"the action distribution {exploring.__name__} is not one of RLlib's: the export cannot explore with it")
-    return distribution, mode, ("action_dist_inputs",)
+    return distribution, mode, (Columns.ACTION_DIST_INPUTS,)
 
 
 def _deterministic(module: Any) -> Callable[[Tensor], Tree]:
@@ -411,13 +380,9 @@ def _deterministic(module: Any) -> Callable[[Tensor], Tree]:
     return lambda inputs: kind.from_logits(inputs).to_deterministic().sample()
 
 
-def _distribution_kind(kind: Any) -> DistributionKind | None:
-    """Return which of RLlib's distributions a class is; None for the user's own, whose samples are not known."""
-    if not kind.__module__.startswith("ray.rllib.core.distribution"):
-        return None
-    # RLlib binds a space to MultiCategorical and MultiDistribution by a class of one more level.
-    named = kind.__mro__[1] if kind.__name__.endswith("Partial") else kind
-    return DISTRIBUTIONS.get(named.__name__)
+def _unbound(kind: type) -> type:
+    """Return the class itself: RLlib binds a space to MultiCategorical and MultiDistribution by one more level."""
+    return kind.__mro__[1] if kind.__name__.endswith("Partial") else kind
 
 
 def _forward_once(pipelines: Pipelines, recipe: Recipe) -> dict[str, Any]:
@@ -426,11 +391,11 @@ def _forward_once(pipelines: Pipelines, recipe: Recipe) -> dict[str, Any]:
     episodes = [pipelines.begin(obs) for obs in _rows(recipe.observation_space, batch.inputs, 2)]
     name = type(pipelines.module).__name__
     try:
-        given = pipelines.forward(pipelines.to_module(episodes)[0])
+        forward = pipelines.forward(pipelines.to_module(episodes)[0])
     except Exception as error:  # the user's own forward may raise anything
         raise UnsupportedError(
             f"module {name} does not run on what the pipeline gives it: {first_line(error)}"
         ) from error
-    if pipelines.module.is_stateful() and Columns.STATE_OUT not in given:
+    if pipelines.module.is_stateful() and Columns.STATE_OUT not in forward:
         raise UnsupportedError(f"module {name} has a state, but its inference forward gives no '{Columns.STATE_OUT}'")
-    return given
+    return forward

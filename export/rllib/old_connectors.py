@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from gymnasium.spaces import Box
 
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
-from rlservo.export.recipe.recipe import ObservationFilter, ObservationStep, Preprocess, Transform, leaf_transform
+from rlservo.export.contract.errors import UnsupportedError
+from rlservo.export.recipe.recipe import ObservationStep, Preprocess, Transform, leaf_transform
 from rlservo.export.recipe.trees import space_leaves
+from rlservo.export.rllib import private_names
+from rlservo.export.rllib.frozen_filter import frozen_filter
 
 # Agent connectors that change no number of a stateless policy's observation, and action connectors likewise.
 AGENT_PLUMBING = frozenset({"ClipRewardAgentConnector", "StateBufferConnector", "ViewRequirementAgentConnector"})
@@ -65,9 +66,13 @@ def read_old_steps(agent_connectors: Any) -> tuple[ObservationStep, ...]:
     for piece in agent_connectors.connectors:
         name = type(piece).__name__
         if name == PREPROCESSOR:
-            steps += _preprocessing(piece._preprocessor)
+            steps += _preprocessing(private_names.get(piece, "_preprocessor"))
         elif name in FILTERS:
-            steps.append(_filter(piece.filter))
+            if piece.filter.no_preprocessor:
+                raise UnsupportedError(
+                    "the observation filter keeps one statistic per part of a nested space: not exported"
+                )
+            steps.append(frozen_filter(piece.filter))
     return tuple(steps)
 
 
@@ -93,31 +98,20 @@ def read_old_transform(action_connectors: Any, action_space: Any) -> Transform:
 
 
 def _preprocessing(preprocessor: Any) -> list[ObservationStep]:
-    name = type(preprocessor).__name__
+    name, space = type(preprocessor).__name__, private_names.get(preprocessor, "_obs_space")
     # Every hundredth observation is checked against the space: it changes no number, but the gate's lie outside, too.
     preprocessor.check_shape = _accept
     if name == "NoPreprocessor":
         return []
     if name not in PREPROCESSORS:
         raise UnsupportedError(
-            f"the preprocessor {name} for observations {preprocessor._obs_space} is not exported: it resizes images or "
+            f"the preprocessor {name} for observations {space} is not exported: it resizes images or "
             "pads lists, outside torch"
         )
     for inner in getattr(preprocessor, "preprocessors", ()):
         _preprocessing(inner)  # refuses what it has to, and switches off the checks
-    return [Preprocess(preprocessor._obs_space)]
+    return [Preprocess(space)]
 
 
 def _accept(_observation: Any) -> None:
     """Stand in for a preprocessor's check."""
-
-
-def _filter(restored: Any) -> ObservationFilter:
-    if restored.no_preprocessor:
-        raise UnsupportedError("the observation filter keeps one statistic per part of a nested space: not exported")
-    stats = restored.running_stats
-    mean, std = np.asarray(stats.mean, np.float64), np.asarray(stats.std, np.float32)
-    if not (np.isfinite(mean).all() and np.isfinite(std).all()):
-        raise CheckpointError("the observation filter's mean or standard deviation is not finite: training diverged")
-    clip = float(restored.clip) if restored.clip else None  # RLlib tests for truth: 0 means no clipping, too
-    return ObservationFilter(int(stats.n), mean, std, clip, bool(restored.demean), bool(restored.destd))

@@ -1,15 +1,14 @@
 """Restore a policy of RLlib's old API stack, and run it as RLlib itself would.
 
-Restoring starts nothing: no `ray.init`, no environment, no worker. `OldStackCheckpoint.reference` is the truth an
-export is compared with: the policy's own agent connectors, `compute_actions_from_input_dict` and action connectors, as
-`EnvRunnerV2` calls them. `Policy.compute_single_action` is not: it leaves filter, preprocessor and unsquashing out.
+`OldStackLoop` is the policy's own agent connectors, `compute_actions_from_input_dict` and action connectors, as
+`EnvRunnerV2` calls them. `Policy.compute_single_action` would leave filter, preprocessor and unsquashing out.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +19,9 @@ from numpy.typing import NDArray
 from ray.rllib.algorithms.dqn.dqn_torch_model import DQNTorchModel
 from ray.rllib.models.torch.modules.noisy_layer import NoisyLayer
 from ray.rllib.models.torch.recurrent_net import LSTMWrapper
-from ray.rllib.models.torch.torch_action_dist import (
-    TorchCategorical,
-    TorchDiagGaussian,
-    TorchMultiActionDistribution,
-    TorchMultiCategorical,
-    TorchSquashedGaussian,
-)
+from ray.rllib.models.torch.torch_action_dist import TorchCategorical
 from ray.rllib.policy.policy import Policy
-from ray.rllib.policy.sample_batch import SampleBatch
+from ray.rllib.policy.sample_batch import SampleBatch, concat_samples
 from ray.rllib.policy.torch_mixins import ValueNetworkMixin
 from ray.rllib.policy.torch_policy import TorchPolicy
 from ray.rllib.policy.torch_policy_v2 import TorchPolicyV2
@@ -36,152 +29,123 @@ from ray.rllib.utils.annotations import is_overridden
 from ray.rllib.utils.exploration.parameter_noise import ParameterNoise
 from ray.rllib.utils.numpy import convert_to_numpy
 from ray.rllib.utils.spaces.space_utils import unbatch
+from ray.rllib.utils.torch_utils import convert_to_torch_tensor
 from ray.rllib.utils.typing import ActionConnectorDataType, AgentConnectorDataType
 from torch import Tensor, nn
 
 from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.checkpoints.unpickle import explain, unpickle
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError, first_line
-from rlservo.export.recipe.describe import surprises
+from rlservo.export.contract.scores import ACTION_DIST_INPUTS, Q_VALUES
 from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLeaf
-from rlservo.export.recipe.runners import Inputs
+from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.trees import build, named_leaves, space_leaves, tree_leaves
-from rlservo.export.rllib import private_names
-from rlservo.export.rllib.distribution_mode import find_mode
+from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_bias_layers
-from rlservo.export.rllib.new_connectors import check_spaces
 from rlservo.export.rllib.old_connectors import check_connectors, read_old_steps, read_old_transform
 from rlservo.export.rllib.old_models import register_custom_parts
+from rlservo.export.rllib.restored_policy import RestoredPolicy
+from rlservo.export.rllib.supported_spaces import check_spaces
 
-DISTRIBUTIONS: dict[type, DistributionKind] = {
-    TorchDiagGaussian: "diag_gaussian",
-    TorchSquashedGaussian: "squashed_gaussian",
-    TorchCategorical: "categorical",
-    TorchMultiCategorical: "multi_categorical",
-    TorchMultiActionDistribution: "multi",
-}
 AGENT = "agent0"  # what RLlib calls the one agent of an environment
-Q_VALUES = "q_values"
 
 
 class OldStackNetwork(nn.Module):
     """The policy's forward pass as a module that can be traced: network input to named tensors, then the next state."""
 
-    def __init__(self, policy: Any, names: tuple[str, ...], given: int = 0) -> None:
+    def __init__(self, policy: Any, names: tuple[str, ...], *, acts: bool) -> None:
+        """`acts` says that the distribution's own rule gives the action's leaves."""
         super().__init__()
         self.module: Any = policy.model
         self.names = names
-        self.given = given
-        """How many action leaves the distribution's own rule gives."""
+        self._acts = acts
         self._policy = policy
 
     def forward(self, obs: Tensor, *state: list[Tensor]) -> tuple[Tensor, ...]:
         """Return one tensor `[batch, ...]` for each of `names`, given the network's input `[batch, ...]`."""
-        inputs, kind, after = _distribution(self._policy, obs, state[0] if state else [])
+        inputs, kind, next_state = _distribution(self._policy, obs, state[0] if state else [])
         named = [self.module.value_function() if name == "value" else inputs for name in self.names]
-        ready = tree_leaves(kind(inputs.clone(), self.module).deterministic_sample()) if self.given else []
-        return (*ready, *named, *(after if state else []))
+        actions = tree_leaves(kind(inputs.clone(), self.module).deterministic_sample()) if self._acts else []
+        return (*actions, *named, *(next_state if state else []))
 
 
 def _distribution(policy: Any, obs: Any, state: list[Tensor]) -> tuple[Tensor, Any, list[Tensor]]:
     """Return (distribution parameters or Q-values, distribution class, state), as `_compute_action_helper` does it."""
-    batch = policy._lazy_tensor_dict({SampleBatch.OBS: obs})
+    batch = SampleBatch({SampleBatch.OBS: obs})
+    batch.set_get_interceptor(partial(convert_to_torch_tensor, device=policy.device))
     batch.set_training(True)  # RLlib does so for inference, too
     lengths = torch.ones_like(state[0][:, 0], dtype=torch.long) if state else None
     how: dict[str, Any] = {"explore": False, "timestep": 0, "is_training": False}
     how.update({"state_batches": state, "seq_lens": lengths})
     kind: Any = policy.dist_class
     if issubclass(type(policy), TorchPolicyV2) and is_overridden(policy.action_distribution_fn):
-        inputs, kind, after = policy.action_distribution_fn(policy.model, obs_batch=batch, **how)
+        inputs, kind, next_state = policy.action_distribution_fn(policy.model, obs_batch=batch, **how)
     elif issubclass(type(policy), TorchPolicy) and policy.action_distribution_fn:
-        inputs, kind, after = policy.action_distribution_fn(policy, policy.model, input_dict=batch, **how)
+        inputs, kind, next_state = policy.action_distribution_fn(policy, policy.model, input_dict=batch, **how)
     else:
-        inputs, after = policy.model(batch, state, lengths)
-    return inputs, kind, after
+        inputs, next_state = policy.model(batch, state, lengths)
+    return inputs, kind, next_state
 
 
 class OldStackLoop:
     """RLlib acting step after step, as `EnvRunnerV2` does it (ray 2.60): exploration off, filter frozen."""
 
     def __init__(self, policy: Any, recipe: Recipe, names: tuple[str, ...]) -> None:
-        self._policy = policy
+        self.policy = policy
         self._recipe = recipe
         self._names = names
 
-    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
         """Return what RLlib computes for one step of every row, each an environment of its own, by output name."""
-        policy, envs = self._policy, [str(row) for row in range(len(restart))]
+        policy, envs = self.policy, [str(row) for row in range(len(restart))]
         items = []
         for row, env in enumerate(envs):
             if restart[row]:
                 policy.agent_connectors.reset(env)
             names = list(self._recipe.observation_leaves)
-            told = {
+            columns = {
                 SampleBatch.NEXT_OBS: build(self._recipe.observation_space, [inputs[name][row] for name in names]),
                 SampleBatch.INFOS: {},
                 SampleBatch.T: 0,
                 SampleBatch.AGENT_INDEX: 0,
             }
             if not restart[row]:
-                told.update({SampleBatch.REWARDS: 0.0, SampleBatch.TERMINATEDS: False, SampleBatch.TRUNCATEDS: False})
-            items.append(AgentConnectorDataType(env, AGENT, told))
-        join = private_names.find("ray.rllib.evaluation.env_runner_v2", "_batch_inference_sample_batches")
+                columns |= {SampleBatch.REWARDS: 0.0, SampleBatch.TERMINATEDS: False, SampleBatch.TRUNCATEDS: False}
+            items.append(AgentConnectorDataType(env, AGENT, columns))
         processed = policy.agent_connectors(items)
-        batch = join([item.data.sample_batch for item in processed])
-        seen = np.asarray(batch[SampleBatch.OBS])
+        batch: Any = concat_samples([item.data.sample_batch for item in processed])
+        if "state_in_0" in batch:
+            batch[SampleBatch.SEQ_LENS] = np.ones(len(envs), np.int32)
+        network_obs = np.asarray(batch[SampleBatch.OBS])
         actions, states, fetches = policy.compute_actions_from_input_dict(
             batch, explore=False, timestep=policy.global_timestep
         )
-        outputs = self._outputs(seen, fetches, states)
-        sent = []
+        outputs = self._outputs(network_obs, fetches, states)
+        commands = []
         for row, action in enumerate(unbatch(convert_to_numpy(actions))):
             env, raw, own = envs[row], processed[row].data.raw_dict, [state[row] for state in states]
             ready = policy.action_connectors(ActionConnectorDataType(env, AGENT, raw, (action, own, {}))).output[0]
-            sent.append(named_leaves(ready, "action"))
+            commands.append(named_leaves(ready, "action"))
             policy.agent_connectors.on_policy_output(ActionConnectorDataType(env, AGENT, raw, (action, own, {})))
-        return {**{name: np.stack([one[name] for one in sent]) for name in sent[0]}, **outputs}
+        return {**{name: np.stack([command[name] for command in commands]) for name in commands[0]}, **outputs}
 
-    def _outputs(self, seen: NDArray[Any], fetches: dict[str, Any], states: list[Any]) -> dict[str, NDArray[Any]]:
-        found: dict[str, NDArray[Any]] = {}
+    def _outputs(self, network_obs: NDArray[Any], fetches: dict[str, Any], states: list[Any]) -> Outputs:
+        outputs: Outputs = {}
         with torch.no_grad():
             if "value" in self._names:
-                found["value"] = self._policy.model.value_function().numpy().copy()
+                outputs["value"] = self.policy.model.value_function().numpy().copy()
             parameters = fetches[SampleBatch.ACTION_DIST_INPUTS]
             if not states:  # a temperature, DQN's or the user's own, divides them in place: compute them again
-                parameters = _distribution(self._policy, seen, [])[0].numpy()
-        found[self._names[0]] = np.asarray(parameters)
+                parameters = _distribution(self.policy, network_obs, [])[0].numpy()
+        outputs[self._names[0]] = np.asarray(parameters)
         for leaf, state in zip(self._recipe.network_state, states, strict=True):
-            found[f"state_out.{leaf.name}"] = np.asarray(state).copy()
-        return found
+            outputs[f"state_out.{leaf.name}"] = np.asarray(state).copy()
+        return outputs
 
 
-@dataclass(frozen=True)
-class OldStackCheckpoint:
-    """A restored policy: the recipe around its network, the network for tracing, and RLlib's own way to act."""
-
-    recipe: Recipe
-    network: OldStackNetwork
-    module_class: str
-    _policy: Any
-    agents: tuple[str, ...] = ()
-
-    def reference(self, inputs: Inputs) -> dict[str, NDArray[Any]]:
-        """Return what RLlib computes for a batch of raw observations `[batch, ...]` by input name, by output name.
-
-        `action` is what RLlib would pass to `env.step`: exploration off, filter frozen. Every row is an episode's
-        first step.
-        """
-        rows = len(next(iter(inputs.values())))
-        return self.loop().step(inputs, np.ones(rows, np.bool_))
-
-    def loop(self) -> OldStackLoop:
-        """Return RLlib acting step after step, which a policy with a memory is compared with."""
-        return OldStackLoop(self._policy, self.recipe, self.network.names)
-
-
-def load_old_stack(
+def restore_old_stack(
     files: OldStackFiles, app_dir: Path, notify: Callable[[str], None], *, value: bool = True
-) -> OldStackCheckpoint:
+) -> RestoredPolicy:
     """Restore one policy; the user's own classes are in `app_dir`. `value` False leaves the value head out.
 
     Raises CheckpointError when it cannot be read, UnsupportedError when exporting it would lose something.
@@ -196,19 +160,16 @@ def load_old_stack(
     state = _network_state(policy)
     distribution, mode, names = _action_rule(policy, action_space, notify)
     recipe = Recipe(observation_space, action_space, steps, mode, transform, distribution, state)
-    for surprise in surprises(recipe):
-        notify(surprise)
     if value and _has_value(policy, notify):
         names = (*names, "value")
     # A second policy to trace: a model keeps tensors of its last forward pass, which the reference needs for itself.
     traced = _restore(files, app_dir)
     _prepare(traced)
     replace_bias_layers(traced.model)
+    network = OldStackNetwork(traced, names, acts=mode == "given")
     model = type(policy.model)
-    given = len(recipe.action_leaves) if mode == "given" else 0
-    return OldStackCheckpoint(
-        recipe, OldStackNetwork(traced, names, given), f"{model.__module__}.{model.__qualname__}", policy
-    )
+    module_class = f"{model.__module__}.{model.__qualname__}"
+    return RestoredPolicy(recipe, network, module_class, partial(OldStackLoop, policy, recipe, names))
 
 
 def _network_state(policy: Any) -> tuple[StateLeaf, ...]:
@@ -349,15 +310,13 @@ def _action_rule(
     mode = find_mode(
         lambda probe: kind(probe, policy.model).deterministic_sample(), plain.__name__, action_space, inputs
     )
-    distribution = DISTRIBUTIONS.get(plain)
     children = getattr(kind, "keywords", {}).get("child_distributions", ())
-    if any(getattr(child, "func", child) not in DISTRIBUTIONS for child in children):
-        distribution = None
-    if mode == "given":  # counted integers, or the user's own
-        distribution = None
+    all_known = all(distribution_kind(getattr(child, "func", child)) for child in children)
+    # The mode is "given" of counted integers, or of the user's own.
+    distribution = distribution_kind(plain) if all_known and mode != "given" else None
     if distribution is None:
         notify(f"the action distribution {plain.__name__} on {action_space} is not one the export can explore with")
-    return distribution, mode, ("action_dist_inputs",)
+    return distribution, mode, (ACTION_DIST_INPUTS,)
 
 
 def _has_value(policy: Any, notify: Callable[[str], None]) -> bool:

@@ -1,4 +1,7 @@
-"""Private names of Ray that reading old-stack checkpoints needs: where one is gone, the export is refused by name."""
+"""Private names of RLlib and Tune that restoring needs: where one is gone, the export is refused by name and version.
+
+docs/operations.md, "What must change for the next Ray", lists them.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,36 @@ from typing import Any
 
 from rlservo.export.contract.errors import UnsupportedError
 
+KNOWN = "2.60"
+"""The Ray these names are of."""
+
 
 def find(module: str, name: str) -> Any:
     """Return what a module of Ray calls so. Raises UnsupportedError where this Ray has no such thing."""
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError):
-        import ray
+        raise _refusal(f"{module}.{name}") from None
 
-        raise UnsupportedError(
-            f"Ray {ray.__version__} has no {module}.{name}, without which old-stack checkpoints cannot be exported: "
-            "export with a Ray that this version of rlservo knows, such as 2.60"
-        ) from None
+
+def get(owner: Any, name: str) -> Any:
+    """Return an object's attribute. Raises UnsupportedError where this Ray's has none of that name."""
+    try:
+        return getattr(owner, name)
+    except AttributeError:
+        raise _refusal(f"{type(owner).__module__}.{type(owner).__name__}.{name}") from None
+
+
+def replace(owner: Any, name: str, value: Any) -> None:
+    """Set an attribute that is there: under a name that this Ray does not know, nothing would come of it."""
+    get(owner, name)
+    setattr(owner, name, value)
+
+
+def _refusal(name: str) -> UnsupportedError:
+    import ray
+
+    return UnsupportedError(
+        f"Ray {ray.__version__} has no {name}, without which this checkpoint cannot be exported: export with a Ray "
+        f"that this version of rlservo knows, such as {KNOWN}"
+    )

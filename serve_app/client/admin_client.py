@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 from urllib.parse import urlsplit
 
-from typing_extensions import Self
-
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.client.http_transport import Transport, encode
+from rlservo.serve_app.interface import Closeable
 from rlservo.serve_app.wire.admin_key_file import key_file, read_key
 from rlservo.serve_app.wire.loopback import is_loopback
 
@@ -19,7 +17,7 @@ KEY_VARIABLE = "RLSERVO_ADMIN_KEY"
 TIMEOUT_S = 90.0  # every replica loads and proves a version before the server answers
 
 
-class AdminClient:
+class AdminClient(Closeable):
     """Changes what a server serves. Every method raises the error that the server names."""
 
     def __init__(self, url: str, *, api_key: str, timeout_s: float = TIMEOUT_S) -> None:
@@ -62,14 +60,6 @@ class AdminClient:
         """Close the connection."""
         self._transport.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def _command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
         reply: dict[str, Any] = self._transport.post("v1", "admin", "policies", name, command, body=encode(document))
         return reply
@@ -82,13 +72,13 @@ def find_key(url: str, file: Path | None) -> str:
     """
     if file is not None:
         return read_key(file)
-    given = os.environ.get(KEY_VARIABLE)
-    if given:
-        return given
+    key = os.environ.get(KEY_VARIABLE)
+    if key:
+        return key
     parts = urlsplit(url)
-    own = key_file(parts.port or 80)
-    if is_loopback(parts.hostname or "") and own.exists():
-        return read_key(own)
+    local = key_file(parts.port or 80)
+    if is_loopback(parts.hostname or "") and local.exists():
+        return read_key(local)
     raise UsageError(
         f"administration needs an admin key: name its file with --key-file or set {KEY_VARIABLE} "
         "('rlservo serve' writes one and says where; 'rlservo key LABEL --admin' makes one for other servers)"

@@ -36,10 +36,10 @@ class DeadlineBackend(httpcore.NetworkBackend):
         """Return what is left of `timeout` and the deadline; raise `kind` where that is nothing."""
         if self.deadline is None:
             return timeout
-        left = self.deadline - time.monotonic()
-        if left <= 0:
+        remaining_s = self.deadline - time.monotonic()
+        if remaining_s <= 0:
             raise kind("the deadline has passed")
-        return left if timeout is None else min(left, timeout)
+        return remaining_s if timeout is None else min(remaining_s, timeout)
 
     def connect_tcp(
         self,
@@ -50,8 +50,8 @@ class DeadlineBackend(httpcore.NetworkBackend):
         socket_options: Iterable[Any] | None = None,
     ) -> httpcore.NetworkStream:
         """Connect."""
-        left = self.remaining(timeout, httpcore.ConnectTimeout)
-        stream = self._backend.connect_tcp(host, port, left, local_address, socket_options)
+        remaining_s = self.remaining(timeout, httpcore.ConnectTimeout)
+        stream = self._backend.connect_tcp(host, port, remaining_s, local_address, socket_options)
         self.connections += 1
         return _DeadlineStream(stream, self)
 
@@ -77,8 +77,8 @@ class _DeadlineStream(httpcore.NetworkStream):
     def start_tls(
         self, ssl_context: ssl.SSLContext, server_hostname: str | None = None, timeout: float | None = None
     ) -> httpcore.NetworkStream:
-        left = self._backend.remaining(timeout, httpcore.ConnectTimeout)
-        return _DeadlineStream(self._stream.start_tls(ssl_context, server_hostname, left), self._backend)
+        remaining_s = self._backend.remaining(timeout, httpcore.ConnectTimeout)
+        return _DeadlineStream(self._stream.start_tls(ssl_context, server_hostname, remaining_s), self._backend)
 
     def get_extra_info(self, info: str) -> Any:
         return self._stream.get_extra_info(info)

@@ -18,14 +18,7 @@ from urllib.request import getproxies, proxy_bypass
 
 import numpy as np
 
-from rlservo.export.contract.errors import (
-    DeadlineError,
-    RequestError,
-    RlservoError,
-    TooLargeError,
-    UnavailableError,
-    UsageError,
-)
+from rlservo.export.contract.errors import DeadlineError, TooLargeError, UnavailableError, UsageError
 
 try:
     import httpcore
@@ -33,6 +26,8 @@ except ModuleNotFoundError as missing:
     raise UsageError("the HTTP client needs httpcore: pip install 'rlservo[client]'") from missing
 
 from rlservo.serve_app.client.deadline_backend import DeadlineBackend
+from rlservo.serve_app.client.error_replies import decode_error, excerpt
+from rlservo.serve_app.client.server_address import host_of, parse_address
 
 try:  # three times faster than the standard library on an image; not a requirement of the client
     import orjson
@@ -42,7 +37,8 @@ except ModuleNotFoundError:
 FIRST_WAIT_S = 0.05  # before the second attempt; doubles each time
 LONGEST_WAIT_S = 2.0
 MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; keeps a wrong URL from filling the memory
-KEEP_S = 5.0  # [s] that an idle connection is kept
+KEEPALIVE_S = 5.0  # that an idle connection is kept
+SCHEMES = {"http": "http", "https": "https"}
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 PATH_CHARACTERS = "/%:@!$&'()*+,;=~"  # of a server's address, which stay as they are given
 PROXIES: dict[str, Callable[..., httpcore.ConnectionPool]] = {
@@ -58,6 +54,11 @@ FAILURES = (
     httpcore.TimeoutException,
     httpcore.UnsupportedProtocol,
 )
+DROPS = (httpcore.RemoteProtocolError, httpcore.ReadError, httpcore.WriteError)
+
+
+class DroppedError(UnavailableError):
+    """The server closed the connection before it answered."""
 
 
 class Transport:
@@ -68,7 +69,7 @@ class Transport:
 
         `api_key` travels as `Authorization: Api-Key <key>`, as openpi's clients send it.
         """
-        self.url = _checked_url(url)
+        self.url = parse_address(url, SCHEMES)
         if not timeout_s > 0:
             raise UsageError(f"timeout_s must be above 0 seconds, got {timeout_s}")
         if retries < 0:
@@ -76,7 +77,7 @@ class Transport:
         self._timeout_s = timeout_s
         self._retries = retries
         parts = urlsplit(self.url)
-        self._address = (parts.scheme.encode(), _host_of(parts), parts.port, quote(parts.path, safe=PATH_CHARACTERS))
+        self._address = (parts.scheme.encode(), host_of(parts), parts.port, quote(parts.path, safe=PATH_CHARACTERS))
         # The replies are a few hundred bytes: compressing them costs more than it saves.
         self._headers = [
             (b"host", _host_header(parts)),
@@ -88,7 +89,7 @@ class Transport:
             self._headers.append((b"authorization", f"Api-Key {api_key}".encode()))
         self._backend = DeadlineBackend()
         self._pool = _connection_pool(self.url, self._backend)
-        self._closed = False
+        self._is_closed = False
 
     @property
     def reconnects(self) -> int:
@@ -105,7 +106,7 @@ class Transport:
 
     def close(self) -> None:
         """Close the connections. A call after that raises UsageError."""
-        self._closed = True
+        self._is_closed = True
         self._pool.close()
 
     def _call(
@@ -116,7 +117,7 @@ class Transport:
         Raises DeadlineError when the answer did not come in time (never retried: the server may still be at work),
         UnavailableError when the server cannot be reached or stays at 503, and else the error the server names.
         """
-        if self._closed:
+        if self._is_closed:
             raise UsageError("the client is closed: make a new one")
         url = "/".join((self.url, *(quote(part, safe="") for part in path)))
         scheme, host, port, prefix = self._address
@@ -126,37 +127,35 @@ class Transport:
         deadline = time.monotonic() + budget
         for attempt, wait in enumerate(_waits(self._retries if retries is None else retries)):
             try:
-                status, headers, content = self._once(method, address, body, deadline, budget)
+                status, headers, content = self._exchange(method, address, body, deadline, budget)
             except UnavailableError as error:
                 failure = error
-                # A server that closed an idle connection is probably there: ask again at once, the first time.
-                if attempt == 0 and error.details.get("dropped"):
-                    wait = None if wait is None else 0.0
+                if attempt == 0 and wait is not None and isinstance(error, DroppedError):
+                    wait = 0.0  # a server that closed an idle connection is probably there
             else:
                 if status < 300:
                     return self._parse(content, url, status)
-                answered = self._error(content, url, status)
+                refusal = decode_error(url, status, content)
                 if status != 503:
-                    raise answered
-                failure = UnavailableError(answered.message, answered.details)
-                asked = _retry_after_s(headers)
-                if asked is not None:
-                    failure.details["retry_after_s"] = asked
-                    wait = None if wait is None else asked
+                    raise refusal
+                failure = refusal if isinstance(refusal, UnavailableError) else UnavailableError(refusal.message)
+                failure.retry_after_s = _retry_after_s(headers)
+                if wait is not None and failure.retry_after_s is not None:
+                    wait = failure.retry_after_s
             # Waiting longer than the caller will is no use: say so now.
             if wait is None or time.monotonic() + wait >= deadline:
                 raise failure
             time.sleep(wait)
         raise AssertionError("the last wait is None")
 
-    def _once(
+    def _exchange(
         self, method: str, url: httpcore.URL, body: bytes | None, deadline: float, budget: float
     ) -> tuple[int, Sequence[tuple[bytes, bytes]], bytes]:
         """Return (status, headers, body) of one attempt."""
         remaining = deadline - time.monotonic()
-        late = DeadlineError(f"{self.url} did not answer within {budget:g} s", {"timeout_s": budget})
+        timeout_error = DeadlineError(f"{self.url} did not answer within {budget:g} s", {"timeout_s": budget})
         if remaining <= 0:
-            raise late
+            raise timeout_error
         headers = self._headers
         if body is not None:
             headers = [*headers, (b"content-type", b"application/json"), (b"content-length", b"%d" % len(body))]
@@ -170,7 +169,7 @@ class Transport:
                 for chunk in response.iter_stream():
                     content += chunk
                     if time.monotonic() > deadline:
-                        raise late
+                        raise timeout_error
                     if len(content) > MAX_REPLY_BYTES:
                         raise TooLargeError(
                             f"{self.url} answered more than {MAX_REPLY_BYTES >> 20} MiB: is it rlservo?"
@@ -178,18 +177,18 @@ class Transport:
             finally:
                 response.close()  # an unread rest closes the connection: a late answer cannot meet the next request
         except (httpcore.ReadTimeout, httpcore.WriteTimeout) as error:
-            raise late from error
+            raise timeout_error from error
         except httpcore.ConnectTimeout as error:
             raise UnavailableError(f"{self.url} cannot be reached within {budget:g} s", {"url": self.url}) from error
         except FAILURES as error:
-            dropped = isinstance(error, httpcore.RemoteProtocolError | httpcore.ReadError | httpcore.WriteError)
-            what = "dropped the connection" if dropped else "cannot be reached"
             why = str(error) or type(error).__name__
-            raise UnavailableError(f"{self.url} {what}: {why}", {"url": self.url, "dropped": dropped}) from error
+            if isinstance(error, DROPS):
+                raise DroppedError(f"{self.url} dropped the connection: {why}", {"url": self.url}) from error
+            raise UnavailableError(f"{self.url} cannot be reached: {why}", {"url": self.url}) from error
         finally:
             self._backend.deadline = None
         if time.monotonic() > deadline:
-            raise late
+            raise timeout_error
         return response.status, response.headers, content
 
     def _parse(self, content: bytes, url: str, status: int) -> Any:
@@ -197,30 +196,8 @@ class Transport:
             return json.loads(content) if orjson is None else orjson.loads(content)
         except ValueError as error:
             raise UnavailableError(
-                f"{url} answered {status} with {_shown(content)}, which is not JSON: is it an rlservo server?"
+                f"{url} answered {status} with {excerpt(content)}, which is not JSON: is it an rlservo server?"
             ) from error
-
-    def _error(self, content: bytes, url: str, status: int) -> RlservoError:
-        """Turn an error's body back into the class that the server raised."""
-        try:
-            document = json.loads(content)
-        except ValueError:
-            document = None
-        told = error_from(document, status) if isinstance(document, dict) else None
-        if told is not None:
-            return told
-        if status == 404:  # Ray Serve's own answer while the application is being deployed
-            return UnavailableError(f"{url} answered 404 with {_shown(content)}: no rlservo server is there (yet)")
-        return error_of_status(status)(f"{url} answered {status} with {_shown(content)}: is it an rlservo server?")
-
-
-def error_from(document: Mapping[str, Any], status: int) -> RlservoError | None:
-    """Turn `{"error", "code", "details"?}` back into the class that the server raised; None if it is not that."""
-    if not isinstance(document.get("error"), str):
-        return None
-    details = document.get("details")
-    kind = error_classes().get(str(document.get("code")), error_of_status(status))
-    return kind(document["error"], details if isinstance(details, dict) else None)
 
 
 def encode(document: Mapping[str, Any]) -> bytes:
@@ -228,17 +205,6 @@ def encode(document: Mapping[str, Any]) -> bytes:
     if orjson is not None:
         return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY, default=_plain)
     return json.dumps(document, default=_plain, allow_nan=False).encode()
-
-
-def error_classes() -> dict[str, type[RlservoError]]:
-    """Return every error class by its code, as the wire names it."""
-    found = {RlservoError.code: RlservoError}
-    waiting = [RlservoError]
-    while waiting:
-        for kind in waiting.pop().__subclasses__():
-            found[kind.code] = kind
-            waiting.append(kind)
-    return found
 
 
 def _plain(value: Any) -> Any:
@@ -263,35 +229,28 @@ def _retry_after_s(headers: Sequence[tuple[bytes, bytes]]) -> float | None:
     return seconds if seconds >= 0 else None  # also refuses NaN
 
 
-def error_of_status(status: int) -> type[RlservoError]:
-    """Return the error for an answer that carries no code of ours, a proxy's for example."""
-    if status in (401, 403):
-        return UsageError
-    if status in (408, 504):
-        return DeadlineError
-    if status == 413:
-        return TooLargeError
-    return UnavailableError if status >= 500 or status < 400 else RequestError
-
-
 def _connection_pool(url: str, backend: DeadlineBackend) -> httpcore.ConnectionPool:
     """Return the connections to a server, through the proxy that the environment asks for."""
     # Reading the certificates takes 20 ms; http has no use for them.
     certificates = _certificates() if url.startswith("https") else None
     proxy = _proxy_of(url)
+    options: dict[str, Any] = {"max_connections": 100, "keepalive_expiry": KEEPALIVE_S, "network_backend": backend}
     if proxy is None:
-        return httpcore.ConnectionPool(
-            certificates, max_connections=100, keepalive_expiry=KEEP_S, network_backend=backend
-        )
+        return httpcore.ConnectionPool(certificates, **options)
     parts = urlsplit(proxy)
     user = None if parts.username is None else (unquote(parts.username), unquote(parts.password or ""))
-    address = httpcore.URL(scheme=parts.scheme.encode(), host=_host_of(parts), port=parts.port, target=b"/")
+    address = httpcore.URL(scheme=parts.scheme.encode(), host=host_of(parts), port=parts.port, target=b"/")
     if parts.scheme not in PROXIES:
         raise UsageError(
             f"a proxy of the environment begins with {parts.scheme!r}: expected for example 'http://proxy:3128'"
         )
     return PROXIES[parts.scheme](
-        address, user, ssl_context=certificates, max_connections=100, keepalive_expiry=KEEP_S, network_backend=backend
+        address,
+        user,
+        ssl_context=certificates,
+        max_connections=100,
+        keepalive_expiry=KEEPALIVE_S,
+        network_backend=backend,
     )
 
 
@@ -303,13 +262,8 @@ def _certificates() -> ssl.SSLContext:
     return httpcore.default_ssl_context()
 
 
-def _host_of(parts: SplitResult) -> bytes:
-    """Return a host as the wire has it."""
-    return (parts.hostname or "").encode("idna")
-
-
 def _host_header(parts: SplitResult) -> bytes:
-    host = _host_of(parts)
+    host = host_of(parts)
     host = b"[%s]" % host if b":" in host else host
     return host if parts.port is None else b"%s:%d" % (host, parts.port)
 
@@ -320,22 +274,3 @@ def _proxy_of(url: str) -> str | None:
     if parts.hostname in LOOPBACK or proxy_bypass(parts.netloc):
         return None
     return getproxies().get(parts.scheme)
-
-
-def _shown(content: bytes) -> str:
-    text = content[:80].decode("utf-8", "replace")
-    return f"{text!r}{'...' if len(content) > 80 else ''}" if text else "an empty body"
-
-
-def _checked_url(url: str) -> str:
-    parts = urlsplit(url)
-    try:
-        port_is_one = parts.port != 0
-        _host_of(parts)  # UnicodeError, a ValueError: a name that no wire can carry
-    except ValueError:
-        port_is_one = False
-    if parts.scheme not in ("http", "https") or not parts.hostname or not port_is_one:
-        raise UsageError(f"{url!r} is not a server address: expected for example 'http://127.0.0.1:8000'")
-    if parts.query or parts.fragment:
-        raise UsageError(f"{url!r} has a query or fragment: expected only scheme, host, port and path")
-    return url.rstrip("/")

@@ -1,4 +1,4 @@
-"""Observations as JSON can carry them, and replies checked: sender, step, state and action fit the contract."""
+"""Replies checked: they answer this request, and their step, state and action fit the policy's contract."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import ActionError, ObservationError, SessionLostError, UnavailableError
+from rlservo.export.contract.errors import ActionError, SessionLostError, UnavailableError
 from rlservo.export.contract.nested import build_action
-from rlservo.export.contract.spaces import DictSpec, LeafSpec, SpaceSpec, TupleSpec, leaf_specs
-from rlservo.serve_app.interface import Observation
+from rlservo.export.contract.spaces import LeafSpec, leaf_specs
 from rlservo.serve_app.wire.state_names import MARK
 
 
@@ -47,7 +46,7 @@ def check_step(reply: Mapping[str, Any], steps: int) -> int:
     return step
 
 
-def carried(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
+def next_state(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
     """Return the state for the next request; raise UnavailableError where the server gave none."""
     state = reply.get("state")
     if state is None and not contract.state:
@@ -58,59 +57,12 @@ def carried(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
     return state
 
 
-def sendable(obs: Observation, contract: Contract) -> tuple[Any, tuple[int, ...]]:
-    """Return (what goes into the JSON, the batch axis as () or (B,)); the server checks shapes and names."""
-    space = contract.observation_space
-    if isinstance(space, DictSpec | TupleSpec):
-        return _sendable_part(obs, space, "obs")
-    if isinstance(obs, Mapping):
-        named = {str(name): _finite(value, f"element {name!r}") for name, value in obs.items()}
-        return named, next((value.shape[:1] for value in named.values()), ())
-    array = _finite(obs, "")
-    batch = array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
-    return array, batch
-
-
-def _sendable_part(obs: Any, space: SpaceSpec, path: str) -> tuple[Any, tuple[int, ...]]:
-    """Return (a nested observation's JSON form, the batch axis of its leaves); the server checks that it fits."""
-    if isinstance(space, DictSpec | TupleSpec):
-        inside = space.spaces.items() if isinstance(space, DictSpec) else enumerate(space.spaces)
-        try:
-            parts = {key: _sendable_part(obs[key], child, f"{path}.{key}") for key, child in inside}
-        except (KeyError, IndexError, TypeError) as error:
-            raise ObservationError(f"the observation does not have the parts of {path}: {error!r}") from error
-        plain = {key: part for key, (part, _) in parts.items()}
-        batch = next((axis for _, axis in parts.values()), ())
-        return (plain if isinstance(space, DictSpec) else list(plain.values())), batch
-    array = _finite(obs, f"part {path}")
-    return array, array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
-
-
-def _finite(value: ArrayLike, where: str) -> NDArray[Any]:
-    """Return `value` as a contiguous array of finite numbers, or raise ObservationError naming the element."""
-    try:
-        array = np.ascontiguousarray(value).reshape(np.shape(value))  # ascontiguousarray makes a scalar an array of 1
-    except ValueError as error:
-        raise ObservationError(f"the observation is ragged: expected numbers in one shape ({error})") from error
-    if array.dtype.kind not in "fiub":
-        got = type(value).__name__ if array.dtype.kind == "O" else array.dtype.name
-        raise ObservationError(f"the observation{where and f', {where},'} holds {got}, expected numbers")
-    array = array.astype(array.dtype.newbyteorder("="), copy=False)  # orjson takes the machine's own byte order only
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        first = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        which = where or f"element {first[0] if len(first) == 1 else first}"
-        raise ObservationError(
-            f"the observation's {which} is {array[first]}: expected a finite number", {"element": list(first)}
-        )
-    return array
-
-
-def restored(action: Any, batch: tuple[int, ...], contract: Contract) -> Any:
+def decode_action(action: Any, batch: tuple[int, ...], contract: Contract) -> Any:
     """Return the JSON action in the space's form, arrays of its dtype and shape, or raise ActionError."""
     return build_action(
         contract.action_space,
         {
-            name: _restored_leaf(_part(action, name, contract), batch, name, leaf, contract)
+            name: _decode_leaf(_part(action, name, contract), batch, name, leaf, contract)
             for name, leaf in leaf_specs(contract.action_space, "action").items()
         },
     )
@@ -119,7 +71,7 @@ def restored(action: Any, batch: tuple[int, ...], contract: Contract) -> Any:
 def is_action(action: Any, batch: tuple[int, ...], contract: Contract) -> bool:
     """Whether this is an action of the policy for so many observations."""
     try:
-        restored(action, batch, contract)
+        decode_action(action, batch, contract)
     except ActionError:
         return False
     return True
@@ -138,8 +90,8 @@ def _part(action: Any, name: str, contract: Contract) -> Any:
     return part
 
 
-def _restored_leaf(action: Any, batch: tuple[int, ...], name: str, space: LeafSpec, contract: Contract) -> NDArray[Any]:
-    expected = (*batch, *space.shape)
+def _decode_leaf(action: Any, batch: tuple[int, ...], name: str, space: LeafSpec, contract: Contract) -> NDArray[Any]:
+    shape = (*batch, *space.shape)
     what = f"action for {contract.name!r}" if name == "action" else f"{name} for {contract.name!r}"
     try:
         array = np.asarray(action)
@@ -147,11 +99,11 @@ def _restored_leaf(action: Any, batch: tuple[int, ...], name: str, space: LeafSp
         array = np.asarray(None)
     if array.dtype.kind not in "fiu" and array.size:
         raise ActionError(f"the server's {what} is {str(action)[:80]}, expected numbers")
-    if array.shape != expected:
-        raise ActionError(f"the server's {what} has shape {array.shape}, expected {expected}")
+    if array.shape != shape:
+        raise ActionError(f"the server's {what} has shape {array.shape}, expected {shape}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ActionError(f"the server's {what} has an element that is not finite")
-    typed = array.astype(space.dtype)
-    if typed.dtype.kind in "iu" and not np.array_equal(typed, array):
+    converted = array.astype(space.dtype)
+    if converted.dtype.kind in "iu" and not np.array_equal(converted, array):
         raise ActionError(f"the server's {what} is {str(action)[:80]}, expected {space.dtype}")
-    return typed
+    return converted

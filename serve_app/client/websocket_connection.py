@@ -22,7 +22,7 @@ except ModuleNotFoundError as missing:
     raise UsageError("the WebSocket client needs websockets: pip install 'rlservo[client]'") from missing
 
 MAX_FRAME_BYTES = 64 << 20  # far above any action or contract
-READ_BYTES = 65536
+RECEIVE_BYTES = 65536
 
 
 class WebSocket:
@@ -31,7 +31,7 @@ class WebSocket:
     def __init__(self, url: str, *, api_key: str | None, deadline: float) -> None:
         """Connect and shake hands by `deadline` (`time.monotonic`).
 
-        Raises BrokenError, or RefusedError when the server answers with an HTTP error.
+        Raises BrokenError, or HandshakeError when the server answers with an HTTP error.
         """
         self._url = url
         uri = parse_uri(url)
@@ -39,7 +39,7 @@ class WebSocket:
         self._pieces: list[bytes] = []
         self._text = False
         try:
-            self._socket = socket.create_connection((uri.host, uri.port), timeout=_left(deadline))
+            self._socket = socket.create_connection((uri.host, uri.port), timeout=_remaining(deadline))
         except OSError as error:
             raise BrokenError(f"{url} cannot be reached: {error}") from error
         try:
@@ -53,14 +53,14 @@ class WebSocket:
             self._protocol.send_request(request)
             self._flush(deadline)
             while not self._protocol.handshake_exc and self._protocol.state.name == "CONNECTING":
-                self._read(deadline)
-            failed = self._protocol.handshake_exc
-            if isinstance(failed, InvalidStatus):
-                raise RefusedError(failed.response.status_code, bytes(failed.response.body or b""))
-            if isinstance(failed, InvalidHandshake):
-                raise BrokenError(f"{url} is not a stream: {failed}: is it an rlservo server?")
-            if failed is not None:
-                raise BrokenError(f"{url} dropped the connection: {failed}")
+                self._receive_bytes(deadline)
+            failure = self._protocol.handshake_exc
+            if isinstance(failure, InvalidStatus):
+                raise HandshakeError(failure.response.status_code, bytes(failure.response.body or b""))
+            if isinstance(failure, InvalidHandshake):
+                raise BrokenError(f"{url} is not a stream: {failure}: is it an rlservo server?")
+            if failure is not None:
+                raise BrokenError(f"{url} dropped the connection: {failure}")
         except (OSError, ssl.SSLError) as error:
             self.close()
             raise BrokenError(f"{url} cannot be reached: {error}") from error
@@ -68,7 +68,7 @@ class WebSocket:
             self.close()
             raise
         self._events = self._protocol.events_received()[1:]  # the first is the handshake's response
-        self.heard_at = time.monotonic()
+        self.last_receive_at = time.monotonic()
         """When the server's last bytes came."""
 
     def send(self, content: bytes, deadline: float) -> None:
@@ -95,7 +95,7 @@ class WebSocket:
                 if message is not None:
                     return message
             try:
-                self._read(deadline)
+                self._receive_bytes(deadline)
                 self._events += self._protocol.events_received()
                 self._flush(deadline)  # the answer to a ping, or to a close
             except TimeoutError:
@@ -128,10 +128,10 @@ class WebSocket:
         content = b"".join(self._pieces)
         return content.decode("utf-8", "replace") if self._text else content
 
-    def _read(self, deadline: float) -> None:
-        self._socket.settimeout(_left(deadline))
-        data = self._socket.recv(READ_BYTES)
-        self.heard_at = time.monotonic()
+    def _receive_bytes(self, deadline: float) -> None:
+        self._socket.settimeout(_remaining(deadline))
+        data = self._socket.recv(RECEIVE_BYTES)
+        self.last_receive_at = time.monotonic()
         if data:
             self._protocol.receive_data(data)
         else:
@@ -140,7 +140,7 @@ class WebSocket:
     def _flush(self, deadline: float) -> None:
         for data in self._protocol.data_to_send():
             if data:
-                self._socket.settimeout(_left(deadline))
+                self._socket.settimeout(_remaining(deadline))
                 self._socket.sendall(data)
 
 
@@ -150,7 +150,7 @@ class BrokenError(UnavailableError):
     code = "connection-broken"
 
 
-class RefusedError(Exception):
+class HandshakeError(Exception):
     """The server answered the upgrade with an HTTP error."""
 
     def __init__(self, status: int, body: bytes) -> None:
@@ -159,8 +159,8 @@ class RefusedError(Exception):
         self.body = body
 
 
-def _left(deadline: float) -> float:
-    left = deadline - time.monotonic()
-    if left <= 0:
+def _remaining(deadline: float) -> float:
+    remaining = deadline - time.monotonic()
+    if remaining <= 0:
         raise TimeoutError("the deadline has passed")
-    return left
+    return remaining

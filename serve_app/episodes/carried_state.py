@@ -18,25 +18,25 @@ from rlservo.serve_app.wire.state_names import BELONGS_TO, LAST_ACTION, MARK
 
 
 @dataclass(frozen=True, slots=True)
-class Carried:
+class CarriedState:
     """A state as a request brought it, taken apart."""
 
     arrays: Mapping[str, Any]
     """By state name."""
 
-    begins: bool = False
-    """Whether it was empty: an episode begins."""
+    is_empty: bool = False
+    """An episode begins."""
 
-    belongs_to: str | None = None
+    policy_identity: str | None = None
     """The identity of the policy that gave it; None where the client has dropped it."""
 
     last_action: Any = None
 
     @classmethod
-    def read(cls, state: Mapping[str, Any]) -> Carried:
+    def parse(cls, state: Mapping[str, Any]) -> CarriedState:
         """Take a request's state apart. Raises RequestError."""
         if not state:
-            return NOTHING
+            return NO_STATE
         arrays = {name: value for name, value in state.items() if not str(name).startswith(MARK)}
         if len(arrays) == len(state):
             return cls(arrays)
@@ -45,20 +45,20 @@ class Carried:
             raise RequestError(
                 f"the state has the unknown entry '{str(unknown[0])[:64]}': send back what the last reply gave"
             )
-        belongs_to = state.get(BELONGS_TO)
-        if belongs_to is not None and type(belongs_to) is not str:
+        policy_identity = state.get(BELONGS_TO)
+        if policy_identity is not None and type(policy_identity) is not str:
             raise RequestError(f"the state's '{BELONGS_TO}' must be the string that the last reply gave")
-        return cls(arrays, belongs_to=belongs_to, last_action=state.get(LAST_ACTION))
+        return cls(arrays, policy_identity=policy_identity, last_action=state.get(LAST_ACTION))
 
 
-NOTHING = Carried({}, begins=True)
+NO_STATE = CarriedState({}, is_empty=True)
 
 
 def carry(policy: Policy, step: Step) -> dict[str, Any]:
     """Return the state that a client is to send with its next request."""
     carried: dict[str, Any] = dict(step.state if step.batch is not None else first_row(step.state))
     carried[BELONGS_TO] = policy.identity
-    if policy.limited:
+    if policy.has_step_limit:
         carried[LAST_ACTION] = step.action
     return carried
 

@@ -2,45 +2,29 @@
 
 It comes with the request and returns with the reply (`state`), or stays here: under a session's id, or with a stream.
 One of them must be said: a recurrent policy that silently began anew with every request would act wrongly and look
-right. A memory goes to the version that it is of, and to no other. Whatever is refused leaves it where it was.
+right. A state goes to the version that it is of, and to no other. Whatever is refused leaves it where it was.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError
-from rlservo.serve_app.episodes.carried_state import NOTHING, Carried, carry
-from rlservo.serve_app.episodes.sessions import Session, SessionId, Sessions, shown
+from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
+from rlservo.serve_app.episodes.carried_state import NO_STATE, CarriedState, carry
+from rlservo.serve_app.episodes.request import Episode, Request
+from rlservo.serve_app.episodes.sessions import Session, SessionId, Sessions, shorten
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import (
-    NEEDS,
     NEEDS_LAST,
     NEEDS_STATE,
     Decision,
     EpisodeNote,
     PolicyStore,
-    take_notices,
 )
 from rlservo.serve_app.wire.state_names import BELONGS_TO
-
-
-@dataclass(frozen=True, slots=True)
-class Episode:
-    """What a request says of the episode it belongs to."""
-
-    state: Mapping[str, Any] | None = None
-    """The memory that the client carries (see `carried_state.py`); empty at an episode's start. None: it carries
-    none."""
-
-    session_id: SessionId | None = None
-    reset: bool = False  # begin the session, or the stream's episode
-    end: bool = False  # forget the session after this request
-    reward: Any = None
-    last_action: Any = None  # what the robot was last commanded, where a limit is set on the step from it
 
 
 class Episodes:
@@ -51,46 +35,35 @@ class Episodes:
         self.sessions = Sessions(most=max_sessions, idle_s=idle_s)
         self._alone = alone
 
-    def act(
-        self,
-        store: PolicyStore,
-        name: str,
-        version: str | None,
-        obs: Any,
-        episode: Episode,
-        *,
-        stream: Session | None = None,
-        explore: bool = False,
-        seed: int | None = None,
-        seq: int | None = None,
-        session: str | None = None,
-    ) -> Decision:
-        """Decide. `stream` is the session of the stream that the request came on; `session` is whose request it is.
+    def act(self, store: PolicyStore, request: Request) -> Decision:
+        """Decide for a request that says something of its episode, or came on a stream that keeps one.
 
         Raises SessionError, SessionLostError, RequestError, UnavailableError where nothing more can be remembered, and
-        what `Policy.step` raises; the memory has then not moved on.
+        what `Policy.step` raises; the recurrent state has then not moved on.
         """
+        episode, stream = request.episode or NO_EPISODE, request.stream
         if episode.session_id is not None:
-            session = str(episode.session_id)
-            begun = self.sessions.peek(name, episode.session_id) is not None or (episode.reset and self._alone())
-            if begun or store.choose(name, version, session).episodic:
-                return self._in_session(_Asked(store, name, version, obs, episode, explore, seed, session), seq)
+            request.label = str(episode.session_id)
+            name = request.policy
+            has_session = self.sessions.peek(name, episode.session_id) is not None
+            begins = episode.reset and self._alone()
+            if has_session or begins or _choose(store, request).is_stateful:
+                return self._act_in_session(store, request, episode, episode.session_id)
             # There is nothing to remember: the id says only which requests belong together.
             episode = replace(episode, session_id=None, reset=False, end=False)
         if episode.end or (episode.reset and stream is None):
             word = "end" if episode.end else "reset"
             raise RequestError(f"'{word}' is for a session: send its 'session_id', too")
-        asked = _Asked(store, name, version, obs, episode, explore, seed, session)
         if episode.state is not None:
-            return self._carried(asked, stream)
+            return self._act_from_carried(store, request, episode)
         if stream is not None:
-            return self._on_stream(asked, stream)
-        policy = asked.choose()
+            return self._act_on_stream(store, request, episode, stream)
+        policy = _choose(store, request)
         if policy.contract.state:
-            raise RequestError(f"policy '{name}' {NEEDS_STATE}", NEEDS)
-        if policy.limited and episode.last_action is None:
-            raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
-        return _timed(policy, asked).decision(policy, None)
+            raise StateNeededError(f"policy '{request.policy}' {NEEDS_STATE}")
+        if policy.has_step_limit and episode.last_action is None:
+            raise StateNeededError(f"policy '{request.policy}' {NEEDS_LAST}")
+        return _take_step(policy, request, episode).decision(policy, None)
 
     def policy_of(
         self, store: PolicyStore, name: str, version: str | None, session_id: SessionId | None, identity: Any
@@ -102,16 +75,16 @@ class Episodes:
         own = store.find(name, identity) if type(identity) is str and version is None else None
         return own or store.get(name, version)
 
-    def _carried(self, asked: _Asked, stream: Session | None) -> Decision:
-        """Act from a memory that came with the request, for the version that it is of."""
-        store, name, version, episode = asked.store, asked.name, asked.version, asked.episode
+    def _act_from_carried(self, store: PolicyStore, request: Request, episode: Episode) -> Decision:
+        """Act from a state that came with the request, for the version that it is of."""
+        name, version, stream = request.policy, request.version, request.stream
         assert episode.state is not None
-        carried = Carried.read(episode.state)
-        if carried.belongs_to is not None:
-            policy = _owner(store, name, version, carried.belongs_to)
+        carried = CarriedState.parse(episode.state)
+        if carried.policy_identity is not None:
+            policy = _owner(store, name, version, carried.policy_identity)
         else:
-            policy = asked.choose()
-            if stream is not None and _is_loaded(store, stream.policy) and version is None:
+            policy = _choose(store, request)
+            if stream is not None and store.has(stream.policy) and version is None:
                 policy = stream.policy
             if carried.arrays and policy.contract.state and not store.is_certain(name, version):
                 raise RequestError(
@@ -120,103 +93,91 @@ class Episodes:
                     f"last reply gave ('{BELONGS_TO}' in 'state', or the parameter 'state_policy'), or name the "
                     "version in the address"
                 )
-        if policy.limited and not carried.begins and carried.last_action is None and episode.last_action is None:
-            raise RequestError(f"policy '{name}' {NEEDS_LAST}", NEEDS)
-        taken = _timed(policy, asked, carried)
-        carries = bool(policy.contract.state) or policy.limited
-        return taken.decision(policy, EpisodeNote(state=carry(policy, taken.step)) if carries else None)
+        needs_last = policy.has_step_limit and not carried.is_empty
+        if needs_last and carried.last_action is None and episode.last_action is None:
+            raise StateNeededError(f"policy '{name}' {NEEDS_LAST}")
+        timed = _take_step(policy, request, episode, carried)
+        carries = bool(policy.contract.state) or policy.has_step_limit
+        return timed.decision(policy, EpisodeNote(state=carry(policy, timed.step)) if carries else None)
 
-    def _on_stream(self, asked: _Asked, stream: Session) -> Decision:
-        """Act from the memory that the connection keeps."""
-        policy, begins = stream.policy, asked.episode.reset
+    def _act_on_stream(self, store: PolicyStore, request: Request, episode: Episode, stream: Session) -> Decision:
+        """Act from the state that the connection keeps."""
+        policy, begins = stream.policy, episode.reset
         try:
-            self._check_version(asked, stream)
+            self._check_version(store, request, stream)
         except SessionError:
             if not begins:
                 raise
-            policy = asked.choose()  # an episode begins: with what is there now
-        taken = _timed(policy, asked, session=Session(policy) if begins else stream)
-        rows = taken.step.rows if policy.episodic else 0
+            policy = _choose(store, request)  # an episode begins: with what is there now
+        timed = _take_step(policy, request, episode, session=Session(policy) if begins else stream)
+        rows = timed.step.rows if policy.is_stateful else 0
         if rows != stream.rows:
-            self.sessions.hold(stream, rows)
+            self.sessions.reserve(stream, rows)
         if begins:
             stream.begin(policy)
-        stream.keep(taken.step)
-        return taken.decision(policy, EpisodeNote(step=stream.steps))
+        stream.keep(timed.step)
+        return timed.decision(policy, EpisodeNote(step=stream.steps))
 
-    def _in_session(self, asked: _Asked, seq: int | None) -> Decision:
-        """Act from the memory that stands under the request's id; `seq` tells a request sent again."""
-        name, episode = asked.name, asked.episode
-        session_id = episode.session_id
-        assert session_id is not None
+    def _act_in_session(
+        self, store: PolicyStore, request: Request, episode: Episode, session_id: SessionId
+    ) -> Decision:
+        """Act from the state that stands under the request's id; its `seq` tells a request sent again."""
+        name, seq = request.policy, request.seq
         if episode.state is not None:
             raise RequestError("the request has a 'state' and a 'session_id': either you carry the state, or we do")
         if episode.reset:
-            policy = asked.choose()
+            policy = _choose(store, request)
             if not self._alone():
                 raise SessionError(
                     "this server has several replicas, and requests of a session would reach any of them: send the "
                     "'state' along, use a WebSocket, or run one replica"
                 )
-            if policy.episodic and not episode.end:
+            if policy.is_stateful and not episode.end:
                 self.sessions.check_room(name, session_id)
             session = Session(policy)
         else:
             session = self.sessions.find(name, session_id)
-            self._check_version(asked, session, session_id)
-            repeated = session.repeated(seq, asked.obs)
+            self._check_version(store, request, session, session_id)
+            repeated = session.answer_again(seq, request.obs)
             if repeated is not None:
                 return repeated
-        taken = _timed(session.policy, asked, session=session)
+        timed = _take_step(session.policy, request, episode, session=session)
         if episode.end:
             self.sessions.end(name, session_id)
         elif episode.reset:
-            self.sessions.put(name, session_id, session, taken.step.rows if session.policy.episodic else 0)
-        session.keep(taken.step)
-        decision = taken.decision(session.policy, EpisodeNote(session_id=session_id, step=session.steps))
+            self.sessions.put(name, session_id, session, timed.step.rows if session.policy.is_stateful else 0)
+        session.keep(timed.step)
+        decision = timed.decision(session.policy, EpisodeNote(session_id=session_id, step=session.steps))
         session.seq, session.answer = seq, decision
-        session.asked = b"" if seq is None else session.policy.fingerprint(taken.step.fed)
+        session.inputs_hash = b"" if seq is None else session.policy.fingerprint(timed.step.inputs)
         return decision
 
-    def _check_version(self, asked: _Asked, session: Session, session_id: SessionId | None = None) -> None:
+    def _check_version(
+        self, store: PolicyStore, request: Request, session: Session, session_id: SessionId | None = None
+    ) -> None:
         """A session stays with the version it began with, for as long as that is loaded."""
-        name, version = asked.name, asked.version
+        name, version = request.policy, request.version
         own = session.policy.contract.version
-        which = "this stream's episode" if session_id is None else f"session '{shown(session_id)}'"
-        if not _is_loaded(asked.store, session.policy):
+        which = "this stream's episode" if session_id is None else f"session '{shorten(session_id)}'"
+        if not store.has(session.policy):
             if session_id is not None:
                 self.sessions.end(name, session_id, lost=True)
             raise SessionLostError(
                 f"{which} was with version {own} of policy '{name}', which is no longer loaded: begin an episode"
             )
-        if version is not None and asked.store.get(name, version) is not session.policy:
+        if version is not None and store.get(name, version) is not session.policy:
             raise SessionError(
                 f"{which} is with version {own} of policy '{name}', and the request names version {version[:32]}: "
                 "begin an episode with that one"
             )
 
 
-@dataclass(frozen=True, slots=True)
-class _Asked:
-    """A request of an episode."""
-
-    store: PolicyStore
-    name: str
-    version: str | None
-    obs: Any
-    episode: Episode
-    explore: bool
-    seed: int | None
-    session: str | None  # whose it is, for the canary's share
-
-    def choose(self) -> Policy:
-        """Return the policy for whoever is with none yet."""
-        return self.store.choose(self.name, self.version, self.session)
+NO_EPISODE = Episode()
 
 
-def _is_loaded(store: PolicyStore, policy: Policy) -> bool:
-    name, version = policy.contract.name, policy.contract.version
-    return name in store.names and version in store.versions(name) and store.get(name, version) is policy
+def _choose(store: PolicyStore, request: Request) -> Policy:
+    """Return the policy for a request that is with none yet."""
+    return store.choose(request.policy, request.version, request.label)
 
 
 def _owner(store: PolicyStore, name: str, version: str | None, identity: str) -> Policy:
@@ -238,34 +199,35 @@ def _owner(store: PolicyStore, name: str, version: str | None, identity: str) ->
 
 
 @dataclass(frozen=True, slots=True)
-class _Taken:
-    """A step, and what there is to say of it."""
+class _TimedStep:
+    """A step, and how long it took."""
 
     step: Step
     milliseconds: float
-    notices: tuple[str, ...]
 
     def decision(self, policy: Policy, note: EpisodeNote | None) -> Decision:
-        contract = policy.contract
-        return Decision(
-            self.step.action, contract.name, contract.version, self.milliseconds, self.step.batch, self.notices, note
-        )
+        contract, step = policy.contract, self.step
+        return Decision(step.action, contract.name, contract.version, self.milliseconds, step.batch, step.notices, note)
 
 
-def _timed(policy: Policy, asked: _Asked, carried: Carried = NOTHING, *, session: Session | None = None) -> _Taken:
-    """Take a step from what the client carries, or from a session's memory."""
-    episode = asked.episode
-    policy.notices.clear()
+def _take_step(
+    policy: Policy,
+    request: Request,
+    episode: Episode,
+    carried: CarriedState = NO_STATE,
+    *,
+    session: Session | None = None,
+) -> _TimedStep:
+    """Take a step from what the client carries, or from a session's state."""
     started = time.perf_counter()
     step = policy.step(
-        asked.obs,
+        request.obs,
         before=None if session is None else session.state,
         last=None if session is None else session.last,
-        state=carried.arrays if carried.arrays or (policy.contract.state and not carried.begins) else None,
+        state=carried.arrays if carried.arrays or (policy.contract.state and not carried.is_empty) else None,
         last_action=carried.last_action if episode.last_action is None else episode.last_action,
         reward=episode.reward,
-        explore=asked.explore,
-        seed=asked.seed,
+        explore=request.explore,
+        seed=request.seed,
     )
-    taken_ms = (time.perf_counter() - started) * 1e3
-    return _Taken(step, taken_ms, take_notices(policy))
+    return _TimedStep(step, (time.perf_counter() - started) * 1e3)

@@ -1,7 +1,7 @@
 """Sessions: recurrent state of running episodes on the server, bounded in number, evicted when idle.
 
 A session is begun explicitly and belongs to this process. Whoever asks for one that is not here gets an error, because
-a memory begun anew in the middle of an episode would give wrong actions without a word. What is bounded is episodes (a
+a state begun anew in the middle of an episode would give wrong actions without a word. What is bounded is episodes (a
 batch is so many side by side), in sessions and on streams together. A session of a policy that remembers nothing only
 keeps its version, takes no place, and makes room for a newer one.
 """
@@ -39,7 +39,7 @@ class Session:
     rows: int = 0  # episodes that it takes the place of
     used: float = field(default_factory=time.monotonic)
     seq: int | None = None  # of the last request that was answered
-    asked: bytes = b""  # what its observation was, as a hash
+    inputs_hash: bytes = b""  # of its observation
     answer: Decision | None = None  # to the last request, for the same request sent again
 
     def keep(self, step: Step) -> None:
@@ -54,16 +54,16 @@ class Session:
         self.state = self.last = self.seq = self.answer = None
         self.steps = 0
 
-    def repeated(self, seq: int | None, obs: Any) -> Decision | None:
+    def answer_again(self, seq: int | None, obs: Any) -> Decision | None:
         """Return the answer there was, when this is the last request again (its reply got lost).
 
-        To compute it twice would move the memory on twice. Raises SessionError for a request that comes out of order,
-        and for another one under the last one's number: the old answer would be an action for what is long past.
+        To compute it twice would move the recurrent state on twice. Raises SessionError for a request that comes out of
+        order, and for another one under the last one's number: the old answer would be an action for what is long past.
         """
         if seq is None or self.seq is None or seq > self.seq:
             return None
         if seq == self.seq:
-            if self.policy.fingerprint(self.policy.read(obs)[0]) == self.asked:
+            if self.policy.fingerprint(self.policy.parse(obs).arrays) == self.inputs_hash:
                 return self.answer
             raise SessionError(
                 f"request {seq} of its session was answered already, for another observation: give every request a "
@@ -87,8 +87,8 @@ class Sessions:
         self._most = most
         self._idle_s = idle_s
         # The longest unused come first, in both.
-        self._remembering: OrderedDict[Key, Session] = OrderedDict()
-        self._labels: OrderedDict[Key, Session] = OrderedDict()
+        self._stateful: OrderedDict[Key, Session] = OrderedDict()
+        self._stateless: OrderedDict[Key, Session] = OrderedDict()
         self._sweeper: asyncio.TimerHandle | None = None
         self.rows = 0  # episodes remembered, in sessions and on streams
         self.begun: Counter[str] = Counter()  # by policy name, as the next two
@@ -96,24 +96,24 @@ class Sessions:
         self.lost: Counter[str] = Counter()
 
     def __len__(self) -> int:
-        return len(self._remembering) + len(self._labels)
+        return len(self._stateful) + len(self._stateless)
 
     def count(self) -> Counter[str]:
         """Return how many sessions there are, by policy name."""
-        return Counter(name for sessions in (self._remembering, self._labels) for name, _ in sessions)
+        return Counter(name for sessions in (self._stateful, self._stateless) for name, _ in sessions)
 
     def check_room(self, name: str, session_id: SessionId) -> None:
         """Raise UnavailableError where not even one more episode could be remembered: before any work for it."""
         self._evict()
         key = (name, session_id)
-        if self.rows >= self._most and key not in self._remembering:
+        if self.rows >= self._most and key not in self._stateful:
             raise self._full(1)
 
     def put(self, name: str, session_id: SessionId, session: Session, rows: int) -> None:
         """Keep a session that was begun; one of that id ends. Raises UnavailableError, and nothing has changed."""
         self._evict()
         key = (name, session_id)
-        before = self._remembering.get(key)
+        before = self._stateful.get(key)
         if rows and self.rows - (0 if before is None else before.rows) + rows > self._most:
             raise self._full(rows)
         self.end(name, session_id)
@@ -122,15 +122,15 @@ class Sessions:
         self.rows += rows
         self.begun[name] += 1
         if rows:
-            self._remembering[key] = session
+            self._stateful[key] = session
         else:
-            self._labels[key] = session
-            if len(self._labels) > self._most:
-                self._labels.popitem(last=False)
+            self._stateless[key] = session
+            if len(self._stateless) > self._most:
+                self._stateless.popitem(last=False)
         self._sweep_later()
 
-    def hold(self, stream: Session, rows: int) -> None:
-        """Take the places of a stream's episodes. Raises UnavailableError, and nothing has changed."""
+    def reserve(self, stream: Session, rows: int) -> None:
+        """Reserve the places of a stream's episodes. Raises UnavailableError, and nothing has changed."""
         more = rows - stream.rows
         if more > 0:
             self._evict()
@@ -148,14 +148,14 @@ class Sessions:
         """Return a session that was begun here. Raises SessionLostError."""
         self._evict()
         key = (name, session_id)
-        sessions = self._remembering if key in self._remembering else self._labels
+        sessions = self._stateful if key in self._stateful else self._stateless
         session = sessions.get(key)
         if session is None:
             self.lost[name] += 1
             raise SessionLostError(
-                f"this server has no session '{shown(session_id)}' of policy '{name[:64]}': it was never begun, was "
+                f"this server has no session '{shorten(session_id)}' of policy '{name[:64]}': it was never begun, was "
                 f"ended, was idle for {self._idle_s:g} s, or ended with its process or its version: begin an episode",
-                {"session_id": shown(session_id), "policy": name[:64]},
+                {"session_id": shorten(session_id), "policy": name[:64]},
             )
         session.used = time.monotonic()
         sessions.move_to_end(key)
@@ -164,13 +164,13 @@ class Sessions:
     def peek(self, name: str, session_id: SessionId) -> Session | None:
         """Return a session, if it is here and not idle, without counting that as its use."""
         key = (name, session_id)
-        session = self._remembering.get(key) or self._labels.get(key)
+        session = self._stateful.get(key) or self._stateless.get(key)
         return session if session is not None and session.used > time.monotonic() - self._idle_s else None
 
     def end(self, name: str, session_id: SessionId, *, lost: bool = False) -> None:
         """Forget a session; `lost` counts it among those that a client will miss."""
         key = (name, session_id)
-        session = self._remembering.pop(key, None) or self._labels.pop(key, None)
+        session = self._stateful.pop(key, None) or self._stateless.pop(key, None)
         if session is not None:
             self.rows -= session.rows
             self.lost[name] += lost
@@ -186,7 +186,7 @@ class Sessions:
 
     def _evict(self) -> None:
         oldest = time.monotonic() - self._idle_s
-        for sessions in (self._remembering, self._labels):
+        for sessions in (self._stateful, self._stateless):
             while sessions:
                 name, session_id = next(iter(sessions))
                 if sessions[name, session_id].used > oldest:
@@ -202,17 +202,17 @@ class Sessions:
             loop = asyncio.get_running_loop()
         except RuntimeError:  # in process, without a server: whoever asks next sweeps
             return
-        first = [next(iter(sessions.values())).used for sessions in (self._remembering, self._labels) if sessions]
+        first = [next(iter(sessions.values())).used for sessions in (self._stateful, self._stateless) if sessions]
         wait_s = min(first) + self._idle_s - time.monotonic()
         self._sweeper = loop.call_later(max(wait_s, min(SWEEP_S, self._idle_s)), self._sweep)
 
     def _sweep(self) -> None:
         self._sweeper = None
         self._evict()
-        if self._remembering or self._labels:
+        if self._stateful or self._stateless:
             self._sweep_later()
 
 
-def shown(session_id: SessionId) -> str:
+def shorten(session_id: SessionId) -> str:
     """Return an id as an error's sentence may show it."""
     return str(session_id)[:64]

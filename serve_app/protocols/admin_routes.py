@@ -1,7 +1,8 @@
 """Administration over HTTP: load, unload, alias, rollback, canary, shadow, on every replica at once.
 
-Every command answers when all replicas serve the change, or says which do not and why. `api_keys.Guard` lets nobody in
-without an admin key. The Open Inference Protocol's `load` and `unload` are two of these under other names.
+Every command answers when all replicas serve the change, or says which do not and why. `request_checks.Authorizer`
+lets nobody in without an admin key. The Open Inference Protocol's `load` and `unload` are two of these under other
+names.
 """
 
 from __future__ import annotations
@@ -16,16 +17,19 @@ from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from rlservo.export.contract.errors import RequestError, RlservoError
-from rlservo.serve_app.protocols import json_messages, oip_infer
-from rlservo.serve_app.protocols.http_endpoint import KEY, json_only, peer_of, request_id
+from rlservo.serve_app.protocols.http_endpoint import KEY, peer_of
 from rlservo.serve_app.protocols.http_errors import error_models
+from rlservo.serve_app.protocols.json_messages import encode_json
+from rlservo.serve_app.protocols.media_types import accept_json
+from rlservo.serve_app.protocols.oip_infer import accept_media_type
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_log import administered
-from rlservo.serve_app.versions import plan
+from rlservo.serve_app.server.request_checks import HEADERS, REQUEST_ID, header_text
+from rlservo.serve_app.server.request_log import write_change
+from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
-from rlservo.serve_app.versions.replica_versions import Change, Control
+from rlservo.serve_app.versions.replica_versions import Change, ReplicaVersions
 
 Route = TypeVar("Route", bound=Callable[..., Any])
 
@@ -75,7 +79,7 @@ class Changed(BaseModel):
     shadow: str | None
 
 
-def add_admin(app: FastAPI, core: Core, control: Control) -> None:
+def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
     """Add /v1/admin and the repository extension's load and unload to the application."""
     errors = error_models(404, 409, 415, 503)
 
@@ -86,17 +90,17 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             summary=summary,
             response_model=Changed,
             responses=errors,
-            dependencies=[Depends(json_only)],
+            dependencies=[Depends(accept_json)],
         )
 
     async def apply(request: Request, what: str, command: Awaitable[Plan]) -> Plan:
         key = request.scope.get(KEY)
         log = partial(
-            administered,
+            write_change,
             what,
             key="" if key is None else key.label,
             peer=peer_of(request.scope),
-            request_id=request_id(request.scope),
+            request_id=header_text(request.scope[HEADERS], REQUEST_ID),
         )
         try:
             after = await command
@@ -131,20 +135,22 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
     @grant(Access.admin)
     async def unload(request: Request, name: str, given: UnloadCommand) -> Response:
         version = given.version
-        return await changed(request, name, f"unload {name} {version or ''}", lambda p: plan.unload(p, name, version))
+        return await changed(
+            request, name, f"unload {name} {version or ''}", lambda p: plan_changes.unload(p, name, version)
+        )
 
     @command("alias", "Let an alias lead to a loaded version")
     @grant(Access.admin)
     async def alias(request: Request, name: str, given: AliasCommand) -> Response:
         what = f"alias {name} {given.alias}={given.version or ''}"
-        return await changed(request, name, what, lambda p: plan.set_alias(p, name, given.alias, given.version))
+        return await changed(request, name, what, lambda p: plan_changes.set_alias(p, name, given.alias, given.version))
 
     @command("rollback", "Let an alias lead where it led before")
     @grant(Access.admin)
     async def rollback(request: Request, name: str, given: RollbackCommand) -> Response:
         what = f"rollback {name} {given.alias}"
         alias, expected = given.alias, given.expected
-        return await changed(request, name, what, lambda p: plan.roll_back(p, name, alias, expected=expected))
+        return await changed(request, name, what, lambda p: plan_changes.roll_back(p, name, alias, expected=expected))
 
     @command("canary", "Send a share of the sessions to another version")
     @grant(Access.admin)
@@ -154,13 +160,13 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
         ended = given.version is None or not given.share
         chosen = None if ended else Canary(version=str(given.version), share=given.share or 0)
         what = f"canary {name} {given.version or 'off'} {given.share or ''}"
-        return await changed(request, name, what, lambda p: plan.set_canary(p, name, chosen))
+        return await changed(request, name, what, lambda p: plan_changes.set_canary(p, name, chosen))
 
     @command("shadow", "Let another version compute along")
     @grant(Access.admin)
     async def shadow(request: Request, name: str, given: ShadowCommand) -> Response:
         what = f"shadow {name} {given.version or 'off'}"
-        return await changed(request, name, what, lambda p: plan.set_shadow(p, name, given.version))
+        return await changed(request, name, what, lambda p: plan_changes.set_shadow(p, name, given.version))
 
     # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: nobody reads it.
     def repository(path: str, summary: str) -> Callable[[Route], Route]:
@@ -170,7 +176,7 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
             summary=summary,
             response_class=Response,
             responses=errors,
-            dependencies=[Depends(oip_infer.media_type)],
+            dependencies=[Depends(accept_media_type)],
         )
 
     # As a Triton that serves what its configuration pins: loading changes what clients get only where the model was not
@@ -186,7 +192,7 @@ def add_admin(app: FastAPI, core: Core, control: Control) -> None:
     @grant(Access.admin)
     async def unload_model(request: Request, name: str) -> Response:
         what = f"unload {name}"
-        await apply(request, what, control.change(lambda p: plan.unload(p, name, None), what=what))
+        await apply(request, what, control.change(lambda p: plan_changes.unload(p, name, None), what=what))
         return Response(b"{}", media_type="application/json")
 
 
@@ -201,4 +207,4 @@ def _answer(name: str, after: Plan) -> Response:
         "canary": policy.canary and policy.canary.model_dump(),
         "shadow": policy.shadow,
     }
-    return Response(json_messages.encode_json(document), media_type="application/json")
+    return Response(encode_json(document), media_type="application/json")

@@ -1,164 +1,240 @@
-"""HTTP endpoint of the hot path: read a body within its limits, call a handler, write the reply.
+"""HTTP: route and checks of every connection, then body and answer of a request for actions.
 
-`Endpoint` is the hot path: a plain ASGI callable, because FastAPI's dependency and response machinery costs more than
-the policy does. Everything runs in the event loop: a decision takes microseconds, a hop to a thread takes more. It
-pauses nowhere, but for a policy that computes together what comes at the same time (`micro_batching.py`).
+FastAPI's middleware, dependencies and responses cost more than a policy does, so `PolicyApp` finds a request's route
+itself and, for actions, answers by a `HttpEndpoint`: a bare ASGI callable with the protocol's codec. Everything runs
+in the event loop: a decision takes microseconds, a hop to a thread takes more.
 """
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
+import secrets
 import sys
 import time
-from collections.abc import Awaitable, Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
-from fastapi import Request
-from fastapi.routing import APIRoute
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from fastapi import FastAPI
+from starlette.routing import BaseRoute, Match
+from starlette.types import Message, Receive, Scope, Send
 
-from rlservo.export.contract.errors import DeadlineError, MediaTypeError, RlservoError
-from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, encode_bug, error_answer, too_large
-from rlservo.serve_app.server.api_keys import Access
+from rlservo.export.contract.errors import RlservoError, UnknownPolicyError
+from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.protocols.direct_routes import PostRoute, StreamRoute
+from rlservo.serve_app.protocols.http_errors import Headers, error_answer, http_error, send_error, too_large
+from rlservo.serve_app.protocols.websocket_stream import refuse_upgrade
+from rlservo.serve_app.server.api_keys import Access, access_of
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_age import LEAST_S
+from rlservo.serve_app.server.loop_clock import STAMP
+from rlservo.serve_app.server.request_checks import (
+    HEADERS,
+    LABEL,
+    PATH,
+    REQUEST_ID,
+    RequestChecks,
+    check_path,
+    fold_headers,
+    header_text,
+)
 from rlservo.serve_app.server.request_log import FIELDS
-from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.server.request_path import ClientGoneError, Codec
 
 logger = logging.getLogger(__name__)
+
+PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
 TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been read
-KEY = "rlservo.key"  # the key that opened a request, in its scope
+STAMP_HEADER = STAMP.encode()
+KEY = "rlservo.key"  # in a connection's scope: the key that opened it
+REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, beside the protocol's own
+
 Body = bytes | bytearray
-Handle = Callable[[Scope, Body, float], Awaitable[tuple[bytes, Headers, Decision]]]
-CheckHeaders = Callable[[list[tuple[bytes, bytes]]], None]
+
+PROCESS = secrets.token_hex(8).encode()
+numbers = itertools.count(1)
 
 
-class Endpoint:
-    """A POST endpoint: reads the body, calls `handle(scope, body, received)`, answers, errors included."""
+class DirectMatch(NamedTuple):
+    """A direct route and the parameters in its path."""
 
-    def __init__(self, protocol: str, handle: Handle, check_headers: CheckHeaders, core: Core) -> None:
-        self._protocol = protocol
-        self._handle = handle
-        self._check_headers = check_headers
+    route: PostRoute | StreamRoute
+    params: dict[str, str]
+
+
+class PolicyApp(FastAPI):
+    """A FastAPI application that finds each connection's route itself, lets the route decide who may use it, and
+    answers requests for actions and streams before its middleware and router see them.
+
+    Those cost as much again as the request does (measured: a sixth of the round trip). A path that no route has never
+    reaches FastAPI.
+    """
+
+    def __init__(self, core: Core, checks: RequestChecks, **options: Any) -> None:
+        super().__init__(**options)
         self._core = core
+        self._checks = checks
+        self._direct: dict[str, list[PostRoute | StreamRoute]] = {"POST": [], "WEBSOCKET": []}
+        self._matches: dict[tuple[str, str], DirectMatch] = {}
+        self._mount: str | None = None  # the paths' prefix, which the first request that Serve brings tells
+
+    def add_direct(self, route: PostRoute | StreamRoute) -> None:
+        """Add a route that is answered without FastAPI, which only documents it."""
+        self.router.routes.append(route)
+        self._direct["POST" if isinstance(route, PostRoute) else "WEBSOCKET"].append(route)
+
+    def find_ahead(self, scope: Scope) -> DirectMatch | None:
+        """Return the direct route of a connection that Serve has not handled yet; None is for Serve to handle."""
+        mount, path = self._mount, scope["path"]
+        return None if mount is None or not path.startswith(mount) else self._find_direct(scope, path[len(mount) :])
+
+    def admit_ahead(self) -> bool:
+        """Return whether such a request may be read; if not, count it as turned away."""
+        return self._core.admission.admit_unread()
+
+    async def answer_ahead(self, match: DirectMatch, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer as Serve would have it answered: under its prefix, and with the request's id on the reply."""
+        scope["root_path"] = self._mount
+        headers = fold_headers(scope["headers"])
+        request_id = headers.setdefault(REQUEST_ID, b"%s-%x" % (PROCESS, next(numbers)))
+        scope[REPLY_HEADERS] = ((REQUEST_ID, request_id),)
+        try:
+            await self._answer_direct(match, headers, scope, receive, send)
+        except Exception:  # a fault outside what the request path guards; Serve keeps uvicorn from logging it
+            logger.exception("a request failed", extra={FIELDS: {"request_id": request_id.decode("latin-1")}})
+            raise
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
-        admission, log = self._core.admission, self._core.log
-        started = time.perf_counter()
+        """Dispatch one ASGI connection."""
+        if scope["type"] == "lifespan":
+            await super().__call__(scope, receive, send)
+            return
+        self._mount = scope.get("root_path", "")
+        path, headers = route_path(scope), fold_headers(scope["headers"])
+        match = self._find_direct(scope, path)
+        if match is not None:
+            await self._answer_direct(match, headers, scope, receive, send)
+            return
         try:
-            self._check_headers(scope["headers"])
-            waited = admission.age.waited(scope["headers"])
-            body = await receive_body(self._core, scope, receive)
-            if body is None:  # the client has gone
+            check_path(scope, path)
+            route, access = self._find(scope)
+            scope[HEADERS], scope[KEY] = headers, self._checks.check(scope, headers, access)
+            if scope["type"] == "websocket":
+                sentence = f"no stream is at {path[:200]}: connect to /v1/policies/NAME/stream"
+                await _send_refusal(scope, receive, send, UnknownPolicyError(sentence))
                 return
-            received = min(started, admission.enter(waited))  # only now: a body that is slow to come waits for itself
-            if waited is not None and waited > LEAST_S:
-                received -= waited
-            content, headers, decision = await self._handle(scope, body, received)
-            status = 200
-            taken, batch = time.perf_counter() - received, decision.batch or 1
-            self._core.metrics.answered(self._protocol, decision, batch, taken)
-            if log.every:
-                log.answered(
-                    self._protocol, decision.name, decision.version, taken, batch=batch, request_id=request_id(scope)
-                )
+            if route is None:
+                await http_error(404, scope)(scope, receive, send)
+                return
+            body = await receive_body(self._core, headers, receive)
         except RlservoError as error:
-            status, content, headers = error_answer(error)
-            self._failed(scope, error, time.perf_counter() - started)
-        except Exception:
-            logger.exception("a request failed", extra={FIELDS: {"request_id": request_id(scope)}})
-            status, content, headers = 500, encode_bug(), JSON_HEADERS
-            self._core.metrics.failed(self._protocol, "", "", "internal")  # what failed may be the policies
-        await send(
-            {
-                "type": "http.response.start",
-                "status": status,
-                "headers": [(b"content-length", b"%d" % len(content)), *headers],
-            }
+            await self._refuse(scope, headers, receive, send, error)
+        except ClientGoneError:
+            return
+        else:
+            await super().__call__(scope, replay(body, receive), send)
+
+    async def _answer_direct(
+        self, match: DirectMatch, headers: dict[bytes, bytes], scope: Scope, receive: Receive, send: Send
+    ) -> None:
+        try:
+            if b"%" in (scope.get("raw_path") or b""):
+                check_path(scope, scope["path"])
+            self._checks.check(scope, headers, match.route.access)
+        except RlservoError as error:
+            await self._refuse(scope, headers, receive, send, error)
+            return
+        scope[HEADERS], scope["path_params"] = headers, match.params
+        await match.route.app(scope, receive, send)
+
+    async def _refuse(
+        self, scope: Scope, headers: Mapping[bytes, bytes], receive: Receive, send: Send, error: RlservoError
+    ) -> None:
+        request_id = header_text(headers, REQUEST_ID)
+        self._core.request_path.record_refusal(scope["type"], error, request_id, peer=peer_of(scope))
+        await _send_refusal(scope, receive, send, error)
+
+    def _find_direct(self, scope: Scope, path: str) -> DirectMatch | None:
+        """Return the direct route of a usable path below the prefix."""
+        kind = scope["method"] if scope["type"] == "http" else "WEBSOCKET"
+        found = self._matches.get((kind, path))
+        if found is None and len(path) <= LONGEST_REMEMBERED and PATH.fullmatch(path) is not None:
+            for route in self._direct.get(kind, ()):
+                match = route.path_regex.fullmatch(path)
+                if match is not None:
+                    if len(self._matches) >= PATHS_REMEMBERED:
+                        self._matches.clear()
+                    found = self._matches[kind, path] = DirectMatch(route, match.groupdict())
+                    break
+        return found
+
+    def _find(self, scope: Scope) -> tuple[BaseRoute | None, Access]:
+        """Return (the route that FastAPI will take, who may use it).
+
+        A path with another method is guarded as its most guarded route is; one without any is for whoever has a key.
+        """
+        others: list[BaseRoute] = []
+        for route in self.router.routes:
+            match, _ = route.matches(scope)
+            if match is Match.FULL:
+                return route, access_of(route)
+            if match is Match.PARTIAL:
+                others.append(route)
+        if not others:
+            return None, Access.act
+        levels = {access_of(route) for route in others}
+        return others[0], next(level for level in (Access.admin, Access.act, Access.open) if level in levels)
+
+
+class HttpEndpoint:
+    """Answers the POST requests of one protocol."""
+
+    def __init__(self, protocol: str, codec: Codec[Receive, tuple[bytes, Headers]], core: Core) -> None:
+        """Take the protocol's name, as metrics and log have it."""
+        self._protocol = protocol
+        self._codec = codec
+        self._request_path = core.request_path
+        self._admission = core.admission
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request, errors included."""
+        headers, params = scope[HEADERS], scope["path_params"]
+        request = Request(
+            self._protocol,
+            params["name"],
+            params.get("version"),
+            time.perf_counter(),
+            label=header_text(headers, LABEL),
+            request_id=header_text(headers, REQUEST_ID),
+            headers=headers,
+            waited=self._admission.waited(headers.get(STAMP_HEADER)),
         )
+        status = 200
+        try:
+            content, reply_headers = await self._request_path.answer(self._codec, request, receive)
+        except RlservoError as error:
+            status, content, reply_headers = error_answer(error)
+        except ClientGoneError:
+            return
+        length = (b"content-length", b"%d" % len(content))
+        every = [length, *reply_headers, *scope.get(REPLY_HEADERS, ())]
+        await send({"type": "http.response.start", "status": status, "headers": every})
         await send({"type": "http.response.body", "body": content})
 
-    def _failed(self, scope: Scope, error: RlservoError, seconds: float) -> None:
-        params = scope["path_params"]
-        name, version = params["name"], params.get("version")
-        self._core.failed(self._protocol, name, version, error.code)
-        self._core.log.failed(
-            self._protocol, name, version, error.code, error.message, request_id=request_id(scope), seconds=seconds
-        )
 
+async def receive_body(core: Core, headers: Mapping[bytes, bytes], receive: Receive) -> Body:
+    """Return a request's body within the server's limits. The first message usually holds all of it.
 
-class BareRoute(APIRoute):
-    """A route FastAPI documents and routes to, and otherwise leaves alone: `app` is a bare ASGI callable."""
-
-    access = Access.act
-
-    def __init__(
-        self,
-        path: str,
-        endpoint: ASGIApp,
-        *,
-        operation: str,
-        tag: str,
-        summary: str,
-        reply: Any,
-        body: Mapping[str, Any],
-        responses: dict[int | str, dict[str, Any]],
-    ) -> None:
-        async def documented() -> None:
-            """Documented, never called: `app` answers."""
-
-        super().__init__(
-            path,
-            documented,
-            methods=["POST"],
-            name=operation,
-            tags=[tag],
-            summary=summary,
-            description=summary + ".",
-            response_model=reply,
-            responses=responses,
-            openapi_extra={
-                "requestBody": {"required": True, "content": body},
-                "parameters": [
-                    {"name": name, "in": "path", "required": True, "schema": {"type": "string"}}
-                    for name in ("name", "version")
-                    if f"{{{name}}}" in path
-                ],
-            },
-            generate_unique_id_function=lambda _route: operation,
-        )
-        self.app = endpoint
-
-
-async def receive_body(core: Core, scope: Scope, receive: Receive) -> Body | None:
-    """Return a request's body within the server's limits, or None when the client hung up.
-
-    The one way in which a body gets into this process. Raises TooLargeError, DeadlineError and OverloadedError.
+    The one way in which a body gets into this process. Raises TooLargeError, DeadlineError, OverloadedError and
+    ClientGoneError.
     """
-    settings = core.settings
-    check_length(scope["headers"], settings.max_body_bytes)
-    with core.admission.reading(settings.body_timeout_s) as timeout_s:
-        return await read_body(receive, max_bytes=settings.max_body_bytes, timeout_s=timeout_s)
-
-
-def replay(body: Body, receive: Receive) -> Receive:
-    """Return a `receive` that gives a body that has been read, and then what else comes."""
-    messages: list[Message] = [{"type": "http.request", "body": bytes(body), "more_body": False}]
-
-    async def receive_again() -> Message:
-        return messages.pop() if messages else await receive()
-
-    return receive_again
-
-
-async def read_body(receive: Receive, *, max_bytes: int, timeout_s: float) -> Body | None:
-    """Return the body, or None when the client hung up. The first message usually holds all of it.
-
-    Raises TooLargeError and DeadlineError.
-    """
-    timer = _BodyTimer(timeout_s)
+    max_bytes, timeout_s = core.settings.max_body_bytes, core.settings.body_timeout_s
+    length = headers.get(b"content-length", b"")
+    if length.isdigit() and len(length) < 20 and int(length) > max_bytes:
+        raise too_large(max_bytes)
+    admission = core.admission
+    given_s = admission.begin_body(timeout_s)
+    timer = _BodyTimer(given_s)
     try:
         message = await receive()
         body = message.get("body", b"")
@@ -175,11 +251,12 @@ async def read_body(receive: Receive, *, max_bytes: int, timeout_s: float) -> Bo
             raise
         if sys.version_info >= (3, 11) and (task := asyncio.current_task()) is not None:  # it counts cancellations
             task.uncancel()
-        raise DeadlineError(f"the request body did not arrive within {timeout_s:g} s") from None
+        raise admission.late_body(timeout_s, given_s) from None
     finally:
         timer.stop()
+        admission.end_body()
     if message["type"] == "http.disconnect":
-        return None
+        raise ClientGoneError
     if len(body) > max_bytes:
         raise too_large(max_bytes)
     return body  # type: ignore[no-any-return]  # ASGI messages are untyped
@@ -193,86 +270,62 @@ class _BodyTimer:
     again for every piece that they bring; for as long again as the time was, at most.
     """
 
-    __slots__ = ("_handle", "_last", "_loop", "_quiet", "_seen", "_task", "late", "pieces")
+    __slots__ = ("_handle", "_last", "_loop", "_quiet", "_seconds", "_seen", "_task", "late", "pieces")
 
     def __init__(self, seconds: float) -> None:
         self._loop = asyncio.get_running_loop()
         self._task = asyncio.current_task()
-        self._handle = self._loop.call_later(seconds, self._look)
-        self._last = self._loop.time() + 2 * seconds
+        self._handle = self._loop.call_later(seconds, self._check)
+        self._seconds = seconds
+        self._last = 0.0  # when the time is over whatever comes: as long again, from the first check on
         self._quiet = self._seen = 0
         self.pieces = 0
         self.late = False
 
     def stop(self) -> None:
-        """Forget about it."""
+        """Never cancel the task."""
         self._handle.cancel()
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         now = self._loop.time()
+        self._last = self._last or now + self._seconds
         if self.pieces != self._seen and now < self._last:
             self._seen, self._quiet = self.pieces, 0
         if self._quiet < TURNS:
             self._quiet += 1
-            self._handle = self._loop.call_later(TURN_S, self._look)
+            self._handle = self._loop.call_later(TURN_S, self._check)
         elif self._task is not None:
             self.late = True
             self._task.cancel()
 
 
-def request_id(scope: Scope) -> str | None:
-    """Return the request's id: the client's, or the one that Ray Serve or `ingress.py` made, which is on the answer."""
-    for name, value in scope["headers"]:
-        if name == b"x-request-id":
-            return str(value.decode("latin-1"))
-    return None
+async def _send_refusal(scope: Scope, receive: Receive, send: Send, error: RlservoError) -> None:
+    headers = scope.get(REPLY_HEADERS, ())
+    if scope["type"] == "http":
+        await send_error(send, error, headers=headers)
+    else:
+        await refuse_upgrade(scope, receive, send, error, headers)
+
+
+def replay(body: Body, receive: Receive) -> Receive:
+    """Return a `receive` that gives a body that has been read, and then what else comes."""
+    messages: list[Message] = [{"type": "http.request", "body": bytes(body), "more_body": False}]
+
+    async def receive_again() -> Message:
+        return messages.pop() if messages else await receive()
+
+    return receive_again
+
+
+def route_path(scope: Scope) -> str:
+    """Return a connection's path below the prefix that the application is mounted at, as Starlette's routes see it."""
+    path: str = scope["path"]
+    root: str = scope.get("root_path", "")
+    below = path[len(root) :]
+    return below if path.startswith(root) and below[:1] in ("", "/") else path
 
 
 def peer_of(scope: Scope) -> str | None:
     """Return the client's address; behind HAProxy uvicorn takes it from `X-Forwarded-For`, which HAProxy adds."""
     client = scope.get("client")
     return None if client is None else str(client[0])
-
-
-def check_length(headers: list[tuple[bytes, bytes]], max_bytes: int) -> None:
-    """Raise TooLargeError for a body that announces itself as too large."""
-    for name, value in headers:
-        if name == b"content-length" and value.isdigit() and len(value) < 20 and int(value) > max_bytes:
-            raise too_large(max_bytes)
-
-
-def check_media_type(headers: list[tuple[bytes, bytes]], *accepted: bytes, optional: bool = False) -> None:
-    """Raise MediaTypeError unless the body is of an accepted content type.
-
-    A web page can send forms, plain text and bodies of no type to any server; for another type a browser asks the
-    server first. Triton's client names no type: `optional` lets through who does not, unless it is a browser.
-    """
-    named = page = False
-    for name, value in headers:
-        if name == b"content-type":
-            named = True
-            if value not in accepted and value.split(b";", 1)[0].strip().lower() not in accepted:
-                raise MediaTypeError(
-                    f"the content type is '{value[:64].decode('latin-1')}': send {accepted[0].decode()} "
-                    f"(curl: -H 'content-type: {accepted[0].decode()}')"
-                )
-        elif name in (b"origin", b"sec-fetch-site"):
-            page = True
-    if not named and (page or not optional):
-        raise MediaTypeError(
-            f"the request has no content type: send {accepted[0].decode()} "
-            f"(curl: -H 'content-type: {accepted[0].decode()}')"
-        )
-
-
-async def json_only(request: Request) -> None:
-    """Raise MediaTypeError for what is not JSON: a dependency of the routes that FastAPI runs."""
-    check_media_type(request.scope["headers"], JSON)
-
-
-def session_of(scope: Scope) -> str | None:
-    """Return the session that the header `x-session-id` names; Ray Serve's own routing knows it, too."""
-    for name, value in scope["headers"]:
-        if name == b"x-session-id":
-            return str(value.decode("latin-1"))
-    return None

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from typing import Any
+
+from starlette.responses import Response
+from starlette.types import Scope, Send
 
 from rlservo.export.contract.errors import (
     ActionError,
     ConflictError,
     DeadlineError,
     ForbiddenError,
+    InternalError,
     MediaTypeError,
     ObservationError,
     RequestError,
@@ -22,6 +27,7 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
 )
 from rlservo.serve_app.protocols import json_messages
+from rlservo.serve_app.server.request_path import BUG
 
 logger = logging.getLogger(__name__)
 
@@ -40,9 +46,14 @@ STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; w
     (ForbiddenError, 403),
     (ActionError, 500),
 )
+CODES = {
+    404: "not-found",
+    405: "method-not-allowed",
+    413: "too-large",
+    415: "wrong-media-type",
+}  # where FastAPI decides
 ANY_ROUTE = (400, 401, 403, 408, 413)  # its path, key, host, page and body
 RETRY_AFTER_S = 1
-BUG = "the server failed on this request; its log says how"
 JSON = b"application/json"
 Headers = tuple[tuple[bytes, bytes], ...]
 JSON_HEADERS: Headers = ((b"content-type", JSON),)
@@ -68,7 +79,7 @@ def error_answer(error: RlservoError) -> tuple[int, bytes, Headers]:
         headers += ((b"retry-after", str(RETRY_AFTER_S).encode()),)
     elif status == 401:
         headers += ((b"www-authenticate", b"Bearer"),)
-    elif status >= 500:
+    elif status >= 500 and not isinstance(error, InternalError):  # which is logged with its traceback
         logger.error("%s", error.message)
     return status, encode_error(error), headers
 
@@ -86,6 +97,25 @@ def encode_error(error: RlservoError) -> bytes:
 def encode_bug() -> bytes:
     """Return the body of an error that is none of ours to explain to a client."""
     return json_messages.encode_json({"error": BUG, "code": "internal"})
+
+
+def http_error(status: int, scope: Scope, *, detail: str = "", headers: Mapping[str, str] | None = None) -> Response:
+    """Return the answer where no route of ours has decided."""
+    path, headers = scope["path"][:200], headers or {}
+    sentences = {
+        404: f"nothing is at {path}: policies are under /v1/policies, documentation at /docs",
+        405: f"{scope['method']} is not what {path} takes: {headers.get('Allow', 'another method')} is",
+    }
+    document = {"error": sentences.get(status, detail), "code": CODES.get(status, "http-error")}
+    return Response(json_messages.encode_json(document), status, headers, "application/json")
+
+
+async def send_error(send: Send, error: RlservoError, *, kind: str = "http.response", headers: Headers = ()) -> None:
+    """Answer with an error; `kind` is the ASGI messages', `headers` are further ones."""
+    status, content, own = error_answer(error)
+    every = [(b"content-length", b"%d" % len(content)), *own, *headers]
+    await send({"type": f"{kind}.start", "status": status, "headers": every})
+    await send({"type": f"{kind}.body", "body": content})
 
 
 def error_models(*statuses: int) -> dict[int | str, dict[str, Any]]:

@@ -38,7 +38,7 @@ def model_config(core: Core, name: str, version: str | None) -> dict[str, Any]:
     """
     policy = core.store().get(name, version)
     contract = policy.contract
-    last_action = oip_infer.last_action_inputs(contract) if policy.limited else []
+    last_action = oip_infer.last_action_inputs(contract) if policy.has_step_limit else []
     offered = oip_infer.output_names(contract)
     config: dict[str, Any] = {
         "name": name,
@@ -54,7 +54,7 @@ def model_config(core: Core, name: str, version: str | None) -> dict[str, Any]:
         # So many are run at once as soon as they are there, and nobody waits for others to come.
         most = policy.options.micro_batch
         config["dynamic_batching"] = {"preferred_batch_size": [most], "max_queue_delay_microseconds": 0}
-    elif policy.episodic and core.is_alone():  # requests of one sequence could reach several replicas
+    elif policy.is_stateful and core.is_alone():  # requests of one sequence could reach several replicas
         config["sequence_batching"] = _sequences(core, policy)
     return config
 

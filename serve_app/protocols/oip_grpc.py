@@ -26,18 +26,23 @@ from rlservo.export.contract.errors import (
     ActionError,
     DeadlineError,
     ForbiddenError,
+    InternalError,
     ObservationError,
     RequestError,
     RlservoError,
     TooLargeError,
 )
+from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
 from rlservo.serve_app.protocols import oip_messages as messages
-from rlservo.serve_app.protocols.http_errors import BUG, RETRY_AFTER_S, status_of
+from rlservo.serve_app.protocols.http_errors import RETRY_AFTER_S, status_of
 from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of, from_bytes, is_shape
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.loop_clock import STAMP
 from rlservo.serve_app.server.request_checks import presented_key
+from rlservo.serve_app.server.request_path import BUG
+from rlservo.serve_app.versions.policy_store import Decision
 
 Incoming = tuple[bytes, float | None]
 """A request's bytes, and how many seconds its caller still waits for the answer (None: for ever)."""
@@ -45,7 +50,7 @@ Incoming = tuple[bytes, float | None]
 logger = logging.getLogger(__name__)
 
 PROTOCOL = "grpc"
-REQUEST_ID, SESSION = "x-request-id", "x-session-id"
+REQUEST_ID, LABEL = "x-request-id", "x-session-id"
 CODES = {
     400: grpc.StatusCode.INVALID_ARGUMENT,
     401: grpc.StatusCode.UNAUTHENTICATED,
@@ -119,6 +124,7 @@ class Grpc:
     def __init__(self, core: Core, *, local_only: bool = False) -> None:
         """Take the core. `local_only`: Serve binds its gRPC ports to every interface, whatever host it is given."""
         self._core = core
+        self._codec = OipGrpcCodec(core)
         self._local_only = local_only
         self._methods: dict[str, Callable[[Incoming], Any]] = {
             "ServerLive": lambda _request: messages.ServerLiveResponse(live=True),
@@ -131,15 +137,15 @@ class Grpc:
             "RepositoryIndex": self._index,
         }
 
-    async def answer(self, method: str, request: Incoming, context: Any) -> Any:
+    async def answer(self, method: str, incoming: Incoming, context: Any) -> Any:
         """Return the reply to one call. An error sets the status, and the empty reply is not looked at."""
         try:
-            request_id, session, waited = self._check(method, context)
-            if request_id is not None:
-                context.set_trailing_metadata([(REQUEST_ID, request_id)])  # in addition to Serve's own
+            request = self._begin(method, context)
+            if request.request_id is not None:
+                context.set_trailing_metadata([(REQUEST_ID, request.request_id)])  # in addition to Serve's own
             if method == "ModelInfer":
-                return await self._infer(request, request_id, session, waited)
-            return self._methods[method](request)
+                return await self._core.request_path.answer(self._codec, request, incoming)
+            return self._methods[method](incoming)
         except Exception as error:
             _fail(context, error)
             return messages.ServerLiveResponse()
@@ -149,17 +155,16 @@ class Grpc:
 
         A stream that says nothing for `stream_idle_s` is ended.
         """
-        idle_s = self._core.settings.stream_idle_s
-        key_changes = self._core.keys.changes
+        core = self._core
+        idle_s = core.settings.stream_idle_s
+        key_changes = core.keys.changes
         try:
-            request_id, session, _ = self._check("ModelStreamInfer", context)
-            session = session or secrets.token_hex(8)  # all of a stream is one version's where a canary runs
-            counted = self._core.admission.streaming()
-            counted.__enter__()
+            opening = self._begin("ModelStreamInfer", context)
+            opening.label = opening.label or secrets.token_hex(8)  # one version for all where a canary runs
+            core.request_path.open_stream(opening)
         except Exception as error:
             _fail(context, error)
             return
-        self._core.metrics.stream("", 1)
         try:
             while True:
                 try:
@@ -169,113 +174,128 @@ class Grpc:
                 except asyncio.TimeoutError:
                     _fail(context, DeadlineError(f"the stream was silent for {idle_s:g} s: open another one"))
                     return
-                if key_changes != self._core.keys.changes:  # the key may be no longer accepted
-                    key_changes = self._core.keys.changes
+                if key_changes != core.keys.changes:  # the key may be no longer accepted
+                    key_changes = core.keys.changes
                     try:
-                        self._check("ModelStreamInfer", context)
+                        self._begin("ModelStreamInfer", context)
                     except RlservoError as error:
                         _fail(context, error)
                         return
+                request = Request(
+                    PROTOCOL, "", None, time.perf_counter(), label=opening.label, request_id=opening.request_id
+                )
                 try:
-                    yield messages.ModelStreamInferResponse(
-                        infer_response=await self._infer((content, None), request_id, session)
-                    )
-                except Exception as error:
+                    reply = await core.request_path.answer(self._codec, request, (content, None))
+                    yield messages.ModelStreamInferResponse(infer_response=reply)
+                except RlservoError as error:
                     sentence = _explain(error)[1]
                     yield messages.ModelStreamInferResponse(
                         error_message=sentence, infer_response=messages.ModelInferResponse(id=_id_of(content))
                     )
         finally:
-            counted.__exit__(None, None, None)
-            self._core.metrics.stream("", -1)
+            core.request_path.close_stream(opening)
 
-    def _check(self, method: str, context: Any) -> tuple[str | None, str | None, float | None]:
-        """Return the caller's (request id, session), where given, and how long the call has waited, where known.
-
-        Raises ForbiddenError or UnauthenticatedError.
-        """
+    def _begin(self, method: str, context: Any) -> Request:
+        """Return a call's request, whose content is still to be read. Raises ForbiddenError, UnauthenticatedError."""
         if self._local_only and not is_local(context.peer()):
             raise ForbiddenError(
                 "this server listens on this machine only: serve it with --host to reach it from others"
             )
         metadata = context.invocation_metadata()
-        headers = [(name.encode(), _bytes(value)) for name, value in metadata]
-        given = {name: value for name, value in metadata if type(value) is str}
+        headers: dict[bytes, bytes] = {}
+        for name, value in metadata:
+            headers.setdefault(name.encode(), _bytes(value))
+        texts = {name: value for name, value in metadata if type(value) is str}
+        request_id = texts.get(REQUEST_ID)
         try:
-            self._core.guard.check(presented_key(headers), Access.open if method in OPEN else Access.act)
+            self._core.authorizer.authorize(presented_key(headers), Access.open if method in OPEN else Access.act)
         except RlservoError as error:
-            self._core.kept_out(PROTOCOL, error, given.get(REQUEST_ID), peer=_caller(context.peer(), metadata))
+            peer = _peer(context.peer(), metadata)
+            self._core.request_path.record_refusal(PROTOCOL, error, request_id, peer=peer)
             raise
-        return given.get(REQUEST_ID), given.get(SESSION), self._core.admission.age.waited(headers)
-
-    def _model_ready(self, request: Incoming) -> Any:
-        asked = _parse(messages.ModelReadyRequest, request[0])
-        return messages.ModelReadyResponse(ready=self._core.has(asked.name, asked.version or None))
-
-    def _model_metadata(self, request: Incoming) -> Any:
-        asked = _parse(messages.ModelMetadataRequest, request[0])
-        return messages.ModelMetadataResponse(
-            **oip_models.model_metadata(self._core, asked.name, asked.version or None)
+        return Request(
+            PROTOCOL,
+            "",
+            None,
+            time.perf_counter(),
+            label=texts.get(LABEL),
+            request_id=request_id,
+            waited=self._core.admission.waited(headers.get(STAMP.encode())),
         )
 
-    def _model_config(self, request: Incoming) -> Any:
-        asked = _parse(messages.ModelConfigRequest, request[0])
-        config = oip_config.model_config(self._core, asked.name, asked.version or None)
+    def _model_ready(self, incoming: Incoming) -> Any:
+        message = _parse(messages.ModelReadyRequest, incoming[0])
+        return messages.ModelReadyResponse(ready=self._core.has(message.name, message.version or None))
+
+    def _model_metadata(self, incoming: Incoming) -> Any:
+        message = _parse(messages.ModelMetadataRequest, incoming[0])
+        return messages.ModelMetadataResponse(
+            **oip_models.model_metadata(self._core, message.name, message.version or None)
+        )
+
+    def _model_config(self, incoming: Incoming) -> Any:
+        message = _parse(messages.ModelConfigRequest, incoming[0])
+        config = oip_config.model_config(self._core, message.name, message.version or None)
         return messages.ModelConfigResponse(config=_numbered(config))
 
-    def _model_statistics(self, request: Incoming) -> Any:
-        asked = _parse(messages.ModelStatisticsRequest, request[0])
-        found = oip_config.statistics(self._core, asked.name or None, asked.version or None)
+    def _model_statistics(self, incoming: Incoming) -> Any:
+        message = _parse(messages.ModelStatisticsRequest, incoming[0])
+        found = oip_config.statistics(self._core, message.name or None, message.version or None)
         return messages.ModelStatisticsResponse(model_stats=found)
 
-    def _index(self, request: Incoming) -> Any:
-        asked = _parse(messages.RepositoryIndexRequest, request[0])
-        return messages.RepositoryIndexResponse(models=oip_models.repository_index(self._core, ready=asked.ready))
+    def _index(self, incoming: Incoming) -> Any:
+        message = _parse(messages.RepositoryIndexRequest, incoming[0])
+        return messages.RepositoryIndexResponse(models=oip_models.repository_index(self._core, ready=message.ready))
 
-    async def _infer(
-        self, request: Incoming, request_id: str | None, session: str | None, waited: float | None = None
-    ) -> Any:
-        content, remaining_s = request
-        name, version = "", None
-        try:
-            received = self._core.admission.enter(waited)
-            if len(content) > self._core.settings.max_body_bytes:
-                limit = self._core.settings.max_body_bytes
-                raise TooLargeError(f"the message is larger than {limit} bytes", {"max_bytes": limit})
-            asked = _parse(messages.ModelInferRequest, content)
-            name, version = asked.model_name, asked.model_version or None
-            self._core.store().get(name, version)
-            document = {
-                "parameters": _parameters(asked.parameters),
-                "outputs": [
-                    {"name": output.name, "parameters": _parameters(output.parameters)} for output in asked.outputs
-                ],
-            }
-            answer = await oip_infer.decide(
-                self._core,
-                name,
-                version,
-                document,
-                _inputs(asked),
-                received=received,
-                deadline_ms=None if remaining_s is None else remaining_s * 1e3,
-                session=session,
-            )
-        except RlservoError as error:
-            self._core.failed(PROTOCOL, name, version, error.code)
-            self._core.log.failed(PROTOCOL, name, version, error.code, error.message, request_id=request_id)
-            raise
-        except Exception:
-            self._core.metrics.failed(PROTOCOL, "", "", "internal")
-            raise
-        decision = answer.decision
-        reply = _reply(answer, asked.id, raw=bool(asked.raw_input_contents))
-        taken, batch = time.perf_counter() - received, decision.batch or 1
-        self._core.metrics.answered(PROTOCOL, decision, batch, taken)
-        if self._core.log.every:
-            self._core.log.answered(
-                PROTOCOL, decision.name, decision.version, taken, batch=batch, request_id=request_id
-            )
+
+class OipGrpcCodec:
+    """The protocol's bytes over gRPC (`Codec`)."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+
+    async def receive(self, request: Request, source: Incoming) -> bytes:
+        """Return the message. Raises TooLargeError."""
+        content, remaining_s = source
+        limit = self._core.settings.max_body_bytes
+        if len(content) > limit:
+            raise TooLargeError(f"the message is larger than {limit} bytes", {"max_bytes": limit})
+        request.deadline_ms = None if remaining_s is None else remaining_s * 1e3
+        return content
+
+    def parse(self, request: Request, content: bytes) -> None:
+        """Fill the request. Raises RequestError, ObservationError, UnknownPolicyError."""
+        message = _parse(messages.ModelInferRequest, content)
+        request.policy, request.version = message.model_name, message.model_version or None
+        self._core.store().get(request.policy, request.version)
+        document = {
+            "parameters": _parameters(message.parameters),
+            "outputs": [
+                {"name": output.name, "parameters": _parameters(output.parameters)} for output in message.outputs
+            ],
+        }
+        oip_infer.fill_request(self._core, request, document, _inputs(message))
+        request.reply_options.request_id = message.id
+        request.reply_options.binary = bool(message.raw_input_contents)
+
+    def encode(self, request: Request, decision: Decision) -> Any:
+        """Return the reply's message."""
+        answer = oip_infer.answer_of(request, decision)
+        reply = messages.ModelInferResponse(
+            model_name=answer.name, model_version=answer.version, id=request.reply_options.request_id
+        )
+        for name, value in answer.parameters.items():
+            _set(reply.parameters[name], value)
+        arrays = {name: np.ascontiguousarray(array) for name, array in answer.outputs.items()}
+        datatypes = {name: datatype_of(array.dtype.name) for name, array in arrays.items()}
+        # A reply is bytes altogether or typed fields altogether, and not every type has a field.
+        raw = request.reply_options.binary or any(datatype not in FIELDS for datatype in datatypes.values())
+        for name, array in arrays.items():
+            output = reply.outputs.add(name=name, datatype=datatypes[name], shape=array.shape)
+            if raw:
+                reply.raw_output_contents.append(array.astype(DTYPES[datatypes[name]], copy=False).tobytes())
+            else:
+                getattr(output.contents, FIELDS[datatypes[name]]).extend(array.ravel().tolist())
         return reply
 
 
@@ -289,24 +309,6 @@ def _numbered(document: Any) -> Any:
     return [_numbered(each) for each in document] if isinstance(document, list) else document
 
 
-def _reply(answer: oip_infer.Answer, request_id: str, *, raw: bool) -> Any:
-    decision = answer.decision
-    reply = messages.ModelInferResponse(model_name=decision.name, model_version=decision.version, id=request_id)
-    for name, value in answer.parameters.items():
-        _set(reply.parameters[name], value)
-    arrays = {name: np.ascontiguousarray(array) for name, array in answer.outputs.items()}
-    datatypes = {name: datatype_of(array.dtype.name) for name, array in arrays.items()}
-    # A reply is bytes altogether or typed fields altogether, and not every type has a field.
-    raw = raw or any(datatype not in FIELDS for datatype in datatypes.values())
-    for name, array in arrays.items():
-        output = reply.outputs.add(name=name, datatype=datatypes[name], shape=array.shape)
-        if raw:
-            reply.raw_output_contents.append(array.astype(DTYPES[datatypes[name]], copy=False).tobytes())
-        else:
-            getattr(output.contents, FIELDS[datatypes[name]]).extend(array.ravel().tolist())
-    return reply
-
-
 def _set(parameter: Any, value: Any) -> None:
     if isinstance(value, bool):
         parameter.bool_param = value
@@ -318,22 +320,22 @@ def _set(parameter: Any, value: Any) -> None:
         parameter.string_param = str(value)
 
 
-def _inputs(asked: Any) -> dict[str, NDArray[Any]]:
+def _inputs(message: Any) -> dict[str, NDArray[Any]]:
     """Return the inputs by name. Raises RequestError where the form is wrong, ObservationError where numbers are."""
-    raw = asked.raw_input_contents
-    if not asked.inputs:
+    raw = message.raw_input_contents
+    if not message.inputs:
         raise RequestError("'inputs' must hold at least one tensor, with name, datatype and shape")
-    if raw and len(raw) != len(asked.inputs):
+    if raw and len(raw) != len(message.inputs):
         raise RequestError(
-            f"there are {len(asked.inputs)} inputs and {len(raw)} raw_input_contents: one for each, or none"
+            f"there are {len(message.inputs)} inputs and {len(raw)} raw_input_contents: one for each, or none"
         )
     seen: set[str] = set()
-    for tensor in asked.inputs:
+    for tensor in message.inputs:
         if tensor.name in seen:
             raise RequestError(f"input '{tensor.name[:64]}' is there twice")
         seen.add(tensor.name)
     inputs: dict[str, NDArray[Any]] = {}
-    for index, tensor in enumerate(asked.inputs):
+    for index, tensor in enumerate(message.inputs):
         label, shape = tensor.name[:64], tuple(tensor.shape)
         if tensor.datatype == "BYTES":
             raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")
@@ -421,12 +423,14 @@ def _explain(error: Exception) -> tuple[grpc.StatusCode, str, str]:
     """Return (status, sentence, code) of an error; the inside of the server stays inside."""
     if not isinstance(error, RlservoError):
         logger.error("a gRPC call failed", exc_info=error)
-        return grpc.StatusCode.INTERNAL, BUG, "internal"
+        return grpc.StatusCode.INTERNAL, BUG, InternalError.code
+    if isinstance(error, InternalError):  # which is logged already
+        return grpc.StatusCode.INTERNAL, BUG, error.code
     status = CODES.get(status_of(error), grpc.StatusCode.INTERNAL)
     if status is grpc.StatusCode.INTERNAL:
         logger.error("%s", error.message)
         if not isinstance(error, ActionError):
-            return status, BUG, "internal"
+            return status, BUG, InternalError.code
     return status, error.message, error.code
 
 
@@ -443,7 +447,7 @@ def is_local(peer: str) -> bool:
     return host.is_loopback if mapped is None else bool(mapped.is_loopback)
 
 
-def _caller(peer: str, metadata: Any) -> str:
+def _peer(peer: str, metadata: Any) -> str:
     """Return where a call came from: what HAProxy says, which is on this machine and adds its word last."""
     forwarded = [value for name, value in metadata if name == "x-forwarded-for" and type(value) is str]
     return forwarded[-1].rpartition(",")[2].strip() if forwarded and is_local(peer) else peer

@@ -17,23 +17,40 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import fastapi
 import numpy as np
 import orjson
-from fastapi import Request
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
-from starlette.types import Scope
+from starlette.types import Receive
 
 from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.serve_app.episodes.episodes import Episode
+from rlservo.serve_app.episodes.request import Episode, Request
 from rlservo.serve_app.episodes.sessions import SessionId
-from rlservo.serve_app.protocols import json_messages
-from rlservo.serve_app.protocols.http_endpoint import Body, check_media_type, session_of
+from rlservo.serve_app.protocols.http_endpoint import Body, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, too_large
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of, flag, from_bytes, read_tensor, write_tensor
+from rlservo.serve_app.protocols.json_messages import parse_json
+from rlservo.serve_app.protocols.media_types import check_media_type
+from rlservo.serve_app.protocols.oip_tensors import (
+    DTYPES,
+    datatype_of,
+    from_bytes,
+    parse_flag,
+    parse_tensor,
+    write_tensor,
+)
 from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.reply import reply_fields
+from rlservo.serve_app.server.request_checks import HEADERS
+from rlservo.serve_app.server.request_fields import (
+    LONGEST_SESSION_ID,
+    OPTIONS,
+    json_type,
+    parse_finite,
+    parse_options,
+)
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.state_names import BELONGS_TO
 
@@ -45,9 +62,7 @@ STATE_POLICY = "state_policy"  # whose the states are
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
 MODEL_NAME = "model_name"  # KServe's client says again what the path says
 # What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
-PARAMETERS = frozenset(
-    {*json_messages.OPTIONS, "binary_data_output", "sequence_id", "sequence_start", "sequence_end", STATE_POLICY}
-)
+PARAMETERS = frozenset({*OPTIONS, "binary_data_output", "sequence_id", "sequence_start", "sequence_end", STATE_POLICY})
 TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
 IGNORED = frozenset({"priority", TIMEOUT, "headers", "content_type"})
 SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits one packet either way
@@ -93,133 +108,125 @@ class InferReply(BaseModel):
     outputs: list[Tensor]
 
 
-class Infer:
-    """Answers inference requests: JSON and raw tensors in, JSON and raw tensors out."""
+@dataclass(slots=True)
+class ReplyOptions:
+    """How a request's reply is to be written."""
+
+    contract: Contract
+    binary: bool
+    """Whether outputs are to be bytes, of which the request does not say otherwise."""
+    outputs: dict[str, bool]
+    """The outputs that were asked for, in order, and whether as bytes; none asked for means all."""
+    request_id: str | None = None
+    """The protocol's own `id`, echoed."""
+
+
+class OipHttpCodec:
+    """The protocol's bytes over HTTP (`Codec`): JSON and raw tensors in, JSON and raw tensors out."""
 
     def __init__(self, core: Core) -> None:
         self._core = core
 
-    async def __call__(self, scope: Scope, body: Body, received: float) -> tuple[bytes, Headers, Decision]:
-        params, encoding, accepted, length = scope["path_params"], b"", b"", None
-        contract = self._core.store().get(params["name"], params.get("version")).contract
-        for name, value in scope["headers"]:
-            if name == LENGTH_HEADER:
-                length = _read_length(value)
-            elif name == b"content-encoding":
-                encoding = value.strip().lower()
-            elif name == b"accept-encoding":
-                accepted = value.lower()
+    async def receive(self, request: Request, source: Receive) -> Body:
+        """Return the body, compressed as it came. Raises MediaTypeError, and what `receive_body` raises.
+
+        Triton's client names no content type, others name JSON or octets: the length header tells them apart.
+        """
+        check_media_type(request.headers, JSON, BINARY, optional=True)
+        encoding = request.headers.get(b"content-encoding", b"")
+        if encoding.strip().lower() not in (b"identity", b"gzip", b"deflate", b""):
+            raise MediaTypeError(
+                f"the content encoding '{encoding[:32].decode('latin-1')}' is not read: send gzip, deflate or none"
+            )
+        return await receive_body(self._core, request.headers, source)
+
+    def parse(self, request: Request, content: Body) -> None:
+        """Fill the request. Raises RequestError, ObservationError, TooLargeError, UnknownPolicyError."""
+        contract = self._core.store().get(request.policy, request.version).contract
+        length = _parse_length(request.headers.get(LENGTH_HEADER))
+        encoding = request.headers.get(b"content-encoding", b"").strip().lower()
         if encoding not in (b"", b"identity"):
-            body = _decompress(body, encoding, self._core.settings.max_body_bytes)
-        view = memoryview(body)
+            content = _decompress(content, encoding, self._core.settings.max_body_bytes)
+        view = memoryview(content)
         if length == 0 and len(view):
             document: dict[str, Any] = {}
-            inputs, non_finite = {contract.inputs[0].name: _raw_input(contract, view)}, False
+            inputs = {contract.inputs[0].name: _raw_input(contract, view)}
         else:
-            document, inputs, non_finite = _read_request(view, length, params["name"])
-        if non_finite and (document.get("parameters") or {}).get("sequence_id"):
-            json_messages.refuse_non_finite()  # before the sequence moves on
-        answer = await decide(
-            self._core,
-            params["name"],
-            params.get("version"),
-            document,
-            inputs,
-            received=received,
-            session=session_of(scope),
-        )
-        if non_finite:
-            json_messages.refuse_non_finite()
-        content, headers = _encode_reply(answer, document.get("id"))
-        if accepted and len(content) >= SMALLEST_COMPRESSED:
-            content, headers = _compress(content, headers, accepted)
-        return content, headers, answer.decision
+            document, inputs, request.non_finite = _parse_document(view, length, request.policy)
+        fill_request(self._core, request, document, inputs)
+        request.reply_options.request_id = document.get("id")
+
+    def encode(self, request: Request, decision: Decision) -> tuple[bytes, Headers]:
+        """Return the reply's body and headers."""
+        answer = answer_of(request, decision)
+        reply: dict[str, Any] = {
+            "model_name": answer.name,
+            "model_version": answer.version,
+            "parameters": answer.parameters,
+        }
+        if request.reply_options.request_id is not None:
+            reply["id"] = request.reply_options.request_id
+        written = [write_tensor(name, array, binary=answer.binary[name]) for name, array in answer.outputs.items()]
+        reply["outputs"] = [tensor for tensor, _ in written]
+        content = orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
+        headers = JSON_HEADERS
+        if any(answer.binary.values()):
+            headers = ((b"content-type", BINARY), (LENGTH_HEADER, b"%d" % len(content)))
+            content += b"".join(part for _, part in written)
+        accepted = request.headers.get(b"accept-encoding")
+        if accepted is not None and len(content) >= SMALLEST_COMPRESSED:
+            return _compress(content, headers, accepted.lower())
+        return content, headers
+
+
+def fill_request(core: Core, request: Request, document: Mapping[str, Any], inputs: dict[str, NDArray[Any]]) -> None:
+    """Fill a request of either transport, whose `parameters` and `outputs` are in `document`.
+
+    A deadline that the request has already is the transport's own: the earlier one holds. Raises RequestError and
+    ObservationError.
+    """
+    parameters = document.get("parameters") or {}
+    if parameters:
+        _fill_options(request, parameters)
+    sequence = parameters.get("sequence_id")
+    identity = parameters.get(STATE_POLICY)
+    if identity is not None and not any(name.startswith(STATE_IN) for name in inputs):
+        identity = None  # there is no state that it could be of
+    session_id = _session_id(sequence) if sequence else None
+    contract = core.policy(request.policy, request.version, session_id, identity).contract
+    binary = bool(parse_flag(parameters, "binary_data_output")) if parameters else False
+    outputs = _wanted_outputs(contract, document, parameters, binary=binary)
+    request.reply_options = ReplyOptions(contract, binary, outputs)
+    request.obs = _observation(contract, inputs)
+    if parameters or len(inputs) > 1:
+        request.episode = _episode(contract, inputs, parameters)
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a request of either transport comes to."""
+    """A reply of either transport."""
 
-    decision: Decision
+    name: str
+    version: str
     parameters: dict[str, Any]
     outputs: dict[str, NDArray[Any]]  # in the order they were asked for
     binary: dict[str, bool]  # the same names: as bytes, or in the JSON
 
 
-async def decide(
-    core: Core,
-    name: str,
-    version: str | None,
-    document: Mapping[str, Any],
-    inputs: dict[str, NDArray[Any]],
-    *,
-    received: float,
-    deadline_ms: float | None = None,
-    session: str | None = None,
-) -> Answer:
-    """Answer a request, whose `parameters` and `outputs` are in `document`; `deadline_ms` is the transport's own."""
-    parameters = document.get("parameters") or {}
-    explore, seed, seq, wanted_ms = _options(parameters) if parameters else (False, None, None, None)
-    if wanted_ms is not None:
-        deadline_ms = wanted_ms if deadline_ms is None else min(wanted_ms, deadline_ms)
-    timestamp = json_messages.read_timestamp(parameters) if parameters else None
-    sequence = parameters.get("sequence_id")
-    identity = parameters.get(STATE_POLICY)
-    if identity is not None and not any(name.startswith(STATE_IN) for name in inputs):
-        identity = None  # there is no state that it could be of
-    contract = core.policy(name, version, _session_id(sequence) if sequence else None, identity).contract
-    binary = _wanted_outputs(contract, document, parameters)
-    obs = _observation(contract, inputs)
-    episode = _episode(contract, inputs, parameters) if parameters or len(inputs) > 1 else None
-    decision = await core.act(
-        name,
-        version,
-        obs,
-        received=received,
-        explore=explore,
-        seed=seed,
-        seq=seq,
-        deadline_ms=deadline_ms,
-        episode=episode,
-        session=session,
-    )
-    said: dict[str, Any] = {"infer_ms": round(decision.infer_ms, 4)}
-    if seq is not None:
-        said["seq"] = seq
-    if decision.notices:
-        said["warnings"] = "; ".join(decision.notices)
-    if decision.episode is not None:
-        told = json_messages.describe_episode(decision.episode)
-        if "session_id" in told:
-            told["sequence_id"] = parameters["sequence_id"]
-            del told["session_id"]
-        said.update(told)
-        if decision.episode.state is not None:
-            said[STATE_POLICY] = decision.episode.state[BELONGS_TO]
-    if timestamp is not None:
-        said.update(json_messages.clock(timestamp, received))
-    outputs = _outputs(contract, decision)
-    if not binary:  # everything there is
-        binary = dict.fromkeys(outputs, bool(flag(parameters, "binary_data_output")))
-    return Answer(decision, said, {name: outputs[name] for name in binary}, binary)
-
-
-def _encode_reply(answer: Answer, request_id: str | None) -> tuple[bytes, Headers]:
-    decision = answer.decision
-    reply: dict[str, Any] = {
-        "model_name": decision.name,
-        "model_version": decision.version,
-        "parameters": answer.parameters,
-    }
-    if request_id is not None:
-        reply["id"] = request_id
-    written = [write_tensor(name, array, binary=answer.binary[name]) for name, array in answer.outputs.items()]
-    reply["outputs"] = [tensor for tensor, _ in written]
-    content = orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
-    if not any(answer.binary.values()):
-        return content, JSON_HEADERS
-    raw = b"".join(part for _, part in written)
-    return content + raw, ((b"content-type", BINARY), (LENGTH_HEADER, b"%d" % len(content)))
+def answer_of(request: Request, decision: Decision) -> Answer:
+    """Return the reply's fields by the protocol's names, and its tensors."""
+    options: ReplyOptions = request.reply_options
+    fields = reply_fields(request, decision)
+    name, version = fields.pop("policy"), fields.pop("version")
+    if "warnings" in fields:
+        fields["warnings"] = "; ".join(fields["warnings"])
+    if "session_id" in fields:
+        fields["sequence_id"] = fields.pop("session_id")
+    if "state" in fields:
+        fields[STATE_POLICY] = fields.pop("state")[BELONGS_TO]
+    outputs = _outputs(options.contract, decision)
+    binary = options.outputs or dict.fromkeys(outputs, options.binary)
+    return Answer(name, version, fields, {name: outputs[name] for name in binary}, binary)
 
 
 def _outputs(contract: Contract, decision: Decision) -> dict[str, NDArray[Any]]:
@@ -231,14 +238,14 @@ def _outputs(contract: Contract, decision: Decision) -> dict[str, NDArray[Any]]:
     return outputs
 
 
-def _read_request(
+def _parse_document(
     view: memoryview, length: int | None, model: str
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]], bool]:
     """Return (the JSON document, the inputs by name, whether the JSON held NaN)."""
     if length is not None and length > len(view):
         raise RequestError(f"Inference-Header-Content-Length is {length}, and the body has {len(view)} bytes")
     header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
-    document, non_finite = json_messages.read_json(header, such_as=SUCH_AS)
+    document, non_finite = parse_json(header, such_as=SUCH_AS)
     unknown = sorted(document.keys() - REQUEST_FIELDS)
     if unknown:
         if document.get(MODEL_NAME) not in (None, model):
@@ -247,16 +254,16 @@ def _read_request(
     if unknown:
         raise RequestError(f"unknown field '{unknown[0][:64]}': known are {', '.join(sorted(REQUEST_FIELDS))}")
     if document.get("id") is not None and type(document["id"]) is not str:
-        raise RequestError(f"'id' must be a string, got {json_messages.json_type(document['id'])}")
+        raise RequestError(f"'id' must be a string, got {json_type(document['id'])}")
     if document.get("parameters") is not None and type(document["parameters"]) is not dict:
-        raise RequestError(f"'parameters' must be an object, got {json_messages.json_type(document['parameters'])}")
+        raise RequestError(f"'parameters' must be an object, got {json_type(document['parameters'])}")
     tensors = document.get("inputs")
     if type(tensors) is not list or not tensors:
         raise RequestError(f"'inputs' must be a list of tensors: send {SUCH_AS}")
     inputs: dict[str, NDArray[Any]] = {}
     offset = 0
     for tensor in tensors:
-        name, array, offset = read_tensor(tensor, raw, offset)
+        name, array, offset = parse_tensor(tensor, raw, offset)
         if name in inputs:
             raise RequestError(f"input '{name[:64]}' is there twice")
         inputs[name] = array
@@ -307,8 +314,8 @@ def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
             )
         rows[expected.name] = len(array)
     if len(set(rows.values())) > 1:
-        told = ", ".join(f"{name} {count}" for name, count in rows.items())
-        raise ObservationError(f"the inputs of policy '{contract.name}' are not of one batch: {told}")
+        batches = ", ".join(f"{name} {count}" for name, count in rows.items())
+        raise ObservationError(f"the inputs of policy '{contract.name}' are not of one batch: {batches}")
     return build_action(contract.observation_space, inputs, "obs")
 
 
@@ -324,7 +331,7 @@ def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters:
         states[BELONGS_TO] = belongs_to
     reward = inputs.get(REWARD)
     last = _last_action(contract, inputs)
-    start, end = bool(flag(parameters, "sequence_start")), bool(flag(parameters, "sequence_end"))
+    start, end = bool(parse_flag(parameters, "sequence_start")), bool(parse_flag(parameters, "sequence_end"))
     sequence_id = parameters.get("sequence_id")
     if sequence_id in (None, 0, ""):
         if start and not states:  # a single step, for whoever carries from there what there is to carry
@@ -344,7 +351,7 @@ def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters:
 
 def _session_id(sequence_id: Any) -> SessionId:
     """Return a sequence's id as a session's; an integer and a string of its digits are two. Raises RequestError."""
-    if type(sequence_id) in (int, str) and len(str(sequence_id)) < json_messages.LONGEST_SESSION_ID:
+    if type(sequence_id) in (int, str) and len(str(sequence_id)) < LONGEST_SESSION_ID:
         return sequence_id  # type: ignore[no-any-return]  # mypy does not narrow by the type's own identity
     raise RequestError("'sequence_id' must be an integer, or a string of fewer than 128 characters")
 
@@ -369,49 +376,53 @@ def last_action_inputs(contract: Contract) -> list[TensorSpec]:
     ]
 
 
-def _options(parameters: Mapping[str, Any]) -> tuple[bool, int | None, int | None, float | None]:
-    """Return (explore, seed, seq, deadline_ms); refuse what would otherwise be ignored in silence."""
+def _fill_options(request: Request, parameters: Mapping[str, Any]) -> None:
+    """Set the request's options; refuse what would otherwise be ignored in silence."""
     for name in parameters:
         if name not in PARAMETERS and name not in IGNORED:
             raise RequestError(
                 f"unknown parameter '{name[:64]}': known are {', '.join(sorted(PARAMETERS | IGNORED))}",
                 {"known": sorted(PARAMETERS | IGNORED)},
             )
-    explore, seed, seq, deadline_ms = json_messages.read_options(parameters)
-    timeout_us = json_messages.read_finite(parameters, TIMEOUT, "an integer of microseconds", kinds=(int,))
-    if deadline_ms is None and timeout_us:
-        deadline_ms = timeout_us / 1e3
-    return explore, seed, seq, deadline_ms
+    transport_ms = request.deadline_ms
+    parse_options(request, parameters)
+    timeout_us = parse_finite(parameters, TIMEOUT, "an integer of microseconds", kinds=(int,))
+    if request.deadline_ms is None and timeout_us:
+        request.deadline_ms = timeout_us / 1e3
+    if transport_ms is not None:
+        own_ms = request.deadline_ms
+        request.deadline_ms = transport_ms if own_ms is None else min(own_ms, transport_ms)
 
 
-def _wanted_outputs(contract: Contract, document: Mapping[str, Any], parameters: Mapping[str, Any]) -> dict[str, bool]:
+def _wanted_outputs(
+    contract: Contract, document: Mapping[str, Any], parameters: Mapping[str, Any], *, binary: bool
+) -> dict[str, bool]:
     """Return the outputs that were asked for, and whether as bytes; none asked for means all.
 
     Raises RequestError for outputs that do not exist.
     """
-    binary = bool(flag(parameters, "binary_data_output")) if parameters else False
     outputs = document.get("outputs")
     if not outputs:
         return {}
     if type(outputs) is not list:
-        raise RequestError(f"'outputs' must be a list of {{\"name\": ...}}, got {json_messages.json_type(outputs)}")
+        raise RequestError(f"'outputs' must be a list of {{\"name\": ...}}, got {json_type(outputs)}")
     known = output_names(contract)
     wanted: dict[str, bool] = {}
     for output in outputs:
         name = output.get("name") if type(output) is dict else None
         if type(name) is not str or name not in known:
-            given = json_messages.json_type(output.get("name") if type(output) is dict else output)
+            given = json_type(output.get("name") if type(output) is dict else output)
             shown = f" '{name[:64]}'" if type(name) is str else f" {given}"
             raise RequestError(f"an output{shown} does not exist: the model's output is {quoted(known)}")
         if name.startswith(STATE_OUT) and parameters.get("sequence_id"):
             raise RequestError(f"the output '{name}' stays with the sequence: ask for the action, or carry the state")
         own = output.get("parameters") or {}
         if type(own) is not dict:
-            raise RequestError(f"an output's 'parameters' must be an object, got {json_messages.json_type(own)}")
+            raise RequestError(f"an output's 'parameters' must be an object, got {json_type(own)}")
         refused = next((name for name in ("classification", "shared_memory_region") if name in own), None)
         if refused is not None:
             raise RequestError(f"the output parameter '{refused}' is not offered: leave it out")
-        chosen = flag(own, "binary_data")
+        chosen = parse_flag(own, "binary_data")
         wanted[name] = binary if chosen is None else chosen
     return wanted
 
@@ -432,17 +443,9 @@ def output_names(contract: Contract) -> list[str]:
 # Bytes: lengths and compression.
 
 
-def check_headers(headers: list[tuple[bytes, bytes]]) -> None:
-    """Triton's client names no content type, others name JSON or octets: the length header is what tells them apart."""
-    check_media_type(headers, JSON, BINARY, optional=True)
-    for name, value in headers:
-        if name == b"content-encoding" and value.strip().lower() not in (b"identity", b"gzip", b"deflate", b""):
-            raise MediaTypeError(
-                f"the content encoding '{value[:32].decode('latin-1')}' is not read: send gzip, deflate or none"
-            )
-
-
-def _read_length(value: bytes) -> int:
+def _parse_length(value: bytes | None) -> int | None:
+    if value is None:
+        return None
     if not value.isdigit() or len(value) > 15:
         raise RequestError(
             f"Inference-Header-Content-Length must be the JSON's length, got '{value[:32].decode('latin-1')}'"
@@ -476,6 +479,6 @@ def _compress(content: bytes, headers: Headers, accepted: bytes) -> tuple[bytes,
     return content, headers
 
 
-async def media_type(request: Request) -> None:
+async def accept_media_type(request: fastapi.Request) -> None:
     """Raise MediaTypeError for what none of the protocol's clients sends: a dependency of routes that FastAPI runs."""
-    check_media_type(request.scope["headers"], JSON, BINARY, optional=True)
+    check_media_type(request.scope[HEADERS], JSON, BINARY, optional=True)

@@ -1,7 +1,4 @@
-"""Protobuf messages of the Open Inference Protocol, built at import: no generated code.
-
-Generated code is tied to the protobuf it was made with, and would claim the names `inference.*` in the process-wide
-descriptor pool, where KServe's and Triton's own packages register theirs. These live in a pool of their own.
+"""Protobuf messages of the Open Inference Protocol.
 
 Source of names and numbers: github.com/kserve/open-inference-protocol, open_inference_grpc.proto, and for streaming
 and the repository index github.com/triton-inference-server/common, grpc_service.proto.
@@ -11,27 +8,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from rlservo.serve_app.wire.protobuf_messages import build_messages
 
 PACKAGE = "inference"
 SERVICE = f"{PACKAGE}.GRPCInferenceService"
 
-_Field = descriptor_pb2.FieldDescriptorProto
-_TYPES = {
-    "bool": _Field.TYPE_BOOL,
-    "int32": _Field.TYPE_INT32,
-    "int64": _Field.TYPE_INT64,
-    "uint32": _Field.TYPE_UINT32,
-    "uint64": _Field.TYPE_UINT64,
-    "float": _Field.TYPE_FLOAT,
-    "double": _Field.TYPE_DOUBLE,
-    "string": _Field.TYPE_STRING,
-    "bytes": _Field.TYPE_BYTES,
-}
 _TENSOR = ["string name", "string datatype", "repeated int64 shape"]
 _VALUES = ["map InferParameter parameters", "InferTensorContents contents"]
-# message -> its fields in the order of their numbers, or with a number of their own (`= 17`); `oneof` fields share the
-# one oneof of their message, and `map` is from string. A nested message is written Outer.Inner, after its outer one.
 _MESSAGES: dict[str, list[str]] = {
     "ServerLiveRequest": [],
     "ServerLiveResponse": ["bool live"],
@@ -144,65 +127,20 @@ _DATA_TYPES = "INVALID BOOL UINT8 UINT16 UINT32 UINT64 INT8 INT16 INT32 INT64 FP
 DATA_TYPES = {f"TYPE_{name}": number for number, name in enumerate(_DATA_TYPES.split())}
 """Triton's numbers of the data types in a ModelConfig."""
 
-
-def _file() -> descriptor_pb2.FileDescriptorProto:
-    file = descriptor_pb2.FileDescriptorProto(name="rlservo_open_inference.proto", package=PACKAGE, syntax="proto3")
-    made: dict[str, Any] = {}
-    for name, fields in _MESSAGES.items():
-        outer, _, inner = name.rpartition(".")
-        message = made[outer].nested_type.add(name=inner) if outer else file.message_type.add(name=inner)
-        made[name] = message
-        for position, declaration in enumerate(fields, start=1):
-            field, _, number = declaration.partition(" = ")
-            _add_field(message, f".{PACKAGE}.{name}", int(number or position), field)
-    return file
-
-
-def _add_field(message: Any, path: str, number: int, declaration: str) -> None:
-    kind, name = declaration.rsplit(" ", 1)
-    modifier, _, kind = kind.rpartition(" ")
-    field = message.field.add(name=name, number=number, label=_Field.LABEL_OPTIONAL)
-    if modifier == "map":  # on the wire a repeated message of key and value
-        entry = message.nested_type.add(name=f"{name.capitalize()}Entry")
-        entry.options.map_entry = True
-        _add_field(entry, path, 1, "string key")
-        _add_field(entry, path, 2, f"{kind} value")
-        field.label, field.type, field.type_name = _Field.LABEL_REPEATED, _Field.TYPE_MESSAGE, f"{path}.{entry.name}"
-        return
-    if modifier == "repeated":
-        field.label = _Field.LABEL_REPEATED
-    elif modifier == "oneof":
-        if not message.oneof_decl:
-            message.oneof_decl.add(name="parameter_choice")
-        field.oneof_index = 0
-    if kind in _TYPES:
-        field.type = _TYPES[kind]
-    else:
-        field.type, field.type_name = _Field.TYPE_MESSAGE, f".{PACKAGE}.{kind}"
-
-
-_pool = descriptor_pool.DescriptorPool()
-_pool.AddSerializedFile(_file().SerializeToString())
-
-
-def _message(name: str) -> Any:
-    return message_factory.GetMessageClass(_pool.FindMessageTypeByName(f"{PACKAGE}.{name}"))
-
-
-# Classes made at run time have no static type: Any is all a type checker can be told.
-ServerLiveResponse: Any = _message("ServerLiveResponse")
-ServerReadyResponse: Any = _message("ServerReadyResponse")
-ServerMetadataResponse: Any = _message("ServerMetadataResponse")
-ModelReadyRequest: Any = _message("ModelReadyRequest")
-ModelReadyResponse: Any = _message("ModelReadyResponse")
-ModelMetadataRequest: Any = _message("ModelMetadataRequest")
-ModelMetadataResponse: Any = _message("ModelMetadataResponse")
-ModelConfigRequest: Any = _message("ModelConfigRequest")
-ModelConfigResponse: Any = _message("ModelConfigResponse")
-ModelStatisticsRequest: Any = _message("ModelStatisticsRequest")
-ModelStatisticsResponse: Any = _message("ModelStatisticsResponse")
-ModelInferRequest: Any = _message("ModelInferRequest")
-ModelInferResponse: Any = _message("ModelInferResponse")
-ModelStreamInferResponse: Any = _message("ModelStreamInferResponse")
-RepositoryIndexRequest: Any = _message("RepositoryIndexRequest")
-RepositoryIndexResponse: Any = _message("RepositoryIndexResponse")
+_CLASSES = build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice")
+ServerLiveResponse: Any = _CLASSES["ServerLiveResponse"]
+ServerReadyResponse: Any = _CLASSES["ServerReadyResponse"]
+ServerMetadataResponse: Any = _CLASSES["ServerMetadataResponse"]
+ModelReadyRequest: Any = _CLASSES["ModelReadyRequest"]
+ModelReadyResponse: Any = _CLASSES["ModelReadyResponse"]
+ModelMetadataRequest: Any = _CLASSES["ModelMetadataRequest"]
+ModelMetadataResponse: Any = _CLASSES["ModelMetadataResponse"]
+ModelConfigRequest: Any = _CLASSES["ModelConfigRequest"]
+ModelConfigResponse: Any = _CLASSES["ModelConfigResponse"]
+ModelStatisticsRequest: Any = _CLASSES["ModelStatisticsRequest"]
+ModelStatisticsResponse: Any = _CLASSES["ModelStatisticsResponse"]
+ModelInferRequest: Any = _CLASSES["ModelInferRequest"]
+ModelInferResponse: Any = _CLASSES["ModelInferResponse"]
+ModelStreamInferResponse: Any = _CLASSES["ModelStreamInferResponse"]
+RepositoryIndexRequest: Any = _CLASSES["RepositoryIndexRequest"]
+RepositoryIndexResponse: Any = _CLASSES["RepositoryIndexResponse"]

@@ -12,19 +12,19 @@ from pydantic import BaseModel, Field
 
 import rlservo
 from rlservo.export.contract.contract import TensorSpec
-from rlservo.serve_app.protocols import json_messages
-from rlservo.serve_app.protocols.http_endpoint import BareRoute, Endpoint
+from rlservo.serve_app.protocols.direct_routes import PostRoute
+from rlservo.serve_app.protocols.http_endpoint import HttpEndpoint
 from rlservo.serve_app.protocols.http_errors import error_models
+from rlservo.serve_app.protocols.json_messages import parse_json
 from rlservo.serve_app.protocols.oip_infer import (
-    Infer,
     InferReply,
     InferRequest,
-    check_headers,
+    OipHttpCodec,
+    accept_media_type,
     last_action_inputs,
-    media_type,
     output_names,
 )
-from rlservo.serve_app.protocols.oip_tensors import datatype_of, flag
+from rlservo.serve_app.protocols.oip_tensors import datatype_of, parse_flag
 from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.listing import states_of
@@ -73,9 +73,9 @@ class ModelState(BaseModel):
 # What can be asked about the server and its models. FastAPI runs these: nobody asks a thousand times a second.
 
 
-def add_routes(app: FastAPI, core: Core, add_direct: Callable[[BareRoute], None]) -> None:
+def add_routes(app: FastAPI, core: Core, add_direct: Callable[[PostRoute], None]) -> None:
     """Add /v2 to the application; `add_direct` adds what FastAPI only documents."""
-    infer = Endpoint("oip", Infer(core), check_headers, core)
+    infer = HttpEndpoint("oip", OipHttpCodec(core), core)
     _add_health(app, core)
     _add_models(app, core)
     for path, operation, summary in (
@@ -87,7 +87,7 @@ def add_routes(app: FastAPI, core: Core, add_direct: Callable[[BareRoute], None]
         ),
     ):
         add_direct(
-            BareRoute(
+            PostRoute(
                 path,
                 infer,
                 operation=operation,
@@ -175,7 +175,7 @@ def _add_models(app: FastAPI, core: Core) -> None:
         "/v2/repository/index",
         tags=tags,
         summary="Every version of every model",
-        dependencies=[Depends(media_type)],
+        dependencies=[Depends(accept_media_type)],
         response_model=list[ModelState],
         responses=error_models(415, 503),
     )
@@ -184,8 +184,8 @@ def _add_models(app: FastAPI, core: Core) -> None:
         body = await request.body()
         ready = False
         if body:
-            document, _ = json_messages.read_json(body, such_as='{"ready": true}')
-            ready = bool(flag(document, "ready"))
+            document, _ = parse_json(body, such_as='{"ready": true}')
+            ready = bool(parse_flag(document, "ready"))
         return _json(repository_index(core, ready=ready))
 
 
@@ -213,7 +213,7 @@ def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]
     policy = core.store().get(name, version)
     contract = policy.contract
     versions = core.store().versions(name) if version is None else (contract.version,)
-    inputs = [*contract.inputs, *(last_action_inputs(contract) if policy.limited else ())]
+    inputs = [*contract.inputs, *(last_action_inputs(contract) if policy.has_step_limit else ())]
 
     def described(tensor: TensorSpec) -> dict[str, Any]:
         return {"name": tensor.name, "datatype": datatype_of(tensor.dtype), "shape": tensor.shape}

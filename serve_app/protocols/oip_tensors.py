@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError
-from rlservo.serve_app.protocols.json_messages import json_type
+from rlservo.serve_app.server.request_fields import json_type
 
 DTYPES: dict[str, np.dtype[Any]] = {
     "BOOL": np.dtype("?"),
@@ -48,7 +48,7 @@ def datatype_of(dtype: str) -> str:
     return NAMES[np.dtype(dtype)]
 
 
-def read_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDArray[Any], int]:
+def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDArray[Any], int]:
     """Return (name, array, offset after it); `offset` is where the tensor would begin in `raw`, were it binary.
 
     Raises RequestError where the form is wrong, ObservationError where a number does not fit its datatype.
@@ -161,7 +161,7 @@ def write_tensor(name: str, array: NDArray[Any], *, binary: bool) -> tuple[dict[
     return document, raw
 
 
-def flag(parameters: Mapping[str, Any], name: str) -> bool | None:
+def parse_flag(parameters: Mapping[str, Any], name: str) -> bool | None:
     """Return an optional boolean parameter. Raises RequestError when it is something else."""
     value = parameters.get(name)
     if value is None or type(value) is bool:

@@ -21,7 +21,8 @@ from ray.serve import Application, Deployment
 from ray.serve.config import HTTPOptions, gRPCOptions
 
 from rlservo.export.contract.errors import PartlyAppliedError, RlservoError
-from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import InferenceService
 from rlservo.serve_app.ray_serve import ingress, ray_parts
 from rlservo.serve_app.ray_serve.autoscaling import BUSY, Load
@@ -31,10 +32,10 @@ from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_policies import Library
+from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
 from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.versions.policy_store import load_policy
-from rlservo.serve_app.versions.replica_versions import Control, Following
+from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.wire.loopback import is_loopback
 
@@ -78,7 +79,7 @@ def build(args: BuildArguments) -> Application:
     """
     ray_parts.check()
     settings = ServerSettings.from_environment(args.settings)
-    ServedConfig.read(args.served)
+    ServedConfig.parse(args.served)
     # A folder may exist only on the nodes that run replicas, so it is the replica that looks.
     folders = [str(Path(folder).expanduser().absolute()) for folder in args.policies]
     server: Deployment = cast("Deployment", PolicyServer)  # the decorator's type says it is still the class
@@ -100,7 +101,7 @@ def _serve_limit(settings: ServerSettings) -> int:
     # A line per request costs more than the policy; below this level Serve makes one all the same and drops it (5%).
     logging_config={"enable_access_log": False, "log_level": "WARNING"},
     # A replica that hangs is gone after three checks in vain, 8 s at most; Serve's own 30 s a check would be minutes.
-    # HAProxy leaves it alone before that, after two of its own (`haproxy_wrapper.py`). It has no end in order:
+    # HAProxy leaves it alone before that, after two of its own (`haproxy/configuration.py`). It has no end in order:
     # RAY_SERVE_FORCE_STOP_UNHEALTHY_REPLICAS.
     health_check_period_s=1,
     health_check_timeout_s=2,
@@ -132,10 +133,10 @@ class PolicyServer(InferenceService):
                 options=self._settings.policy_options,
                 limits=limits,
             )
-            library = Library(Repository(folders, limits), load)
+            library = LoadedPolicies(Repository(folders, limits), load)
         except RlservoError as error:
             raise _plain(error) from None
-        self._control = Control(
+        self._control = ReplicaVersions(
             library,
             GcsLedger(_controller()._actor_id.hex(), context.app_name, context.deployment),
             replica=self._replica,
@@ -157,10 +158,9 @@ class PolicyServer(InferenceService):
         )
         core: Core = app.state.core
         self._core = core
-        core.admission.age.watch()
+        core.admission.loop_clock.start()
         # By way of the module: Serve pickles this class with copies of the objects that it names.
-        ahead = self._settings.ahead_of_serve and _can_be_left_out()
-        ingress.door.open(app, core.admission.is_open, ahead=ahead)
+        ingress.bypass.install(app, answers=self._settings.ahead_of_serve and _can_bypass_serve())
         self.serve_grpc(core, local_only=is_loopback(self._host))
         return app
 
@@ -174,13 +174,13 @@ class PolicyServer(InferenceService):
                 await self._control.configure(user_config)
             except RlservoError as error:
                 raise _plain(error) from None
-            self._watch = asyncio.create_task(self._control.watch())
+            self._watch = asyncio.create_task(self._control.poll_ledger())
         else:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Tell Serve's autoscaler how busy this replica is, for `autoscaling.by_load`."""
-        return {BUSY: self._load.busy()}
+        return {BUSY: self._load.measure()}
 
     async def check_health(self) -> None:
         """Tell Serve's controller that the event loop turns and the policies are there; if not, it replaces us."""
@@ -188,7 +188,7 @@ class PolicyServer(InferenceService):
         if self._control.store is None:
             raise RuntimeError("no policies are loaded: the deployment's user_config must be a map, and not null")
 
-    async def follow_plan(self, generation: int) -> Following:
+    async def follow_plan(self, generation: int) -> ReplicaProgress:
         """Serve a plan that another replica wrote; replicas call this of each other."""
         return await self._control.follow(generation)
 
@@ -213,9 +213,9 @@ class PolicyServer(InferenceService):
             return True
         return current is None or current.user_config == user_config
 
-    async def _tell_all(self, generation: int) -> list[Following]:
+    async def _tell_all(self, generation: int) -> list[ReplicaProgress]:
         replies = await self._call_all("follow_plan", generation)
-        return [reply for reply in replies if isinstance(reply, Following)]
+        return [reply for reply in replies if isinstance(reply, ReplicaProgress)]
 
     async def _ask_all(self) -> list[Any]:
         return sorted(await self._call_all("describe"), key=lambda reply: str(reply.get("replica")))
@@ -249,8 +249,8 @@ def _controller() -> Any:
     return ray_parts.find("ray.serve.context:_get_global_client")()._controller
 
 
-def _can_be_left_out() -> bool:
-    """Whether Serve's handling of a request can be: where Serve traces, it is to see every request.
+def _can_bypass_serve() -> bool:
+    """Whether Serve's handling of a request can be left out: where Serve traces, it is to see every request.
 
     A replica that stops then waits for its HTTP server alone, as ray 2.60's does; one that does not is asked.
     """

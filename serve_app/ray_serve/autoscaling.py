@@ -20,7 +20,7 @@ ENOUGH = 0.45  # a replica less only if the others stay below this: no to and fr
 
 
 class Load:
-    """Measures how much of the time this process's busiest thread wanted a core, got it or not, between two questions.
+    """Share of the time in which this process's busiest thread wanted a core, whether it got one or not.
 
     Time on the processor alone looks modest exactly when the machine is overloaded.
     """
@@ -28,8 +28,8 @@ class Load:
     def __init__(self) -> None:
         self._wall, self._wanted = time.perf_counter(), _wanted_by_thread()
 
-    def busy(self) -> float:
-        """Return the share since the last question, between 0 and 1."""
+    def measure(self) -> float:
+        """Return the share since the last measurement, between 0 and 1, and begin the next one."""
         wall, wanted = time.perf_counter(), _wanted_by_thread()
         most = max((seconds - self._wanted.get(thread, 0.0) for thread, seconds in wanted.items()), default=0.0)
         share = most / max(wall - self._wall, 1e-3)

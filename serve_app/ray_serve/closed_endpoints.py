@@ -1,8 +1,8 @@
-"""Ray Serve's own HTTP paths and gRPC methods, which know no keys: nobody answers them.
+"""Closed endpoints: Ray Serve's own HTTP paths and gRPC methods, which check no keys and so are answered to nobody.
 
 `/-/routes` and `ListApplications` tell what is deployed. `/-/healthz` and `Healthz` are what HAProxy's health checks
 ask: where the server has a secret for those checks (`rlservo serve` makes one), only they are answered. For everybody
-else there are `/healthz`, `/v2/health/live` and `/v2/health/ready`. `haproxy_wrapper.py` does the same in front.
+else there are `/healthz`, `/v2/health/live` and `/v2/health/ready`. `haproxy/configuration.py` does the same in front.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import grpc
 from starlette.types import Scope
 
-from rlservo.serve_app.ray_serve.haproxy_wrapper import CHECK_HEADER, CHECK_SECRET
+from rlservo.serve_app.ray_serve.haproxy.configuration import CHECK_HEADER, CHECK_SECRET
 from rlservo.serve_app.ray_serve.ray_parts import find
 
 ROUTES, HEALTH = "/-/routes", "/-/healthz"

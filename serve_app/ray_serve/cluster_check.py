@@ -19,13 +19,13 @@ import rlservo
 from rlservo.export.contract.errors import UnavailableError, UsageError
 from rlservo.serve_app.ray_serve.environment import CLUSTER, HAPROXY_BINARY
 
-SAY_S = 5.0  # between words about what is waited for
+NOTICE_PERIOD_S = 5.0  # between notices of what is waited for
 LONGEST_S = 90.0  # without a report: a step's own bounds are shorter
 
 
 @dataclass(frozen=True)
 class Check:
-    """What one look at the cluster found."""
+    """Result of one check of the cluster."""
 
     name: str
     ok: bool
@@ -44,7 +44,7 @@ def check_cluster(
 
     `configuration` is a serve.yaml whose policy folders are looked for on every node, instead of those of what is
     deployed. `own` names variables to which the cluster gives values of its own. Raises UnavailableError where the
-    cluster cannot be asked, UsageError.
+    cluster does not answer, UsageError.
     """
     if unknown := [name for name in own if name not in CLUSTER]:
         raise UsageError(f"'{unknown[0]}' is not one of the cluster's variables: {', '.join(CLUSTER)}")
@@ -97,7 +97,7 @@ def _reports(stdout: IO[str], log: IO[str], on_wait: Callable[[str], None]) -> I
     waits, since = "Ray", time.monotonic()
     while True:
         try:
-            line = lines.get(timeout=SAY_S)
+            line = lines.get(timeout=NOTICE_PERIOD_S)
         except queue.Empty:
             waited = time.monotonic() - since
             if waited > LONGEST_S:
@@ -106,8 +106,8 @@ def _reports(stdout: IO[str], log: IO[str], on_wait: Callable[[str], None]) -> I
             continue
         if not line:
             log.seek(0)
-            said = log.read().strip().splitlines()
-            raise UnavailableError(f"Ray gave up while waiting for {waits}: {said[-1] if said else 'without a word'}")
+            output = log.read().strip().splitlines() or ["without a word"]
+            raise UnavailableError(f"Ray gave up while waiting for {waits}: {output[-1]}")
         since = time.monotonic()
         message: dict[str, Any] = json.loads(line)
         if "error" in message:

@@ -1,4 +1,4 @@
-"""Child process of `rlservo cluster check`: a driver that asks a running cluster, and reports a JSON object per line.
+"""Child process of `rlservo cluster check`: a driver of a running cluster that reports a JSON object per line.
 
 `cluster_check.py` runs it as `python -m rlservo.serve_app.ray_serve.cluster_probe PLAN`, in a process of its own: Ray's
 C++ parts wait without a bound, end the process, and write to its terminal.
@@ -24,11 +24,11 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 EVERY = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}  # an address to ask, for those that mean all interfaces
 AGAIN = 'run eval "$(rlservo cluster env)" there, then ray stop and ray start'
 
-Line = tuple[str, str | None, str]
-"""(Which check, the problem or None, what was found)."""
+Result = tuple[str, str | None, str]
+"""(Name of the check, the problem or None, what was found)."""
 
-Looks = list[tuple[str, dict[str, Any] | str]]
-"""(A node's address, what `look` found there, or why it did not)."""
+NodeReports = list[tuple[str, dict[str, Any] | str]]
+"""(A node's address, what `inspect_node` found there, or why it did not run)."""
 
 
 def main() -> None:
@@ -48,8 +48,8 @@ def main() -> None:
     report(done=True)
 
 
-def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Line]:
-    """Yield what each check found; `wait` is told what takes its time. Raises where the cluster cannot be asked."""
+def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Result]:
+    """Yield what each check found; `wait` gets what takes its time. Raises where the cluster does not answer."""
     import ray
 
     address = plan["address"] or os.environ.get("RAY_ADDRESS") or "auto"
@@ -75,9 +75,9 @@ def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Line]:
     applications = [each for each in serve.get("applications", {}).values() if _is_ours(each)]
     folders = plan["policies"] or [folder for each in applications for folder in _folders(each)]
     settings = proxy_settings(applications)
-    looks = _look_at(nodes, [*plan["variables"], *plan["any_value"], *settings], folders)
-    yield from check_nodes(looks, plan, settings)
-    yield from _policies(looks, folders)
+    reports = _inspect_nodes(nodes, [*plan["variables"], *plan["any_value"], *settings], folders)
+    yield from check_nodes(reports, plan, settings)
+    yield from _policies(reports, folders)
     if problem is not None:
         yield "serve", problem, ""
         return
@@ -86,8 +86,8 @@ def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Line]:
     yield from check_keys(serve, applications)
 
 
-def look(names: list[str], folders: list[str], haproxy: str) -> dict[str, Any]:
-    """Tell what a node's processes see. Runs on the node, where rlservo may be missing."""
+def inspect_node(names: list[str], folders: list[str], haproxy: str) -> dict[str, Any]:
+    """Return what a process on a node sees. It runs there, where rlservo may be missing."""
     import ray
 
     found: dict[str, Any] = {
@@ -107,7 +107,7 @@ def look(names: list[str], folders: list[str], haproxy: str) -> dict[str, Any]:
         with open(script) as file:  # noqa: PTH123
             words = shlex.split(file.read())
         gone = [word for word in words if word.startswith("/") and not os.path.exists(word)]  # noqa: PTH110
-        if not any(word.endswith("haproxy_wrapper.py") for word in words):
+        if not any(word.endswith("/haproxy/wrapper.py") for word in words):
             found["haproxy"] = f"{script} is not the wrapper that rlservo writes"
         elif gone or not os.access(script, os.X_OK):
             found["haproxy"] = f"{script} cannot run: {', '.join(gone) or 'it is not executable'} is missing"
@@ -124,14 +124,14 @@ def _reach(address: str) -> None:
             pass
 
 
-def _look_at(nodes: list[dict[str, Any]], names: list[str], folders: list[str]) -> Looks:
+def _inspect_nodes(nodes: list[dict[str, Any]], names: list[str], folders: list[str]) -> NodeReports:
     """Return by node's address what a task there found, or why there is none."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     from rlservo.serve_app.ray_serve.environment import HAPROXY_BINARY
 
-    task: Any = ray.remote(num_cpus=0, max_retries=0)(look)
+    task: Any = ray.remote(num_cpus=0, max_retries=0)(inspect_node)
     tasks = [
         task.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)).remote(
             names, folders, HAPROXY_BINARY
@@ -139,23 +139,23 @@ def _look_at(nodes: list[dict[str, Any]], names: list[str], folders: list[str]) 
         for node in nodes
     ]
     ready, _ = ray.wait(tasks, num_returns=len(tasks), timeout=NODE_S)
-    looks: Looks = []
+    reports: NodeReports = []
     for node, reference in zip(nodes, tasks, strict=True):
         found: dict[str, Any] | str = f"no task ran there within {NODE_S:g} s"
         try:
             found = ray.get(reference) if reference in ready else found
         except Exception as error:
             found = _sentence(error)
-        looks.append((node["NodeManagerAddress"], found))
-    return looks
+        reports.append((node["NodeManagerAddress"], found))
+    return reports
 
 
-def check_nodes(looks: Looks, plan: dict[str, Any], settings: dict[str, float]) -> Iterator[Line]:
-    for address, look in looks:
-        if isinstance(look, str):
-            yield "node", f"{address}: {look}", ""
+def check_nodes(reports: NodeReports, plan: dict[str, Any], settings: dict[str, float]) -> Iterator[Result]:
+    for address, report in reports:
+        if isinstance(report, str):
+            yield "node", f"{address}: {report}", ""
             continue
-        variables = look["variables"]
+        variables = report["variables"]
         wrong = [
             f"{name} is {variables[name]!r}, not {value!r}" if name in variables else f"{name} is not set"
             for name, value in plan["variables"].items()
@@ -166,25 +166,26 @@ def check_nodes(looks: Looks, plan: dict[str, Any], settings: dict[str, float]) 
         yield "variables", f"{address}: {'; '.join(wrong)}: {AGAIN}" if wrong else None, f"{address} has all {count}"
         for name, value in settings.items():
             if float(variables.get(name, "nan")) != value:
-                said = f"{name} is {variables.get(name, 'not set')!r}, but the application's setting is {value:g}"
-                yield "settings", f"{address}: {said}: HAProxy goes by the first; give it to rlservo cluster env", ""
-        other = [f"{name} {version}" for name, version in look["versions"].items() if version != plan["versions"][name]]
+                shown = f"{name} is {variables.get(name, 'not set')!r}, but the application's setting is {value:g}"
+                yield "settings", f"{address}: {shown}: HAProxy goes by the first; give it to rlservo cluster env", ""
+        versions = report["versions"].items()
+        other = [f"{name} {version}" for name, version in versions if version != plan["versions"][name]]
         mine = ", ".join(f"{name} {version}" for name, version in plan["versions"].items())
         yield (
             "versions",
             f"{address}: {', '.join(other)}; here: {mine}: install the same" if other else None,
             f"{address} has {mine}",
         )
-        haproxy = look["haproxy"]
+        haproxy = report["haproxy"]
         yield "haproxy", haproxy and f"{address}: {haproxy}: {AGAIN}", f"{address} has HAProxy's wrapper"
 
 
-def _policies(looks: Looks, folders: list[str]) -> Iterator[Line]:
+def _policies(reports: NodeReports, folders: list[str]) -> Iterator[Result]:
     if not folders:
         return
-    for address, look in looks:
-        if not isinstance(look, str):
-            missing = ", ".join(look["missing"])
+    for address, report in reports:
+        if not isinstance(report, str):
+            missing = ", ".join(report["missing"])
             problem = f"{address}: {missing} is not there: replicas cannot start on this node" if missing else None
             yield "policies", problem, f"{address} has {', '.join(folders)}"
 
@@ -208,21 +209,21 @@ def _serve(dashboard: str | None) -> tuple[dict[str, Any], str | None]:
     return details, None
 
 
-def _health(serve: dict[str, Any]) -> Iterator[Line]:
+def _health(serve: dict[str, Any]) -> Iterator[Result]:
     for proxy in serve["proxies"].values():
         bad = proxy["status"] != "HEALTHY"
-        said = f"on {proxy['node_ip']} is {proxy['status']}"
-        yield "proxy", f"{said}: see its log, {proxy['log_file_path']}" if bad else None, said
+        state = f"on {proxy['node_ip']} is {proxy['status']}"
+        yield "proxy", f"{state}: see its log, {proxy['log_file_path']}" if bad else None, state
     for name, application in serve["applications"].items():
         bad = application["status"] != "RUNNING"
         parts = [application["message"], *(each["message"] for each in application["deployments"].values())]
         why = _last_line(" ".join(filter(None, parts))) or "see serve status"
-        said = f"'{name}' is {application['status']}"
-        yield "application", f"{said}: {why}" if bad else None, said
+        state = f"'{name}' is {application['status']}"
+        yield "application", f"{state}: {why}" if bad else None, state
 
 
-def check_keys(serve: dict[str, Any], applications: list[dict[str, Any]]) -> Iterator[Line]:
-    """Ask as anybody could who has no key."""
+def check_keys(serve: dict[str, Any], applications: list[dict[str, Any]]) -> Iterator[Result]:
+    """Check whether a request without a key is answered."""
     options = serve.get("http_options") or {}
     host, port = str(options.get("host")), options.get("port")
     for application in applications:

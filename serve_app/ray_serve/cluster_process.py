@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.serve_app.ray_serve import ray_parts
-from rlservo.serve_app.ray_serve.processes import SERVER_LOG, cut_log, describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, cut_log
 from rlservo.serve_app.server.admin_key import remove_key
 
-LOOK_S = 0.5  # between looks at whether Ray's own processes live
+CHECK_PERIOD_S = 0.5  # between checks of whether Ray's own processes live
 ORDERLY_END_S = 25.0  # [s] less than the launcher waits
-LOG_LOOK_S = 60.0
+LOG_CHECK_PERIOD_S = 60.0
 OBJECT_STORE_BYTES = 80 << 20  # Ray's least is 75 MiB; requests do not go through it
 
 
@@ -69,14 +70,14 @@ def main() -> int:
         raise
     started.set()
     _report(plan, {"ready": True})
-    looked = time.monotonic()
-    while not stop.wait(LOOK_S):
+    log_checked = time.monotonic()
+    while not stop.wait(CHECK_PERIOD_S):
         if (cause := _ray_ended()) is not None:
             _report(plan, {"died": cause})
             _leave_nothing(plan)
             return 1
-        if time.monotonic() - looked > LOG_LOOK_S:
-            looked = time.monotonic()
+        if time.monotonic() - log_checked > LOG_CHECK_PERIOD_S:
+            log_checked = time.monotonic()
             cut_log(Path(plan["folder"]) / SERVER_LOG)
     app.stop()
     ray.shutdown()

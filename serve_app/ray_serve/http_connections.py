@@ -12,8 +12,8 @@ read, which the application then answers one after the other while the event loo
 nobody reads.
 
 `install` puts subclasses in place of the classes that uvicorn chooses, in each of Serve's processes that serves HTTP
-(`ingress.py`). One timer a connection looks at its phases; a request costs two assignments. In front of the replicas
-HAProxy has time-outs of its own (`haproxy_wrapper.py`).
+(`ingress.py`). One timer a connection checks its phase; a request costs two assignments. In front of the replicas
+HAProxy has time-outs of its own (`haproxy/configuration.py`).
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from uvicorn.protocols.http import auto
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
+from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites
+
 if TYPE_CHECKING:
     from starlette.types import Message, Receive, Scope, Send
     from websockets.frames import Frame
@@ -39,10 +41,10 @@ LINGER_S = 1.0
 """[s] in which a client that still sends may take the reply: closed at once, what it sends would destroy the reply."""
 UNREAD_S = 10.0
 """[s] that sent bytes may wait for a client that does not read."""
-LOOK_S = 1.0
-"""[s] between two looks at a connection."""
+CHECK_PERIOD_S = 1.0
+"""[s] between two checks of a connection's phase."""
 PIECE_BYTES = 16384
-"""Of a WebSocket, between two looks at how much has come: uvloop reads 256 KB at once, which are 40,000 frames."""
+"""Of a WebSocket, between two checks of how much has come: uvloop reads 256 KB at once, which are 40,000 frames."""
 MOST_AHEAD = 64
 """Requests of a stream that wait for those before them: request and answer alternate, a late answer lets some wait."""
 MOST_EMPTY, SMALL_BYTES = 1000, 512
@@ -64,24 +66,26 @@ PRIVATE_OF_STREAMS = ("handle_cont", "handle_ping", "handle_pong")
 
 
 class TimedProtocol(HttpToolsProtocol):
-    """A connection that ends when one of its phases takes too long."""
+    """A connection that ends when one of its phases takes too long, and writes each reply at once."""
 
     _head_since: float | None = None  # since when a head is awaited; None while something else is
     _body_since = 0.0  # since when the request's body is awaited
     _timer: asyncio.TimerHandle | None = None
+    _replies: JoinedWrites
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first head."""
         super().connection_made(transport)
+        self._replies = JoinedWrites(transport)
         self._head_since = self.loop.time()
-        self._timer = self.loop.call_later(LOOK_S, self._look)
+        self._timer = self.loop.call_later(CHECK_PERIOD_S, self._check_phase)
         # The kernel ends the connection, whoever else still holds it: uvicorn's WebSockets, too.
         connection = transport.get_extra_info("socket")
         if connection is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1000))
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop looking."""
+        """Stop the timer."""
         self._stop()
         super().connection_lost(exc)
 
@@ -127,9 +131,12 @@ class TimedProtocol(HttpToolsProtocol):
             cycle.keep_alive = False
             if _has_body(cycle.scope):
                 app = _refuse_upgrade
+        if cycle.scope["method"] == "POST":  # of a HEAD there would be no body for its head to wait for
+            self._replies.head = None
+            cycle.transport = self._replies
         super()._start_asgi_task(cycle, app)
 
-    def _look(self) -> None:
+    def _check_phase(self) -> None:
         if self.transport.is_closing():
             return
         now, cycle = self.loop.time(), self.cycle
@@ -142,7 +149,7 @@ class TimedProtocol(HttpToolsProtocol):
         else:
             late = cycle.more_body and now - self._body_since > BODY_S
         if not late:
-            self._timer = self.loop.call_later(LOOK_S, self._look)
+            self._timer = self.loop.call_later(CHECK_PERIOD_S, self._check_phase)
             return
         if cycle is None or cycle.response_complete or not cycle.response_started:
             self.transport.write(LATE_REPLY)
@@ -177,7 +184,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
         super().handle_ping()
 
     def handle_pong(self, event: Frame) -> None:
-        """Take note of it."""
+        """Count it."""
         self._count()
         super().handle_pong(event)
 
@@ -229,7 +236,7 @@ async def _refuse_upgrade(_scope: Scope, _receive: Receive, send: Send) -> None:
 
 
 def install() -> None:
-    """Let uvicorn's servers of this process use it. Raises RuntimeError where uvicorn has become another."""
+    """Let uvicorn's servers of this process use it. Raises RuntimeError for another uvicorn than is known here."""
     if auto.AutoHTTPProtocol is TimedProtocol:
         return
     classes: dict[type, tuple[str, ...]] = {HttpToolsProtocol: PRIVATE, WebSocketsSansIOProtocol: PRIVATE_OF_STREAMS}

@@ -1,17 +1,16 @@
 """Middleware before Ray Serve's request handling: passes requests for actions straight to the application.
 
 Serve spends more on a request than a policy does: contexts, tasks, a request object, statistics, a line for its log. A
-request for actions needs none of it. How much a replica takes on is decided by `admission.py`, who may ask by
-`api_keys.py`, metrics and the log are ours, and a replica that is told to stop waits for its HTTP server, which waits
-for whoever is still being answered (ray 2.60). So the door passes such requests straight to the application, and
-everything else to Serve. Streams gain as well: Serve reads a WebSocket in a task of its own.
+request for actions needs none of it. How much a replica takes on is decided by `request_path.py`, who may ask by
+`request_checks.py`, metrics and the log are ours, and a replica that is told to stop waits for its HTTP server, which
+waits for whoever is still being answered (ray 2.60). So such requests go straight to the application, and everything
+else to Serve. Streams gain as well: Serve reads a WebSocket in a task of its own.
 
-It turns such requests away, too, while the replica has more than it takes on. In Serve's proxies, and in a replica
-whose application runs in another event loop than its HTTP server, the door lets everybody through to Serve.
+Such requests are refused, too, while the replica has more than it takes on. In Serve's proxies, and in a replica whose
+application runs in another event loop than its HTTP server, everything goes to Serve.
 
 Serve watches every HTTP request for the client hanging up, so that long work can be cancelled. The header
-`x-request-disconnect-disabled` is its switch for that (ray 2.60), worth two asyncio tasks a request. Replies leave in
-one write (`joined_writes.py`).
+`x-request-disconnect-disabled` is its switch for that (ray 2.60), worth two asyncio tasks a request.
 
 `RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH=rlservo.serve_app.ray_serve.ingress:middlewares` puts it in place. It is
 imported by Serve's proxies as well, so it imports little.
@@ -20,21 +19,13 @@ imported by Serve's proxies as well, so it imports little.
 from __future__ import annotations
 
 import asyncio
-import itertools
-import logging
-import secrets
-from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 from starlette.middleware import Middleware
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from rlservo.serve_app.ray_serve import closed_endpoints, http_connections, loopback_ports
-from rlservo.serve_app.ray_serve.joined_writes import join_writes
 from rlservo.serve_app.server.request_checks import mend_headers
-from rlservo.serve_app.server.request_log import FIELDS
-
-logger = logging.getLogger(__name__)
 
 FULL = b'{"error":"this replica has as many requests as it takes on: try again shortly","code":"over-capacity"}'
 TURNED_AWAY = (
@@ -47,44 +38,47 @@ NOT_FOUND = (
     (b"content-length", b"%d" % len(closed_endpoints.NOTHING)),
 )
 NO_WATCH = (b"x-request-disconnect-disabled", b"?1")
-REQUEST_ID = b"x-request-id"
 
 
 class Application(Protocol):
-    """Answers the requests that need nothing of what Serve does."""
+    """Answers the connections that need nothing of what Serve does."""
 
-    def takes(self, scope: Scope) -> bool:
-        """Whether this is one of them."""
+    def find_ahead(self, scope: Scope) -> Any | None:
+        """Return the route of such a connection, None for every other."""
         ...
 
-    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer it."""
+    def admit_ahead(self) -> bool:
+        """Return whether one more request may be read; if not, count it as turned away."""
+        ...
+
+    async def answer_ahead(self, match: Any, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer by the route that was found."""
         ...
 
 
-class Door:
-    """What this process puts before Serve's handling; the replica sets it up, in a proxy it stays as it is here."""
+class ServeBypass:
+    """The application of this process, where it is a replica's."""
 
     def __init__(self) -> None:
-        """Leave everything to Serve."""
-        self.app: Application | None = None
-        self.ahead = False
-        self.has_room: Callable[[], bool] = lambda: True
+        """Leave everything to Serve, as in a proxy."""
+        self._app: Application | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
+        self.answers = False
 
-    def open(self, app: Application, has_room: Callable[[], bool], *, ahead: bool = True) -> None:
-        """From now on turn away, of what `app` takes, what there is no room for; let it answer the rest, if `ahead`.
+    def install(self, app: Application, *, answers: bool = True) -> None:
+        """From now on, in this event loop, refuse what there is no room for, and let `app` answer, if it `answers`."""
+        self._app, self._loop, self.answers = app, asyncio.get_running_loop(), answers
 
-        In this event loop.
-        """
-        self.app, self.ahead, self.has_room, self._loop = app, ahead, has_room, asyncio.get_running_loop()
+    def find(self, scope: Scope) -> tuple[Application, Any] | None:
+        """Return (application, route) for a connection that it answers, None for all that Serve handles."""
+        app = self._app
+        if app is None or asyncio.get_running_loop() is not self._loop:
+            return None
+        match = app.find_ahead(scope)
+        return None if match is None else (app, match)
 
-    def takes(self, scope: Scope) -> bool:
-        """Whether this is for the application to answer."""
-        return self.app is not None and asyncio.get_running_loop() is self._loop and self.app.takes(scope)
 
-
-door = Door()
+bypass = ServeBypass()
 
 
 class Ingress:
@@ -95,22 +89,16 @@ class Ingress:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         http = scope["type"] == "http"
-        taken = door.takes(scope)
-        if taken and http and not door.has_room():
-            await send({"type": "http.response.start", "status": 503, "headers": list(TURNED_AWAY)})
-            await send({"type": "http.response.body", "body": FULL})
-            return
-        if http and scope["method"] == "POST":
-            join_writes(send)
-        if taken and door.ahead:
-            assert door.app is not None
-            request_id = _identify(scope)
-            try:
-                await door.app.answer(scope, receive, _with_id(request_id, send) if http else send)
-            except Exception:  # a bug outside what the application guards; Serve keeps uvicorn from logging it
-                logger.exception("a request failed", extra={FIELDS: {"request_id": request_id.decode("latin-1")}})
-                raise
-            return
+        found = bypass.find(scope)
+        if found is not None:
+            app, match = found
+            if http and not app.admit_ahead():
+                await send({"type": "http.response.start", "status": 503, "headers": list(TURNED_AWAY)})
+                await send({"type": "http.response.body", "body": FULL})
+                return
+            if bypass.answers:
+                await app.answer_ahead(match, scope, receive, send)
+                return
         headers = mend_headers(scope["headers"])
         if http:
             if closed_endpoints.is_closed(scope):
@@ -120,29 +108,6 @@ class Ingress:
             headers = [*headers, NO_WATCH]
         scope["headers"] = headers
         await self._app(scope, receive, send)
-
-
-def _identify(scope: Scope) -> bytes:
-    """Return the request's id, the client's or a new one, which the request then has: what Serve would have done."""
-    for name, value in scope["headers"]:
-        if name == REQUEST_ID:
-            return bytes(value)
-    request_id = b"%s-%x" % (PROCESS, next(numbers))
-    scope["headers"] = [*scope["headers"], (REQUEST_ID, request_id)]
-    return request_id
-
-
-def _with_id(request_id: bytes, send: Send) -> Send:
-    async def send_with_id(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            message["headers"] = [*message["headers"], (REQUEST_ID, request_id)]
-        await send(message)
-
-    return send_with_id
-
-
-PROCESS = secrets.token_hex(8).encode()
-numbers = itertools.count(1)
 
 
 def middlewares() -> list[Middleware]:

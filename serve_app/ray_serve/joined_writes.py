@@ -5,7 +5,7 @@ uvicorn writes the two one after the other, so the proxy, and then the client, m
 it sleeps again: written one after the other at the end of the turn, they are one wake-up. A single caller does not wait
 for that: replies are held back only when the turn before had several.
 
-It relies on uvicorn's own object for a request (0.54); where it finds another, replies are written as before.
+`http_connections.py` gives each connection one, and begins it anew with each request.
 """
 
 from __future__ import annotations
@@ -14,18 +14,8 @@ import asyncio
 import threading
 from typing import Any
 
-from starlette.types import Send
-
 MOST_HELD = 16  # replies: the first of them waits for the last
 INFORMATIONAL = b"HTTP/1.1 1"  # 100 Continue: the client waits for it before it sends the body
-
-
-def join_writes(send: Send) -> None:
-    """Make the reply behind `send` one write. Not for HEAD: there is no body for its head to wait for."""
-    cycle = getattr(send, "__self__", None)
-    transport = getattr(cycle, "transport", None)
-    if transport is not None:
-        cycle.transport = JoinedWrites(transport)  # type: ignore[union-attr]  # it has the attribute
 
 
 class Turn(threading.local):
@@ -69,22 +59,23 @@ turn = Turn()
 
 
 class JoinedWrites:
-    """One reply's transport: holds the head back until the first piece of the body, and writes both at once."""
+    """A connection's transport for replies: holds the head until the first piece of the body, writes both at once."""
 
-    __slots__ = ("_head", "_transport")
+    __slots__ = ("_transport", "head")
 
     def __init__(self, transport: Any) -> None:
         self._transport = transport
-        self._head: bytes | None = None  # None before the head, empty after it
+        self.head: bytes | None = None
+        """The reply's head, while it is held: None before it came (set so to begin a reply), empty once written."""
 
     def write(self, data: bytes) -> None:
         """Write, or hold the head."""
-        head = self._head
+        head = self.head
         if head:
-            self._head = b""
+            self.head = b""
             turn.write(self._transport, head + data)
         elif head is None and not data.startswith(INFORMATIONAL):
-            self._head = data
+            self.head = data
         else:
             if data:
                 turn.flush()  # what comes before this may be held
@@ -93,9 +84,9 @@ class JoinedWrites:
     def close(self) -> None:
         """Write what is held and close."""
         turn.flush()
-        if self._head:
-            self._transport.write(self._head)
-            self._head = b""
+        if self.head:
+            self._transport.write(self.head)
+            self.head = b""
         self._transport.close()
 
     def __getattr__(self, name: str) -> Any:

@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import queue
-import re
 import secrets
 import signal
 import subprocess
@@ -26,10 +25,11 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.contract.errors import UnavailableError, UsageError
-from rlservo.serve_app.ray_serve import haproxy_wrapper as haproxy_script
 from rlservo.serve_app.ray_serve import loopback_ports
 from rlservo.serve_app.ray_serve.environment import ray_environment
-from rlservo.serve_app.ray_serve.processes import SERVER_LOG, check_port, describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
+from rlservo.serve_app.ray_serve.processes import check_port, describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, last_fault
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
@@ -42,11 +42,6 @@ logger = logging.getLogger(__name__)
 START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 30.0
 ENDED_S = 5.0  # from the end of a process's reports to its own
-# In Python's and Ray's logs: a level, an exception's last line, what a raylet's end is told as.
-FAULT = re.compile(
-    r"^(?:\[.*\] *)?(?:ERROR|CRITICAL|FATAL)\b|^\w[\w.]*(?:Error|Exception)\b|\bC? *Check failed\b|terminated\b"
-)
-COLOURS = re.compile(r"\x1b\[[\d;]*m")
 MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
@@ -54,8 +49,8 @@ STOP, STOP_NOW = "stop", "stop now"
 
 
 @dataclass(frozen=True)
-class Served:
-    """What `serve_policies` tells when requests are answered."""
+class RunningServer:
+    """Addresses and policies of a server that answers requests."""
 
     url: str
     policies: tuple[tuple[str, str], ...]  # (name, default version)
@@ -75,7 +70,7 @@ def serve_policies(
     served: Mapping[str, Any] | None = None,
     admin_key_file: Path | None = None,
     on_start: Callable[[], None] | None = None,
-    on_ready: Callable[[Served], None] | None = None,
+    on_ready: Callable[[RunningServer], None] | None = None,
     stop: threading.Event | None = None,
 ) -> None:
     """Serve the policies at or below `dirs` until Ctrl-C, SIGTERM or `stop`; return when everything is shut down.
@@ -86,15 +81,15 @@ def serve_policies(
     A second Ctrl-C ends everything at once. In the main thread this takes over SIGINT and SIGTERM (and SIGHUP, unless
     it is ignored, as under nohup) for as long as it runs; in another thread only `stop` ends it.
 
-    `on_start` is told when all that can be checked before has been. Raises UsageError or BundleError before that,
-    UnavailableError when the start fails.
+    `on_start` is called after all checks, before any process starts; `on_ready` when requests are answered. Raises
+    UsageError or BundleError before `on_start`, UnavailableError when the start fails.
     """
     if replicas < 1:
         raise UsageError(f"replicas must be 1 or more, got {replicas}")
     chosen = ServerSettings.from_environment(settings)
     paths = [str(Path(path).expanduser().absolute()) for path in dirs]
     _check_ray()
-    with contextlib.closing(load_served(paths, ServedConfig.read(served), chosen)) as store:
+    with contextlib.closing(load_served(paths, ServedConfig.parse(served), chosen)) as store:
         policies = tuple((name, store.default(name)) for name in store.names)
         if chosen.default_policy not in (None, *store.names):
             raise UsageError(
@@ -138,7 +133,7 @@ def serve_policies(
         _wait_ready(child, folder, events)
         if on_ready is not None:
             grpc = None if grpc_port is None else f"{_shown_host(host)}:{grpc_port}"
-            on_ready(Served(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc, key_file))
+            on_ready(RunningServer(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc, key_file))
         event = events.get()
         if isinstance(event, Mapping):
             cause = event.get("died") or _cause_of_end(child, folder)
@@ -164,7 +159,7 @@ def _wait_ready(child: subprocess.Popen[bytes], folder: Path, events: queue.Simp
         event = events.get(timeout=START_TIMEOUT_S)
     except queue.Empty:
         raise UnavailableError(
-            f"the server was not ready within {START_TIMEOUT_S:g} s: {_last_fault(folder)}"
+            f"the server was not ready within {START_TIMEOUT_S:g} s: {last_fault(folder / SERVER_LOG)}"
         ) from None
     if event in (STOP, STOP_NOW):
         raise KeyboardInterrupt
@@ -298,7 +293,7 @@ def _check_ray() -> None:
 
 def _haproxy_binary() -> str | None:
     """Return the HAProxy that Ray Serve would use, or None."""
-    return haproxy_script.find_binary() if importlib.util.find_spec("jinja2") is not None else None
+    return find_binary() if importlib.util.find_spec("jinja2") is not None else None
 
 
 def _shown_host(host: str) -> str:
@@ -311,14 +306,4 @@ def _cause_of_end(child: subprocess.Popen[bytes], folder: Path) -> str:
     """Return how the cluster's process ended, with the last fault in its log, if there is one."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         child.wait(ENDED_S)
-    return f"its main process {describe_end(child.poll())}; {_last_fault(folder)}"
-
-
-def _last_fault(folder: Path) -> str:
-    """Return the last line of the log that tells of a fault; most lines tell of what went well."""
-    with contextlib.suppress(OSError):
-        lines = (folder / SERVER_LOG).read_text(errors="replace").splitlines()
-        faults = [line.strip() for line in lines if FAULT.search(line)]
-        if faults:
-            return f"its log says: {COLOURS.sub('', faults[-1])[:500]}"
-    return "its log tells of no fault"
+    return f"its main process {describe_end(child.poll())}; {last_fault(folder / SERVER_LOG)}"

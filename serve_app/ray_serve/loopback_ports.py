@@ -2,9 +2,9 @@
 
 A server of one machine needs one port that others reach: HAProxy's, or without HAProxy that of Serve's own proxy. Serve
 (ray 2.60) binds the replicas' HTTP ports and the fallback proxy's where the public port is, and gRPC ports to every
-interface, whatever it is told. `rlservo serve` sets the variable; a cluster of several machines cannot have it, since
-its machines ask each other. Ray's own ports follow the node's address, which `launcher.py` and `cluster_process.py`
-set.
+interface, whatever its options say. `rlservo serve` sets the variable; a cluster of several machines cannot have it,
+since its machines ask each other. Ray's own ports follow the node's address, which `launcher.py` and
+`cluster_process.py` set.
 
 Serve calls `ingress.middlewares` in each process before it binds anything, and that calls `install`.
 """

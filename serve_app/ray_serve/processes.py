@@ -3,7 +3,6 @@
 Every process of a launch inherits one environment variable with the launch's own mark, and the session of the launch's
 first process, so that whatever is left of it can be found and ended whatever became of its parents. It takes both:
 Ray's workers write their title over the memory that held their environment, and whoever wants to may leave a session.
-Reads /proc (Linux).
 """
 
 from __future__ import annotations
@@ -18,17 +17,15 @@ import socket
 import time
 from pathlib import Path
 
+import psutil
+
 from rlservo.export.contract.errors import UnavailableError, UsageError
 
 MARK = "RLSERVO_LAUNCH"
-SERVER_LOG = "server.log"
-KEPT_BYTES = 4096  # of a log that is cut
-LOG_BYTES = 4 << 20  # [bytes] of this log, and of each log of Ray's
-PROC = Path("/proc")
 # Where `free_ports` looks: above those Ray gives its workers, below those of replicas (`launcher.py`, 30000 and up)
 # and those of outgoing connections (Linux: 32768 and up).
 PORTS = range(20_000, 30_000)
-QUIET_S = 0.3  # without a sign of a marked process, before the last of them counts as gone
+QUIET_S = 0.3  # without any marked process, before the last of them counts as gone
 
 
 def check_port(host: str, port: int) -> None:
@@ -72,27 +69,18 @@ def _why_not(host: str, port: int, error: OSError) -> str:
 
 def _is_orphan(pid: int) -> bool:
     """Return whether no Ray is left among the process's ancestors, so that it serves nobody."""
-    with contextlib.suppress(OSError):
-        while pid > 1:
-            if (PROC / str(pid) / "comm").read_text().startswith(("raylet", "ray::")):
-                return False
-            pid = int((PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()[1])
+    with contextlib.suppress(psutil.Error):
+        return not any(parent.name().startswith(("raylet", "ray::")) for parent in psutil.Process(pid).parents())
     return True
 
 
 def port_holder(port: int) -> tuple[int, str] | None:
-    """Return (pid, command name) of a process listening on a TCP port, where /proc shows it to this user."""
-    inodes: set[str] = set()
-    for table in ("net/tcp", "net/tcp6"):
-        with contextlib.suppress(OSError):
-            for line in (PROC / table).read_text().splitlines()[1:]:
-                fields = line.split()
-                if fields[3] == "0A" and int(fields[1].rsplit(":", 1)[1], 16) == port:  # 0A: LISTEN
-                    inodes.add(f"socket:[{fields[9]}]")
-    for pid in _pids():
-        with contextlib.suppress(OSError):
-            if any(str(link.readlink()) in inodes for link in (PROC / str(pid) / "fd").iterdir()):
-                return pid, (PROC / str(pid) / "comm").read_text().strip()
+    """Return (pid, command name) of a process that listens on a TCP port, where the system shows it to this user."""
+    for connection in psutil.net_connections("tcp"):
+        is_there = connection.status == psutil.CONN_LISTEN and connection.laddr and connection.laddr.port == port
+        if is_there and connection.pid is not None:
+            with contextlib.suppress(psutil.Error):
+                return connection.pid, psutil.Process(connection.pid).name()
     return None
 
 
@@ -127,38 +115,29 @@ def is_free(port: int) -> bool:
     return True
 
 
-def marked(mark: str, session: int | None = None) -> list[int]:
+def find_marked(mark: str, session: int | None = None) -> list[int]:
     """Return the living processes, other than this one, that carry the launch's mark or belong to its session."""
-    wanted = f"{MARK}={mark}".encode()
     found = []
-    for pid in _pids():
-        if pid == os.getpid():
-            continue
-        with contextlib.suppress(OSError):
-            # A zombie's environment reads as empty: it is gone but for its parent's notice.
-            has_mark = wanted in (PROC / str(pid) / "environ").read_bytes().split(b"\0")
-            if has_mark or (session is not None and _session_of_living(pid) == session):
-                found.append(pid)
+    for process in psutil.process_iter():
+        # What is not ours is not shown; a zombie is gone but for its parent's notice.
+        with contextlib.suppress(psutil.Error, ProcessLookupError):
+            if process.pid == os.getpid() or process.status() == psutil.STATUS_ZOMBIE:
+                continue
+            if process.environ().get(MARK) == mark or os.getsid(process.pid) == session:
+                found.append(process.pid)
     return found
 
 
-def _session_of_living(pid: int) -> int | None:
-    """Return the process's session id, None for a zombie."""
-    # After the command in parentheses, which may hold anything: state, parent, group, session.
-    state, _, _, session, *_ = (PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
-    return None if state == "Z" else int(session)
-
-
 def end_marked(mark: str, session: int | None = None, *, timeout_s: float = 10.0) -> list[int]:
-    """Kill every process of the launch (see `marked`), and those they start meanwhile; return what would not go."""
+    """Kill what `find_marked` finds, and what that starts meanwhile; return what would not go."""
     deadline = time.monotonic() + timeout_s
     quiet_since: float | None = None
     while time.monotonic() < deadline:
-        left = marked(mark, session)
+        left = find_marked(mark, session)
         for pid in left:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.kill(pid, signal.SIGKILL)
-        # One empty look proves nothing: in the middle of an exec a process shows no environment at all.
+        # One empty result proves nothing: in the middle of an exec a process shows no environment at all.
         if left:
             quiet_since = None
         elif quiet_since is None:
@@ -166,7 +145,7 @@ def end_marked(mark: str, session: int | None = None, *, timeout_s: float = 10.0
         elif time.monotonic() - quiet_since >= QUIET_S:
             return []
         time.sleep(0.05)
-    return marked(mark, session)
+    return find_marked(mark, session)
 
 
 def describe_end(returncode: int | None) -> str:
@@ -180,19 +159,6 @@ def describe_end(returncode: int | None) -> str:
     return f"was ended by signal {-returncode}"
 
 
-def cut_log(file: Path, max_bytes: int = LOG_BYTES) -> None:
-    """Empty a log that has grown beyond its bound, but for its last lines; whoever writes it appends."""
-    with contextlib.suppress(OSError):
-        if file.stat().st_size <= max_bytes:
-            return
-        with file.open("rb+") as log:
-            log.seek(-KEPT_BYTES, os.SEEK_END)
-            kept = log.read().partition(b"\n")[2]
-            log.truncate(0)
-        with file.open("ab") as log:
-            log.write(kept)
-
-
 def remove_folder(folder: Path, *, timeout_s: float = 5.0) -> None:
     """Remove a folder that processes just ended, or another cleaner, may be touching a last time."""
     deadline = time.monotonic() + timeout_s
@@ -200,10 +166,3 @@ def remove_folder(folder: Path, *, timeout_s: float = 5.0) -> None:
         shutil.rmtree(folder, ignore_errors=True)
         if folder.exists():
             time.sleep(0.05)
-
-
-def _pids() -> list[int]:
-    try:
-        return [int(entry.name) for entry in PROC.iterdir() if entry.name.isdigit()]
-    except OSError:
-        return []

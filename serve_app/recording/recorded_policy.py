@@ -6,12 +6,10 @@ import time
 import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from typing_extensions import Self
 
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError
@@ -21,7 +19,7 @@ from rlservo.serve_app.recording.recorder import Recorder
 from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
 
 
-class WithRecording:
+class WithRecording(ActingPolicy):
     """A policy that records what it sees and does; `outcome` adds what only the control loop knows.
 
     ```python
@@ -119,12 +117,15 @@ class WithRecording:
             final_obs=None if final_obs is None else _copy(final_obs),
         )
 
-    def commanded(self, action: Any) -> None:
-        """Record what the robot was commanded instead of the last action."""
+    def set_last_action(self, action: Any) -> None:
+        """Record what the robot was commanded instead of the last action, and pass it on to a client."""
+        self.record_command(action)
+        if hasattr(self._policy, "set_last_action"):
+            self._policy.set_last_action(action)
+
+    def record_command(self, action: Any) -> None:
+        """Record what the robot was commanded instead of the last action, and tell nobody."""
         self._add_outcome(commanded=_copy(action))
-        passed_on = getattr(self._policy, "commanded", None)
-        if passed_on is not None and self._source is not self._policy:
-            passed_on(action)
 
     def begin(self) -> None:
         """Begin an episode of the recording, and of nothing else."""
@@ -144,14 +145,6 @@ class WithRecording:
         """End the recording and close the policy."""
         self.end()
         self._policy.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _known_format(self, has_acted: bool) -> PolicyFormat | None:
         """Return the policy's format; None before a server has told its contract."""
@@ -175,10 +168,8 @@ class WithRecording:
         reply = getattr(self._source, "last_reply", None)  # of a client
         if isinstance(reply, Mapping) and record.action is not None:
             record.seq, record.warnings = reply.get("seq"), reply.get("warnings") or ()
-        notices = getattr(self._source, "notices", None)  # of a policy in process
-        if notices:
-            record.warnings = tuple(notices)
-            notices.clear()
+        elif record.action is not None:
+            record.warnings = getattr(self._source, "last_notices", ())  # of a policy in process
 
     def _add_outcome(self, **fields: Any) -> None:
         if self._format is not None and self._step:

@@ -18,13 +18,11 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
-
-from typing_extensions import Self
 
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UsageError, first_line
+from rlservo.serve_app.interface import Closeable
 from rlservo.serve_app.recording.log_file import LogFile
 from rlservo.serve_app.recording.policy_format import PolicyFormat
 from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
@@ -42,7 +40,7 @@ YIELD_EVERY = 8  # records written at a stretch before other threads get the int
 WAIT_S = 10.0  # for the writer to finish at close
 
 
-class Recorder:
+class Recorder(Closeable):
     """Writes records to one file, or to a folder of files that rotate.
 
     ```python
@@ -132,14 +130,6 @@ class Recorder:
         self._closing.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(WAIT_S)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _run(self) -> None:
         flushed = time.monotonic()

@@ -87,7 +87,7 @@ class Follower:
 
     def _follow(self, episode: Episode) -> Followed:
         policy = self._policy_of(episode.policy)
-        if not policy.episodic and all(tensor.name != REWARD for tensor in policy.contract.inputs):
+        if not policy.is_stateful and all(tensor.name != REWARD for tensor in policy.contract.inputs):
             at_once = _follow_at_once(policy, episode)
             if at_once is not None:
                 return at_once
@@ -98,7 +98,7 @@ class Follower:
         inputs: NDArray[Any] | None = None
         key = (id(episode.policy), episode.id)
         before, last = (None, None) if episode.begins else self._carried.pop(key, (None, None))
-        if policy.episodic:
+        if policy.is_stateful:
             end = _end_of_memory(episode, before, last)
             known[end:] = False
         rewarded = any(tensor.name == REWARD for tensor in policy.contract.inputs)
@@ -114,7 +114,7 @@ class Follower:
                     answer = policy.follow(obs, done, before=before, last=last, reward=reward)
                 except ActionError:
                     known[row], unsafe[row] = False, True
-                    if policy.episodic:  # what it would remember then is not known either
+                    if policy.is_stateful:  # what it would remember then is not known either
                         known[row + 1 :] = False
                     continue
                 for name, leaf in answer.leaves.items():
@@ -123,7 +123,7 @@ class Follower:
                     inputs = np.zeros((rows, answer.inputs.shape[1]), answer.inputs.dtype) if inputs is None else inputs
                     inputs[row] = answer.inputs[0]
                 before = answer.state or None
-            if policy.limited and moved[row]:
+            if policy.has_step_limit and moved[row]:
                 last = done
         if episode.goes_on:
             self._carried[key] = (before, last)

@@ -1,13 +1,12 @@
 """Control loop: drive a Gymnasium environment with a policy, report success, return and latency.
 
-The policy is anything that acts: in process or over HTTP. gymnasium is imported when a rollout starts. Success is what
-the environment's `info` says at an episode's end.
+The policy is anything that acts: in process or over HTTP. gymnasium is imported when a rollout starts.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,18 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlservo.export.contract.contract import REWARD
-from rlservo.export.contract.errors import RlservoError, UsageError
-from rlservo.serve_app.interface import ActingPolicy
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.interface import ActingPolicy, Observation
 from rlservo.serve_app.recording.start import record_policy
 from rlservo.serve_app.rollout.environment import check_fit, control_rate_of, make_env
+from rlservo.serve_app.rollout.episode import Episode, EpisodeEnv, run_episode
 from rlservo.serve_app.rollout.fallback import LinkCounts, StoppedError, WithFallback
 from rlservo.serve_app.rollout.report import EpisodeRow, Link, Rate, RolloutReport, summarise
-from rlservo.serve_app.rollout.video import VideoFile, rgb_frame
+from rlservo.serve_app.rollout.video import FilmedEnv, VideoFile
 
 if TYPE_CHECKING:
-    import gymnasium as gym
-
     from rlservo.serve_app.recording.recorded_policy import WithRecording
     from rlservo.serve_app.recording.recorder import Recorder
 
@@ -76,30 +74,39 @@ def rollout(
         check_fit(contract, env, arguments)
         control_rate_hz = control_rate_of(env, arguments, contract)
         if control_rate_hz is None and (rate == "real" or video is not None):
-            wanted = "rate 'real'" if rate == "real" else "a video"
+            purpose = "rate 'real'" if rate == "real" else "a video"
             raise UsageError(
-                f"{wanted} needs a control rate, and neither {env_id} (describe(), render_fps) nor the policy's "
+                f"{purpose} needs a control rate, and neither {env_id} (describe(), render_fps) nor the policy's "
                 "contract states one"
             )
-        recorded = None if record is None else record_policy(policy, record, wait=rate == "max")
-        if recorded is not None:
-            cleanup.callback(recorded.end)
-        loop = _Loop(
-            recorded or policy,
-            env,
-            recorded=recorded,
-            pacer=_Pacer(control_rate_hz if rate == "real" else None),
-            explore=explore,
-        )
+        pacer = _Pacer(control_rate_hz if rate == "real" else None)
+        recording = None
+        if record is not None:
+            recording = record_policy(policy, record, wait=rate == "max")
+            cleanup.callback(recording.end)
+        paced = _PacedPolicy(recording or policy, pacer)
+        video_file = None
         if video is not None and control_rate_hz is not None:
-            loop.video = cleanup.enter_context(VideoFile(video, fps=control_rate_hz))
+            video_file = cleanup.enter_context(VideoFile(video, fps=control_rate_hz))
         rows: list[EpisodeRow] = []
         interrupted, stopped = False, None
         began = time.perf_counter()
         try:
             for index in range(episodes):
-                filmed = video is not None and index < video_episodes
-                row = loop.run(index, None if seed is None else seed + index, filmed=filmed)
+                first = len(paced.latencies_s)
+                loop_env: EpisodeEnv = env
+                if video_file is not None and index < video_episodes:
+                    loop_env = FilmedEnv(env, video_file.add)
+                if recording is not None:
+                    loop_env = _RecordedEnv(loop_env, recording)
+                episode = run_episode(
+                    loop_env,
+                    paced,
+                    index=index,
+                    seed=None if seed is None else seed + index,
+                    explore=explore,
+                )
+                row = _row(episode, paced.latencies_s[first:])
                 rows.append(row)
                 if on_episode is not None:
                     on_episode(row)
@@ -110,7 +117,7 @@ def rollout(
         wall_s = time.perf_counter() - began
     return summarise(
         rows,
-        loop.latencies_s,
+        paced.latencies_s,
         env_id=env_id,
         policy=contract.name,
         version=contract.version,
@@ -120,8 +127,8 @@ def rollout(
         interrupted=interrupted,
         wall_s=wall_s,
         control_rate_hz=control_rate_hz,
-        overruns=loop.pacer.overruns,
-        video=str(video) if loop.video is not None and loop.video.frames else None,
+        overruns=pacer.overruns,
+        video=str(video_file.path) if video_file is not None and video_file.frames else None,
         link=_link_of(policy),
         stopped=stopped,
     )
@@ -146,125 +153,86 @@ def _link_of(policy: ActingPolicy) -> Link | None:
     )
 
 
-@dataclass
 class _Pacer:
     """Keeps a loop at `rate_hz`; None lets it run as fast as it can."""
 
-    rate_hz: float | None
-    overruns: int = 0
-    _due: float = 0.0
+    def __init__(self, rate_hz: float | None) -> None:
+        self.rate_hz = rate_hz
+        self.overruns = 0
+        self._due: float | None = None
 
-    def start(self) -> None:
-        """Begin the schedule: the first step runs now, the second is due one period from now."""
-        if self.rate_hz is not None:
-            self._due = time.perf_counter() + 1 / self.rate_hz
+    def restart(self) -> None:
+        """Begin the schedule anew: the next step runs at once, and the others follow from it."""
+        self._due = None
 
     def wait(self) -> None:
-        """Sleep until the next step is due. When it already was, count an overrun and return at once."""
+        """Sleep until the step is due. When it already was, count an overrun and return at once."""
         if self.rate_hz is None:
             return
-        late = time.perf_counter() - self._due
+        now = time.perf_counter()
+        if self._due is None:
+            self._due = now
+        delay_s = now - self._due
         periods = 1
-        if late <= 0:
-            time.sleep(-late)
-        else:
+        if delay_s < 0:
+            time.sleep(-delay_s)
+        elif delay_s > 0:
             self.overruns += 1
-            periods += int(late * self.rate_hz)  # whole periods gone by are skipped, never caught up in a burst
+            periods += int(delay_s * self.rate_hz)  # whole periods gone by are skipped, never caught up in a burst
         self._due += periods / self.rate_hz  # from the schedule, not from now: that would drift
 
 
 @dataclass
-class _Loop:
-    """The parts of a run, and the time every `act` took [s]."""
+class _PacedPolicy:
+    """A policy whose `act` waits for its turn, and the time every `act` took [s]."""
 
     policy: ActingPolicy
-    env: gym.Env[Any, Any]
     pacer: _Pacer
-    explore: bool
-    recorded: WithRecording | None = None
-    video: VideoFile | None = None
     latencies_s: list[float] = field(default_factory=list)
 
-    def run(self, index: int, seed: int | None, *, filmed: bool) -> EpisodeRow:
-        """Run one episode: observe, act, step, until the environment ends it."""
-        rewarded = any(tensor.name == REWARD for tensor in self.policy.contract.inputs)
-        draws = np.random.default_rng(seed)  # one seed per exploring action; unused otherwise
-        self.policy.reset()
-        obs = self._in_env(index, 0, self.env.reset, seed=seed)[0]
-        self._film(filmed)
-        steps, total, reward = 0, 0.0, 0.0
-        first = len(self.latencies_s)
-        self.pacer.start()
-        while True:
-            seeded = int(draws.integers(2**31)) if self.explore else None
-            action = self._act(obs, index, steps, seeded, {REWARD: float(reward)} if rewarded else {})
-            command = _command(action)
-            obs, reward, terminated, truncated, info = self._in_env(index, steps, self.env.step, command)
-            self._film(filmed)
-            steps, total = steps + 1, total + float(reward)
-            if self.recorded is not None:
-                ends = bool(terminated or truncated)
-                self.recorded.outcome(
-                    reward,
-                    terminated=terminated,
-                    truncated=truncated,
-                    final_status=_final_status(info) if ends else None,
-                    final_obs=obs if ends else None,
-                )
-            if terminated or truncated:
-                break
-            self.pacer.wait()
-        latencies = 1e3 * np.array(self.latencies_s[first:])
-        return EpisodeRow(
-            index=index,
-            seed=seed,
-            steps=steps,
-            episode_return=total,
-            success=success_of(info),
-            final_status=_final_status(info),
-            latency_p50_ms=float(np.median(latencies)),
-            latency_max_ms=float(latencies.max()),
-        )
+    @property
+    def contract(self) -> Contract:
+        return self.policy.contract
 
-    def _act(self, obs: Any, index: int, step: int, seed: int | None, earned: Mapping[str, float]) -> Any:
+    def act(self, obs: Observation, **options: Any) -> Any:
+        self.pacer.wait()
         began = time.perf_counter()
-        try:
-            # Only a policy that was trained to see its reward takes one.
-            action = self.policy.act(obs, explore=self.explore, seed=seed, **earned)
-        except RlservoError as error:
-            raise type(error)(f"episode {index}, step {step}: {error.message}", error.details) from error
+        action = self.policy.act(obs, **options)
         self.latencies_s.append(time.perf_counter() - began)
         return action
 
-    def _in_env(self, index: int, step: int, call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-        try:
-            return call(*arguments, **named)
-        except Exception as error:  # an environment is anyone's code
-            raise UsageError(
-                f"episode {index}, step {step}: the environment failed with {type(error).__name__}: {error}"
-            ) from error
-
-    def _film(self, filmed: bool) -> None:
-        if filmed and self.video is not None:
-            self.video.add(rgb_frame(self.env))
+    def reset(self) -> None:
+        self.policy.reset()
+        self.pacer.restart()
 
 
-def _command(action: Any) -> Any:
-    """A choice is a plain number to most environments; a nested action has such parts."""
-    if isinstance(action, dict):
-        return {key: _command(part) for key, part in action.items()}
-    if isinstance(action, tuple):
-        return tuple(_command(part) for part in action)
-    return int(action) if action.ndim == 0 and action.dtype.kind in "iu" else action
+@dataclass
+class _RecordedEnv:
+    """An environment whose rewards and ends are recorded as what the last action brought."""
+
+    env: EpisodeEnv
+    recording: WithRecording
+
+    def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.env.reset(seed=seed)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        result = self.env.step(action)
+        obs, reward, terminated, truncated, info = result
+        is_over = bool(terminated or truncated)
+        status = info.get("final_status") if is_over else None
+        self.recording.outcome(
+            reward,
+            terminated=terminated,
+            truncated=truncated,
+            final_status=None if status is None else str(status),
+            final_obs=obs if is_over else None,
+        )
+        return result
 
 
-def _final_status(info: Mapping[str, Any]) -> str | None:
-    return None if info.get("final_status") is None else str(info["final_status"])
-
-
-def success_of(info: Mapping[str, Any]) -> bool | None:
-    """Return what an episode's last `info` says of success: `is_success`, else `final_status`, else None."""
-    if info.get("is_success") is not None:
-        return bool(info["is_success"])
-    status = info.get("final_status")
-    return None if status is None else status == "success"
+def _row(episode: Episode, latencies_s: Sequence[float]) -> EpisodeRow:
+    latencies = 1e3 * np.array(latencies_s)
+    return EpisodeRow(
+        **vars(episode), latency_p50_ms=float(np.median(latencies)), latency_max_ms=float(latencies.max())
+    )

@@ -42,8 +42,8 @@ def control_rate_of(env: gym.Env[Any, Any], arguments: Mapping[str, Any], contra
 
     `render_fps` comes last because in Gymnasium's own environments it is a wish about videos (Pendulum: 30 at 20 Hz).
     """
-    stated = _described(env, arguments).get("control_rate_hz")
-    for candidate in (stated, contract.control_rate_hz, env.unwrapped.metadata.get("render_fps")):
+    described_hz = _description(env, arguments).get("control_rate_hz")
+    for candidate in (described_hz, contract.control_rate_hz, env.unwrapped.metadata.get("render_fps")):
         if candidate:
             return float(candidate)
     return None
@@ -55,13 +55,14 @@ def check_fit(contract: Contract, env: gym.Env[Any, Any], arguments: Mapping[str
     The observation must have the same shape, kind of number and, where both name them, elements; the action the same
     bounds as well, since the policy scales to them.
     """
-    described = _described(env, arguments)
+    description = _description(env, arguments)
     sides = (
         ("observation", contract.observation_space, env.observation_space),
         ("action", contract.action_space, env.action_space),
     )
     for side, expected, actual in sides:
-        difference = _difference(expected, actual, bounds=side == "action") or _misnamed(expected, described.get(side))
+        difference = _difference(expected, actual, bounds=side == "action")
+        difference = difference or _name_difference(expected, description.get(side))
         if difference:
             name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
             raise UsageError(f"policy {contract.name!r} does not fit {name}: the {side} {difference}")
@@ -127,16 +128,16 @@ def _nested_difference(expected: DictSpec | TupleSpec, actual: gym.Space[Any], *
     return None
 
 
-def _misnamed(expected: SpaceSpec, described: Any) -> str | None:
-    if not isinstance(described, list | tuple) or len(described) != len(expected.elements):
+def _name_difference(expected: SpaceSpec, elements: Any) -> str | None:
+    if not isinstance(elements, list | tuple) or len(elements) != len(expected.elements):
         return None
-    for index, (ours, theirs) in enumerate(zip(expected.elements, described, strict=True)):
+    for index, (ours, theirs) in enumerate(zip(expected.elements, elements, strict=True)):
         if ours.name != theirs["name"]:
             return f"element {index} is {theirs['name']!r} there, the policy has {ours.name!r}"
     return None
 
 
-def _described(env: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+def _description(env: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return what the environment class says of itself, if it does: element names and the control rate."""
     describe = getattr(type(env.unwrapped), "describe", None)
     if describe is None:

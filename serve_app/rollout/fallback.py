@@ -10,13 +10,12 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
-from typing_extensions import Self
 
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import (
@@ -53,7 +52,7 @@ class LinkCounts:
     fallback: int = 0  # steps that got the fallback's action
 
 
-class WithFallback:
+class WithFallback(ActingPolicy):
     """A policy that always has an action in time, for as long as what it wraps keeps its deadline.
 
     ```python
@@ -74,16 +73,16 @@ class WithFallback:
         """
         self._policy = policy
         self._fallback = fallback
-        self._given: Any = None
+        self._constant: Any = None
         if not isinstance(fallback, str):
-            self._given = _checked(policy.contract, fallback)
+            self._constant = _parse_action(policy.contract, fallback)
         elif fallback == "zero":
-            self._given = _zero(policy.contract)
+            self._constant = _zero(policy.contract)
         elif fallback not in ("hold", "stop"):
             raise UsageError(f"fallback {fallback!r} does not exist: expected hold, zero, stop or an action")
         self._on_fallback = on_fallback
         self._last: Any = None
-        self._said_at = -LOG_EVERY_S
+        self._logged_at = -LOG_EVERY_S
         self.counts = LinkCounts()
         self.failure: RlservoError | None = None
         """Why the last action is the fallback's; None where the policy gave it."""
@@ -126,7 +125,7 @@ class WithFallback:
                     self._count(error)
                     continue  # the robot has not been commanded yet, and what it sees has not changed
                 return self._fall_back(error)
-            self._last, self.failure = _copy(action), None  # a loop may write into what it got
+            self._last, self.failure = deepcopy(action), None  # a loop may write into what it got
             return action
         raise AssertionError("the last try returns or raises")
 
@@ -139,30 +138,22 @@ class WithFallback:
         """Close the wrapped policy."""
         self._policy.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def _fall_back(self, error: DeadlineError | UnavailableError | SessionLostError) -> Any:
         self._count(error)
         self.failure = error
         if self._fallback_is("stop"):
             raise StoppedError(f"stopped: {error.message}", error.details) from error
-        action = self._given if self._given is not None else self._last
+        action = self._constant if self._constant is not None else self._last
         if action is None:
             raise StoppedError(f"there is no action to hold yet: {error.message}", error.details) from error
         self.counts.fallback += 1
         now = time.monotonic()
-        if now - self._said_at >= LOG_EVERY_S:
-            self._said_at = now
+        if now - self._logged_at >= LOG_EVERY_S:
+            self._logged_at = now
             logger.warning("fallback (%s), %d times so far: %s", self.name, self.counts.fallback, error.message)
-        if isinstance(self._policy, _Told):  # a limit on the step counts from what the robot really does
-            self._policy.commanded(_copy(action))
-        return _copy(action)
+        if isinstance(self._policy, LastActionPolicy):  # a limit on the step counts from what the robot really does
+            self._policy.set_last_action(deepcopy(action))
+        return deepcopy(action)
 
     def _fallback_is(self, word: str) -> bool:
         return isinstance(self._fallback, str) and self._fallback == word
@@ -179,10 +170,10 @@ class WithFallback:
 
 
 @runtime_checkable
-class _Told(Protocol):
+class LastActionPolicy(Protocol):
     """A client whose server may remember the last action."""
 
-    def commanded(self, action: Any) -> None: ...
+    def set_last_action(self, action: Any) -> None: ...
 
 
 def _zero(contract: Contract) -> Any:
@@ -191,32 +182,26 @@ def _zero(contract: Contract) -> Any:
     if choice is not None:
         raise UsageError(f"{choice} of policy '{contract.name}' is a choice, of which zero is one: give an action")
     zeros = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
-    return _checked(contract, build_action(contract.action_space, zeros))
+    return _parse_action(contract, build_action(contract.action_space, zeros))
 
 
-def _checked(contract: Contract, action: Any) -> Any:
+def _parse_action(contract: Contract, action: Any) -> Any:
     """Return a given action as the space has it; raise UsageError where it is none."""
     space: SpaceSpec = contract.action_space
-    typed: dict[str, Any] = {}
+    leaves: dict[str, Any] = {}
     try:
-        for name, given in action_leaves(space, action).items():
+        for name, value in action_leaves(space, action).items():
             leaf = leaf_specs(space, "action")[name]
-            array = np.asarray(given)
+            array = np.asarray(value)
             low, high = leaf.bounds()
             cast = array.astype(leaf.dtype)
             inside = array.shape == leaf.shape and bool(((cast >= low) & (cast <= high)).all())
             if not inside or not np.isfinite(array).all() or not np.allclose(cast, array, rtol=1e-6):
                 raise UsageError(
-                    f"the fallback's {name} is {str(given)[:80]}: policy '{contract.name}' expects shape {leaf.shape} "
+                    f"the fallback's {name} is {str(value)[:80]}: policy '{contract.name}' expects shape {leaf.shape} "
                     f"within {leaf.bounds()[0].min():g} to {leaf.bounds()[1].max():g}"
                 )
-            typed[name] = cast
+            leaves[name] = cast
     except (RequestError, ValueError, TypeError) as error:
         raise UsageError(f"the fallback is no action of policy '{contract.name}': {error}") from error
-    return build_action(space, typed)
-
-
-def _copy(action: Any) -> Any:
-    if isinstance(action, dict):
-        return {key: _copy(part) for key, part in action.items()}
-    return tuple(_copy(part) for part in action) if isinstance(action, tuple) else action.copy()
+    return build_action(space, leaves)

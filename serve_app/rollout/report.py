@@ -11,19 +11,15 @@ from typing import Any, Literal
 import numpy as np
 from rich.table import Table
 
+from rlservo.serve_app.rollout.episode import Episode
+
 Rate = Literal["max", "real"]
 
 
 @dataclass(frozen=True)
-class EpisodeRow:
-    """One finished episode."""
+class EpisodeRow(Episode):
+    """One finished episode, and the time spent in its `act` calls."""
 
-    index: int
-    seed: int | None
-    steps: int
-    episode_return: float
-    success: bool | None  # None: the environment does not say
-    final_status: str | None
     latency_p50_ms: float
     latency_max_ms: float
 
@@ -109,7 +105,7 @@ def summarise(
     stopped: str | None = None,
 ) -> RolloutReport:
     """Return the report of what was recorded."""
-    judged = [row.success for row in rows if row.success is not None]
+    outcomes = [row.success for row in rows if row.success is not None]
     returns = np.array([row.episode_return for row in rows])
     deadline_s = None if control_rate_hz is None else 1 / control_rate_hz
     return RolloutReport(
@@ -121,9 +117,9 @@ def summarise(
         requested_episodes=requested_episodes,
         interrupted=interrupted,
         episodes=tuple(rows),
-        successes=sum(judged) if judged else None,
-        success_rate=sum(judged) / len(judged) if judged else None,
-        success_interval=wilson_interval(sum(judged), len(judged)) if judged else None,
+        successes=sum(outcomes) if outcomes else None,
+        success_rate=sum(outcomes) / len(outcomes) if outcomes else None,
+        success_interval=wilson_interval(sum(outcomes), len(outcomes)) if outcomes else None,
         return_mean=float(returns.mean()) if rows else None,
         return_std=float(returns.std(ddof=1)) if len(rows) > 1 else None,
         length_mean=float(np.mean([row.steps for row in rows])) if rows else None,
@@ -167,9 +163,9 @@ def render_report(report: RolloutReport) -> Table:
     table = Table(title=f"{report.env_id}  <-  {version}", title_justify="left", show_header=False)
     table.add_column(style="bold")
     table.add_column()
-    done = len(report.episodes)
+    finished = len(report.episodes)
     note = "  (interrupted)" if report.interrupted else ""
-    table.add_row("episodes", f"{done} of {report.requested_episodes}{note}")
+    table.add_row("episodes", f"{finished} of {report.requested_episodes}{note}")
     if report.success_rate is not None and report.success_interval is not None:
         low, high = report.success_interval
         table.add_row("success", f"{report.success_rate:.1%}  (95% interval {low:.1%} to {high:.1%})")

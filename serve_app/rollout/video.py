@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from importlib import import_module
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import Self
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.interface import Closeable
+
+if TYPE_CHECKING:
+    import gymnasium as gym
 
 
-class VideoFile:
+class VideoFile(Closeable):
     """An mp4 file that grows frame by frame; nothing is created before the first one. A context manager."""
 
     def __init__(self, path: str | Path, *, fps: float) -> None:
@@ -49,22 +52,42 @@ class VideoFile:
             self._writer.close()
             self._writer = None
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+class FilmedEnv:
+    """An environment that gives `add` its picture after each reset and step, or after `steps` alone (0: the reset)."""
+
+    def __init__(
+        self, env: gym.Env[Any, Any], add: Callable[[NDArray[np.uint8]], object], steps: Collection[int] | None = None
     ) -> None:
-        self.close()
+        self._env = env
+        self._add = add
+        self._steps = steps
+        self._step = 0
+
+    def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
+        result = self._env.reset(seed=seed)
+        self._step = 0
+        self._draw()
+        return result
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        result = self._env.step(action)
+        self._step += 1
+        self._draw()
+        return result
+
+    def _draw(self) -> None:
+        if self._steps is None or self._step in self._steps:
+            self._add(rgb_frame(self._env))
 
 
-def rgb_frame(env: Any) -> NDArray[np.uint8]:
+def rgb_frame(env: gym.Env[Any, Any]) -> NDArray[np.uint8]:
     """Return `env.render()` as (height, width, 3) uint8.
 
     Raises UsageError when the environment cannot draw: no GL library, no display, or no `rgb_array` mode.
     """
     try:
-        frame = env.render()
+        frame: Any = env.render()
     except Exception as error:  # GL libraries raise ImportError, AttributeError, RuntimeError and mujoco.FatalError
         raise UsageError(
             f"the environment cannot draw a picture ({type(error).__name__}: {str(error)[:200]}). For MuJoCo without a "
@@ -72,6 +95,6 @@ def rgb_frame(env: Any) -> NDArray[np.uint8]:
         ) from error
     array = np.asarray(frame)
     if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
-        got = type(frame).__name__ if array.ndim == 0 else f"{array.dtype} {array.shape}"
-        raise UsageError(f"the environment's rgb_array picture is {got}, expected uint8 (height, width, 3)")
+        description = type(frame).__name__ if array.ndim == 0 else f"{array.dtype} {array.shape}"
+        raise UsageError(f"the environment's rgb_array picture is {description}, expected uint8 (height, width, 3)")
     return array

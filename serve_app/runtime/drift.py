@@ -32,7 +32,6 @@ class Drift:
         self.elements = elements
         self._mean = mean
         self._scale = 1.0 / np.maximum(std, SMALLEST_STD)
-        self._left = 1
         self.looks = 0
         self._shift = np.zeros(len(mean))
         self._square = np.zeros(len(mean))
@@ -51,12 +50,8 @@ class Drift:
         labels = names if len(set(names)) == space.size else [label for _, label in iter_elements(space)]
         return cls(tuple(labels), mean, std)
 
-    def see(self, obs: NDArray[Any]) -> None:
-        """Take note of checked observations `[batch, ...]`, or do not: only some are looked at."""
-        self._left -= 1
-        if self._left:
-            return
-        self._left = EVERY
+    def add(self, obs: NDArray[Any]) -> None:
+        """Count checked observations `[batch, ...]` in; a parser does so with one call in `EVERY`."""
         self.looks += 1
         z: NDArray[np.float64] = (obs[:ROWS].reshape(min(len(obs), ROWS), -1) - self._mean) * self._scale
         np.clip(z, -LARGEST, LARGEST, out=z)

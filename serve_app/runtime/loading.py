@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rlservo.export.contract.bundle import CONTRACT_FILE, CONTRACT_KEY, GOLDEN_FILE, ONNX_FILE, Bundle
 from rlservo.export.contract.contract import REWARD, Contract, embedded_contract
 from rlservo.export.contract.errors import BundleError, BundleTamperedError, GoldenMismatchError, first_line
-from rlservo.export.contract.onnx_session import open_session
+from rlservo.export.contract.ort_session import open_ort_session
 from rlservo.export.contract.scores import split_scores
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, LeafSpec, MultiDiscreteSpec, leaf_specs
 from rlservo.serve_app.runtime.exploration import distribution_size
@@ -35,9 +35,6 @@ ONNX_TYPES = {
 }  # fmt: skip
 
 Run = Callable[[list[str], dict[str, NDArray[Any]]], Any]
-
-
-# Loading: what must hold before a graph may act.
 
 
 def check_contract(bundle: Bundle) -> None:
@@ -114,18 +111,18 @@ def _quoted(names: Sequence[str]) -> str:
 def open_graph(bundle: Bundle, threads: int) -> onnxruntime.InferenceSession:
     with bundle.verified_copy(ONNX_FILE) as file:
         try:
-            return open_session(file, threads)
+            return open_ort_session(file, threads)
         except Exception as error:  # onnxruntime's own exceptions share no base but Exception
             sentence = first_line(error).replace(str(file), bundle.onnx.name)
             raise BundleError(f"{bundle.onnx} is not a graph onnxruntime can run: {sentence}") from error
 
 
-def check_graph(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
+def check_graph(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> None:
     """Compare the graph's inputs and outputs with the contract's."""
     contract = bundle.contract
     for side, listed, actual in (
-        ("inputs", contract.inputs, session.get_inputs()),
-        ("outputs", contract.outputs, session.get_outputs()),
+        ("inputs", contract.inputs, ort_session.get_inputs()),
+        ("outputs", contract.outputs, ort_session.get_outputs()),
     ):
         found = {node.name: node for node in actual}
         if set(found) != {tensor.name for tensor in listed}:
@@ -151,9 +148,9 @@ def check_graph(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
                 )
 
 
-def check_copy(bundle: Bundle, session: onnxruntime.InferenceSession) -> None:
+def check_copy(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> None:
     """Compare the contract with the copy inside the graph: an edited one may have valid hashes."""
-    text = session.get_modelmeta().custom_metadata_map.get(CONTRACT_KEY)
+    text = ort_session.get_modelmeta().custom_metadata_map.get(CONTRACT_KEY)
     if text is None:
         return  # a graph that another tool wrote; what of the contract can be seen in it has been compared
     exported = embedded_contract(text, bundle.onnx)

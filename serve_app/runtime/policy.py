@@ -8,8 +8,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -25,7 +24,7 @@ from rlservo.export.contract.errors import ActionError, RequestError, UsageError
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.interface import Observation
-from rlservo.serve_app.runtime.action_guard import ActionGuard
+from rlservo.serve_app.runtime.action_check import ActionCheck
 from rlservo.serve_app.runtime.drift import Drift
 from rlservo.serve_app.runtime.exploration import Draw, draw_action
 from rlservo.serve_app.runtime.loading import (
@@ -37,9 +36,9 @@ from rlservo.serve_app.runtime.loading import (
     check_rows,
     open_graph,
 )
-from rlservo.serve_app.runtime.observations import ObservationReader, StructureReader
+from rlservo.serve_app.runtime.observations import ObservationParser, Observed
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
-from rlservo.serve_app.runtime.recurrent_state import Memory, State
+from rlservo.serve_app.runtime.recurrent_state import State, StateTensors
 from rlservo.serve_app.runtime.step_limit import StepLimit
 
 if TYPE_CHECKING:
@@ -64,9 +63,9 @@ class Answer:
     """For the next step."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
 class Step:
-    """What one step of an episode came to."""
+    """One step of an episode: the action, the next state, and what the network was given."""
 
     action: Any
     """In the action space's own form, a batch with its axis on every leaf."""
@@ -76,8 +75,10 @@ class Step:
     """What the next step needs, `[batch, *shape]`; empty for a stateless policy."""
     batch: int | None
     """How many observations there were; None for one that came alone."""
-    fed: Mapping[str, NDArray[Any]]
+    inputs: Mapping[str, NDArray[Any]]
     """What the network was given, by tensor name."""
+    notices: tuple[str, ...] = ()
+    """What was out of bounds or beyond a limit, and used all the same."""
 
     @property
     def rows(self) -> int:
@@ -97,53 +98,47 @@ class Policy:
     def __init__(
         self,
         bundle: Bundle,
-        session: onnxruntime.InferenceSession,
+        ort_session: onnxruntime.InferenceSession,
         options: PolicyOptions = DEFAULT_OPTIONS,
         *,
         graph_hash: str = "",
     ) -> None:
-        """Wrap a session whose graph fits `bundle.contract`; use `Policy.load`."""
+        """Wrap onnxruntime's session, whose graph fits `bundle.contract`; use `Policy.load`."""
         contract = bundle.contract
         self._bundle = bundle
         self._graph_hash = graph_hash
         self.identity = f"{contract.name}/{contract.version}#{graph_hash[:SHOWN_HASH]}"
-        """What a memory of this policy's belongs to: name, version and graph, the same wherever it is loaded."""
+        """Name, version and graph, the same wherever it is loaded: a recurrent state goes to the policy of its own."""
         self._contract = contract
-        self._session: onnxruntime.InferenceSession | None = session
-        self._run: Run = session.run
+        self._ort_session: onnxruntime.InferenceSession | None = ort_session
+        self._run: Run = ort_session.run
         self._rng = np.random.default_rng()
         self.options = options
-        self.notices: deque[str] = deque(maxlen=16)
-        """What was out of bounds or beyond a limit and used all the same, for who answers to a client."""
         self.draw: Draw | None = None
         """How the last exploring action came about, for a recording; None before the first."""
+        self.last_notices: tuple[str, ...] = ()
+        """What was out of bounds or beyond a limit at the last `act` and used all the same, for a recording."""
         self._unlogged = 0
         self._logged_at = -NOTICE_EVERY_S
-        self._reader = StructureReader(
-            contract.name, contract.observation_space, options=options, notice=self._take_notice
+        self.drift = Drift.of(contract)
+        self._observations = ObservationParser(
+            contract.name, contract.observation_space, options=options, drift=self.drift
         )
-        self._observed = list(leaf_specs(contract.observation_space, "obs"))
         actions = leaf_specs(contract.action_space, "action")
-        self._guards = {name: ActionGuard(contract.name, name, leaf) for name, leaf in actions.items()}
-        self._memory = Memory(contract)
-        self._limit = StepLimit(contract.name, actions, options)
+        self._action_checks = {name: ActionCheck(contract.name, name, leaf) for name, leaf in actions.items()}
+        self._state_tensors = StateTensors(contract)
+        self._step_limit = StepLimit(contract.name, actions, options)
         self._state: State | None = None
         self._last: dict[str, NDArray[Any]] | None = None
-        self.limited = bool(self._limit)
-        self.episodic = bool(contract.state) or self.limited
+        self.has_step_limit = bool(self._step_limit)
+        self.is_stateful = bool(contract.state) or self.has_step_limit
         """Whether an action depends on what came before: on a state, or by a limit on the last action."""
         # Most policies read one array and give one: those few microseconds are what a control loop asks for.
-        observations = leaf_specs(contract.observation_space, "obs")
-        flat = "obs" in observations and "action" in actions  # not a Dict or Tuple, which may have a single leaf
-        self._simple = flat and len(contract.inputs) == 1 and not self.episodic
-        self._leaf_reader = ObservationReader(
-            contract.name, next(iter(observations.values())), options=options, notice=self._take_notice
-        )
-        self.drift = Drift.of(contract)
-        if self.drift is not None:
-            self._leaf_reader.watch = self.drift.see
-            self._reader.watch("obs", self.drift.see)
-        self._guard = next(iter(self._guards.values()))
+        leaves = self._observations.leaves
+        flat = "obs" in leaves and "action" in actions  # not a Dict or Tuple, which may have a single leaf
+        self._simple = flat and len(contract.inputs) == 1 and not self.is_stateful
+        self._leaf = next(iter(leaves.values()))
+        self._action_check = next(iter(self._action_checks.values()))
         self._input = contract.inputs[0].name
         self._action_only = ["action"]
         self._dist_only = ["action_dist_inputs"]
@@ -171,12 +166,12 @@ class Policy:
             raise UsageError(f"threads must be 1 or more, got {threads}")
         bundle = load_bundle(path, limits)
         check_contract(bundle)
-        session = open_graph(bundle, threads)
-        check_graph(bundle, session)
-        check_copy(bundle, session)
+        ort_session = open_graph(bundle, threads)
+        check_graph(bundle, ort_session)
+        check_copy(bundle, ort_session)
         if check_golden:
-            check_golden_vectors(bundle, session.run)
-        return cls(bundle, session, options, graph_hash=bundle.sums[ONNX_FILE])
+            check_golden_vectors(bundle, ort_session.run)
+        return cls(bundle, ort_session, options, graph_hash=bundle.sums[ONNX_FILE])
 
     @property
     def contract(self) -> Contract:
@@ -210,16 +205,14 @@ class Policy:
         the reward, or remembers another number of episodes, and ActionError when what came out is not finite or not in
         the action space.
         """
-        if not self._simple:
-            return self._act_on(obs, explore, seed, reward)
-        array, batch = self._leaf_reader.read(obs)
-        if explore:
-            self._check_explores()
-            action = self._sample(self._run(self._dist_only, {self._input: array})[0], seed)["action"]
-        else:
-            action = self._run(self._action_only, {self._input: array})[0]
-        self._guard.check(action)
-        return action if batch else action[0, ...]
+        if self._simple:
+            computed, _, batch, self.last_notices = self._compute(obs, explore, seed)
+            return computed if batch else computed[0, ...]
+        step = self.step(obs, before=self._state, last=self._last, explore=explore, seed=seed, reward=reward)
+        self._state = step.state or None
+        self._last = step.leaves if self._step_limit else None
+        self.last_notices = step.notices
+        return step.action
 
     def act_from(
         self,
@@ -258,7 +251,13 @@ class Policy:
         sends them, which is checked. None of a pair begins an episode. Raises RequestError when they do not fit, and
         what `act` raises.
         """
-        feed, batch = self._reader.read(obs)
+        if self._simple and before is None and state is None and last is None and last_action is None:
+            computed, feed, batch, notices = self._compute(obs, explore, seed)
+            leaves = {"action": computed}
+            if batch:
+                return Step(computed, leaves, {}, len(computed), feed, notices)
+            return Step(computed[0, ...], leaves, {}, None, feed, notices)
+        feed, batch, notices = self.parse(obs)
         rows = len(next(iter(feed.values())))
         known = next((len(leaf) for leaf in (*(before or {}).values(), *(last or {}).values())), rows)
         if known != rows:
@@ -267,20 +266,20 @@ class Policy:
                 f"observation{'s' if rows > 1 else ''}: reset to begin others"
             )
         if state is not None:
-            before = self._memory.read(state, rows, batch=batch)
+            before = self._state_tensors.parse(state, rows, batch=batch)
         if last_action is not None:
             given = action_leaves(self._contract.action_space, last_action, "action")
-            last = self._limit.read(given, rows, batch=batch)
+            last = self._step_limit.parse_last_action(given, rows, batch=batch)
         action, after = self._decide(feed, rows, before, explore, seed, reward)
-        if self._limit and last is not None:
-            action, limited = self._limit.apply(action, last)
-            for sentence in limited:
-                self._take_notice(sentence)
-            for name, guard in self._guards.items():
-                guard.check(action[name])
+        if self._step_limit and last is not None:
+            action, limit_notices = self._step_limit.apply(action, last)
+            self._log(limit_notices)
+            notices += limit_notices
+            for name, check in self._action_checks.items():
+                check.check(action[name])
         space = self._contract.action_space
         own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
-        return Step(build_action(space, own), action, after, rows if batch else None, feed)
+        return Step(build_action(space, own), action, after, rows if batch else None, feed, notices)
 
     def follow(
         self,
@@ -296,60 +295,65 @@ class Policy:
         `done` and `last`, the step before's, are leaves `[batch, *shape]`: what the policy sees of its actions, and
         what limits count from, is what the robot did. Raises what `step` raises.
         """
-        feed, _ = self._reader.read(obs)
+        feed, _, _ = self._observations.parse(obs)
         rows = len(next(iter(feed.values())))
-        feed.update(self._memory.feed(before, rows, reward))
+        feed.update(self._state_tensors.inputs(before, rows, reward))
         explores = self._contract.distribution is not None
-        names = list(self._guards) + (self._dist_only if explores else []) + self._memory.outputs
+        names = list(self._action_checks) + (self._dist_only if explores else []) + self._state_tensors.outputs
         computed = dict(zip(names, self._run(names, feed), strict=True))
-        action = {name: computed[name] for name in self._guards}
-        for name, guard in self._guards.items():
-            guard.check(action[name])
-        if self._limit and last is not None:
-            action, _ = self._limit.apply(action, last)
+        action = {name: computed[name] for name in self._action_checks}
+        for name, check in self._action_checks.items():
+            check.check(action[name])
+        if self._step_limit and last is not None:
+            action, _ = self._step_limit.apply(action, last)
         inputs = computed["action_dist_inputs"] if explores else None
-        return Answer(action, inputs, self._memory.keep(computed, done))
+        return Answer(action, inputs, self._state_tensors.next_state(computed, done))
 
-    def read(self, obs: Observation) -> tuple[dict[str, NDArray[Any]], bool]:
-        """Return what the network would be given, and whether that is a batch. Raises ObservationError."""
-        return self._reader.read(obs)
+    def parse(self, obs: Observation) -> Observed:
+        """Return an observation as the network's tensors. Raises ObservationError."""
+        observed = self._observations.parse(obs)
+        if observed.notices:
+            self._log(observed.notices)
+        return observed
 
-    def action(self, computed: Mapping[str, NDArray[Any]], *, batch: bool) -> Any:
-        """Return the action that the network's outputs are (`read`, `network`), checked. Raises ActionError."""
-        for name, guard in self._guards.items():
-            guard.check(computed[name])
-        own = {name: computed[name] if batch else computed[name][0, ...] for name in self._guards}
+    def build_action(self, computed: Mapping[str, NDArray[Any]], *, batch: bool) -> Any:
+        """Return the action that the network's outputs are (`parse`, `network`), checked. Raises ActionError."""
+        for name, check in self._action_checks.items():
+            check.check(computed[name])
+        own = {name: computed[name] if batch else computed[name][0, ...] for name in self._action_checks}
         return build_action(self._contract.action_space, own)
 
     def network(self) -> Network:
-        """Return the network: from what `read` gives to the action's tensors by name, unchecked (`action` checks).
+        """Return the network: from what `parse` gives to the action's tensors by name (`build_action` checks them).
 
         It is onnxruntime's own `run`: what has been given to it is computed even when the policy is closed meanwhile.
         """
-        return _named(self._open_session().run, list(self._guards))
+        run: Callable[..., Sequence[Any]] = self._open().run  # an action is dense: no sparse tensors, no maps
+        names = list(self._action_checks)
+        return lambda feed: dict(zip(names, run(names, feed), strict=True))
 
     def check_rows(self) -> None:
         """Raise BundleError where the network computes several observations otherwise than each by itself."""
-        check_rows(self._bundle, self._open_session().run)
+        check_rows(self._bundle, self._open().run)
 
-    def fingerprint(self, fed: Mapping[str, NDArray[Any]]) -> bytes:
-        """Return what tells the observation of a feed (`read`, `Step.fed`) from others."""
+    def fingerprint(self, inputs: Mapping[str, NDArray[Any]]) -> bytes:
+        """Return a hash of the observation in the network's inputs (`parse`, `Step.inputs`)."""
         digest = hashlib.blake2b(digest_size=16)
-        for name in self._observed:
-            digest.update(fed[name].tobytes())
+        for name in self._observations.leaves:
+            digest.update(inputs[name].tobytes())
         return digest.digest()
 
-    def twin(self) -> Policy:
-        """Return another policy over the same graph, for another thread: its memory, notices and drift are its own."""
-        return Policy(self._bundle, self._open_session(), self.options, graph_hash=self._graph_hash)
+    def clone(self) -> Policy:
+        """Return another policy over the same graph, for another thread: its recurrent state and drift are its own."""
+        return Policy(self._bundle, self._open(), self.options, graph_hash=self._graph_hash)
 
     def reset(self) -> None:
         """Start an episode: a recurrent policy forgets. Nothing to do for a stateless one."""
         self._state = self._last = None
 
     def close(self) -> None:
-        """Drop the session; `act` raises UsageError from now on."""
-        self._run, self._session = _refuse_closed, None
+        """Drop the graph; `act` raises UsageError from now on."""
+        self._run, self._ort_session = _refuse_closed, None
 
     def __enter__(self) -> Self:
         return self
@@ -359,24 +363,37 @@ class Policy:
     ) -> None:
         self.close()
 
-    def _open_session(self) -> onnxruntime.InferenceSession:
-        if self._session is None:
+    def _open(self) -> onnxruntime.InferenceSession:
+        if self._ort_session is None:
             _refuse_closed([], {})
-        return self._session
+        return self._ort_session
 
-    def _act_on(self, obs: Observation, explore: bool, seed: int | None, reward: ArrayLike | None) -> Any:
-        step = self.step(obs, before=self._state, last=self._last, explore=explore, seed=seed, reward=reward)
-        self._state = step.state or None
-        self._last = step.leaves if self._limit else None
-        return step.action
+    def _compute(
+        self, obs: Observation, explore: bool, seed: int | None
+    ) -> tuple[NDArray[Any], dict[str, NDArray[Any]], bool, tuple[str, ...]]:
+        """Return (action `[batch, ...]`, feed, whether `obs` is a batch, notices) of a simple policy."""
+        array, batch, notice = self._leaf.parse(obs)
+        feed = {self._input: array}
+        if explore:
+            self._check_explores()
+            action = self._sample(self._run(self._dist_only, feed)[0], seed)["action"]
+        else:
+            action = self._run(self._action_only, feed)[0]
+        self._action_check.check(action)
+        notices: tuple[str, ...] = ()
+        if notice:
+            notices = (notice,)
+            self._log(notices)
+        return action, feed, batch, notices
 
-    def _take_notice(self, sentence: str) -> None:
-        self.notices.append(sentence)
-        self._unlogged += 1
-        now = time.monotonic()
-        if now - self._logged_at >= NOTICE_EVERY_S:
-            logger.warning("policy '%s': %s (%d times)", self._contract.name, sentence, self._unlogged)
-            self._unlogged, self._logged_at = 0, now
+    def _log(self, notices: tuple[str, ...]) -> None:
+        """Log a notice once in `NOTICE_EVERY_S`, with how many there were."""
+        for sentence in notices:
+            self._unlogged += 1
+            now = time.monotonic()
+            if now - self._logged_at >= NOTICE_EVERY_S:
+                logger.warning("policy '%s': %s (%d times)", self._contract.name, sentence, self._unlogged)
+                self._unlogged, self._logged_at = 0, now
 
     def _decide(
         self,
@@ -388,16 +405,16 @@ class Policy:
         reward: ArrayLike | None,
     ) -> tuple[dict[str, NDArray[Any]], State]:
         """Return (action leaves `[batch, ...]`, next state) for checked observations."""
-        feed.update(self._memory.feed(before, rows, reward))
-        names = (["action_dist_inputs"] if explore else list(self._guards)) + self._memory.outputs
+        feed.update(self._state_tensors.inputs(before, rows, reward))
+        names = (["action_dist_inputs"] if explore else list(self._action_checks)) + self._state_tensors.outputs
         if explore:
             self._check_explores()
         computed = dict(zip(names, self._run(names, feed), strict=True))
         action = self._sample(computed["action_dist_inputs"], seed) if explore else computed
-        for name, guard in self._guards.items():
-            guard.check(action[name])
-        after = self._memory.keep(computed, action if explore else None)
-        return {name: action[name] for name in self._guards}, after
+        for name, check in self._action_checks.items():
+            check.check(action[name])
+        after = self._state_tensors.next_state(computed, action if explore else None)
+        return {name: action[name] for name in self._action_checks}, after
 
     def _check_explores(self) -> Distribution:
         distribution = self._contract.distribution
@@ -411,17 +428,13 @@ class Policy:
         if seed is not None and seed < 0:
             raise RequestError(f"seed must be a non-negative integer, got {seed}")
         rng = self._rng if seed is None else np.random.default_rng(seed)
-        # Minus infinity is how a policy says 'not allowed'; where it is a mean, the guard refuses the action.
+        # Minus infinity is how a policy says 'not allowed'; where it is a mean, the action is refused.
         if np.isnan(inputs).any() or np.isposinf(inputs).any():
             raise ActionError(
                 f"policy '{self._contract.name}' gave a non-finite action distribution for this observation"
             )
         self.draw = draw_action(inputs, self._check_explores(), self._contract.action_space, rng)
         return self.draw.action
-
-
-def _named(run: Run, names: list[str]) -> Network:
-    return lambda feed: dict(zip(names, run(names, feed), strict=True))
 
 
 def _refuse_closed(_names: list[str], _feed: Mapping[str, Any]) -> NoReturn:

@@ -19,29 +19,29 @@ State: TypeAlias = dict[str, NDArray[Any]]
 """Arrays `[batch, *shape]` by state name."""
 
 
-class Memory:
-    """Reads and writes the state of one policy; empty for a stateless one."""
+class StateTensors:
+    """The graph's tensors for the recurrent state of one policy; none for a stateless one."""
 
     def __init__(self, contract: Contract) -> None:
         self._policy = contract.name
         self._specs: dict[str, StateSpec] = {state.name: state for state in contract.state}
-        self._rewarded = any(tensor.name == REWARD for tensor in contract.inputs)
+        self._has_reward = any(tensor.name == REWARD for tensor in contract.inputs)
         self._choices = contract.action_space if isinstance(contract.action_space, DiscreteSpec) else None
         self.outputs = [f"state_out.{name}" for name in self._specs]
         """The graph's outputs to ask for beside the action."""
 
-    def feed(self, state: State | None, rows: int, reward: ArrayLike | None) -> dict[str, NDArray[Any]]:
+    def inputs(self, state: State | None, rows: int, reward: ArrayLike | None) -> dict[str, NDArray[Any]]:
         """Return the graph's inputs beside the observation; a state of None begins an episode in every row.
 
         Raises RequestError when the policy needs a reward, and none that fits is given.
         """
         now = {name: spec.initial_value(rows) for name, spec in self._specs.items()} if state is None else state
-        given = {f"state_in.{name}": value for name, value in now.items()}
-        if self._rewarded:
-            given[REWARD] = self._reward(state is None, rows, reward)
-        return given
+        inputs = {f"state_in.{name}": value for name, value in now.items()}
+        if self._has_reward:
+            inputs[REWARD] = self._reward(state is None, rows, reward)
+        return inputs
 
-    def keep(self, computed: Mapping[str, NDArray[Any]], sampled: Mapping[str, NDArray[Any]] | None) -> State:
+    def next_state(self, computed: Mapping[str, NDArray[Any]], sampled: Mapping[str, NDArray[Any]] | None) -> State:
         """Return the next state from the graph's outputs; `sampled` is the action where it is not the graph's own."""
         after = {name: computed[f"state_out.{name}"] for name in self._specs}
         if sampled is not None and self._choices is not None:
@@ -53,7 +53,7 @@ class Memory:
                     after[name] = codes
         return after
 
-    def read(self, state: Mapping[str, ArrayLike], rows: int, *, batch: bool) -> State:
+    def parse(self, state: Mapping[str, ArrayLike], rows: int, *, batch: bool) -> State:
         """Return a caller's state as the graph's arrays. Raises RequestError, naming what does not fit."""
         missing = [name for name in self._specs if name not in state]
         unknown = [str(name)[:64] for name in state if name not in self._specs]

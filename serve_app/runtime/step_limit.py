@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rlservo.export.contract.errors import ActionError, RequestError, UsageError
 from rlservo.export.contract.spaces import BoxSpec, LeafSpec, iter_elements
 from rlservo.serve_app.runtime.options import PolicyOptions
+from rlservo.serve_app.runtime.rounding import rounding_slack
 
 ROUNDING = 1e-6  # relative to the step: what float32 may add to a step that is allowed
 
@@ -29,12 +30,12 @@ class StepLimit:
         self._refuses = options.beyond_action_step == "refuse"
         given = options.max_action_step
         by_leaf = given if isinstance(given, dict) else {"action": given} if given is not None else {}
-        self._steps = {name: self._read(name, steps) for name, steps in by_leaf.items()}
+        self._steps = {name: self._parse_steps(name, steps) for name, steps in by_leaf.items()}
 
     def __bool__(self) -> bool:
         return bool(self._steps)
 
-    def read(self, last: Mapping[str, Any], rows: int, *, batch: bool) -> dict[str, NDArray[Any]]:
+    def parse_last_action(self, last: Mapping[str, Any], rows: int, *, batch: bool) -> dict[str, NDArray[Any]]:
         """Return a caller's last action, by leaf, as `[batch, *shape]`.
 
         Raises RequestError unless it is an action of the space: no limit holds against something else.
@@ -50,7 +51,7 @@ class StepLimit:
             if not space.shape and array.shape == (*expected, 1):  # as RLlib, and so the graph, gives such an action
                 array = array.reshape(expected)
             low, high = space.bounds()
-            slack = 1e-5 * np.maximum(1.0, np.minimum(np.abs(low), np.abs(high)))
+            slack = rounding_slack(low, high)
             if array.shape != expected:
                 raise RequestError(
                     f"policy '{self._policy}' expects {name} of last_action of shape {expected}, got {array.shape}"
@@ -62,7 +63,7 @@ class StepLimit:
 
     def apply(
         self, action: dict[str, NDArray[Any]], last: Mapping[str, NDArray[Any]]
-    ) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    ) -> tuple[dict[str, NDArray[Any]], tuple[str, ...]]:
         """Return (the action within its limits, a sentence for each leaf that was limited).
 
         Raises ActionError where the options refuse instead.
@@ -88,9 +89,9 @@ class StepLimit:
                 raise ActionError(f"policy '{self._policy}': {sentence}", {"policy": self._policy})
             notices.append(f"{sentence}: limited")
             limited[name] = (before + np.clip(step, -steps, steps)).astype(action[name].dtype)
-        return limited, notices
+        return limited, tuple(notices)
 
-    def _read(self, name: str, steps: Any) -> NDArray[np.float64]:
+    def _parse_steps(self, name: str, steps: Any) -> NDArray[np.float64]:
         space = self._leaves.get(name)
         if space is None:
             raise UsageError(

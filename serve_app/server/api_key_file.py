@@ -31,7 +31,8 @@ class CurrentKeys:
         self._settings = settings
         file = settings.api_keys_file
         content = None if file is None else read_key_file(Path(file))
-        self._keys = Keys.from_settings(settings, file_content=content)
+        self.accepted = Keys.from_settings(settings, file_content=content)
+        """The keys that are accepted now."""
         self._seen: bytes | str | None = content
         self._used: bytes | str | None = content
         self._refused = ""
@@ -43,16 +44,6 @@ class CurrentKeys:
             watcher.start()
 
     @property
-    def keys(self) -> tuple[Key, ...]:
-        """The keys that are accepted now."""
-        return self._keys.keys
-
-    @property
-    def operator(self) -> Key | None:
-        """The operator's key, which is in no file."""
-        return self._keys.operator
-
-    @property
     def current(self) -> bool:
         """Whether these are the file's keys, and not older ones because the file cannot be used or read."""
         if self._settings.api_keys_file is None:
@@ -61,7 +52,7 @@ class CurrentKeys:
 
     def find(self, presented: bytes) -> Key | None:
         """Return the key that was presented."""
-        return self._keys.find(presented)
+        return self.accepted.find(presented)
 
     def refresh(self) -> None:
         """Look at the file; use what it holds when this is the second look in a row to see the same."""
@@ -79,11 +70,11 @@ class CurrentKeys:
             self._refused = error.message
             logger.error("the API keys stay as they were: %s", error.message)
             return
-        if self._refused or keys != self._keys:
-            logger.warning("the API keys were read again: %s", _difference(self._keys, keys))
+        if self._refused or keys != self.accepted:
+            logger.warning("the API keys were read again: %s", _difference(self.accepted, keys))
         self._refused = ""
-        if keys != self._keys:
-            self._keys = keys
+        if keys != self.accepted:
+            self.accepted = keys
             self.changes += 1
 
 

@@ -1,4 +1,4 @@
-"""API keys, kept as hashes, and the check of each request against them.
+"""API keys, kept as hashes, and what they are for; `request_checks.py` checks requests against them.
 
 A key is 256 random bits, so its plain SHA-256 is all that needs keeping: there is no dictionary to try. A line of the
 key file, or an entry of RLSERVO_API_KEYS (separated by commas), is
@@ -20,17 +20,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from typing_extensions import Self
 
-from rlservo.export.contract.errors import ForbiddenError, UnauthenticatedError, UsageError
+from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.regular_files import NotReadableError, blocks, open_regular
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.loopback import is_loopback
-
-if TYPE_CHECKING:
-    from rlservo.serve_app.server.api_key_file import CurrentKeys
 
 LINE = re.compile(r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|admin)\s+sha256:(?P<digest>[0-9a-f]{64})")
 KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets can tell what they found
@@ -131,39 +128,6 @@ class Keys:
             if hmac.compare_digest(digest, key.digest):
                 found = key
         return found
-
-
-class Guard:
-    """Decides by a request's key whether it may use what its route, or its method, grants."""
-
-    def __init__(self, keys: Keys | CurrentKeys) -> None:
-        self._keys = keys
-
-    @property
-    def asks_for_keys(self) -> bool:
-        """Whether whoever wants actions needs a key."""
-        return bool(self._keys.keys)
-
-    def check(self, presented: bytes | None, access: Access) -> Key | None:
-        """Return the key that opens this, None where it needs none. Raises UnauthenticatedError or ForbiddenError."""
-        if access is Access.open:
-            return None
-        admin = access is not Access.act
-        if not self._keys.keys and not (admin and self._keys.operator):
-            if admin:
-                raise ForbiddenError(
-                    "administration needs an admin key, and this server has none: see 'rlservo key --help'"
-                )
-            return None
-        if presented is None:
-            what = "administration needs an admin" if admin else "this server wants an API"
-            raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
-        key = self._keys.find(presented)
-        if key is None:
-            raise UnauthenticatedError("this API key is not known to the server")
-        if admin and key.role is not Role.admin:
-            raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key")
-        return key
 
 
 def new_key(label: str, *, admin: bool = False) -> tuple[str, str]:

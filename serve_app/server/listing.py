@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.versions.plan import Canary, PolicyPlan, Refusal
+from rlservo.serve_app.versions.plan import Canary, Refusal
 from rlservo.serve_app.versions.replica_versions import VersionState
 
 
@@ -69,7 +69,7 @@ def describe(core: Core) -> dict[str, Any]:
     policies = []
     for name in store.names:
         contract = store.get(name).contract
-        arranged = (control.arranged(name) if control is not None else None) or PolicyPlan(versions={})
+        arranged = store.plans[name]
         shadow = store.shadow(name)
         versions = []
         for version, state in states.get(name, {}).items():
@@ -104,7 +104,7 @@ def describe(core: Core) -> dict[str, Any]:
         "changed_at": plan and plan.changed_at,
         "changed_by": plan and plan.changed_by,
         "refused": plan and plan.refused and plan.refused.model_dump(),
-        "behind": list(control.following().behind) if control is not None else [],
+        "behind": list(control.progress().behind) if control is not None else [],
     }
 
 

@@ -1,4 +1,4 @@
-"""Checks of a request before it is routed: the form of its path, the host it names, the web page that sends it.
+"""Checks of a request before its body is read: the form of its path, the host it names, the page it is from, its key.
 
 A browser lets any page send requests to any address that it reaches, the robot's own computer included, and lets it
 read the answers where the page's name leads to that address ("DNS rebinding"). So a request says which host it is for,
@@ -13,15 +13,18 @@ from __future__ import annotations
 import ipaddress
 import re
 import socket
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from rlservo.export.contract.errors import ForbiddenError, RequestError
-from rlservo.serve_app.server.api_keys import SCHEMES
+from rlservo.export.contract.errors import ForbiddenError, RequestError, UnauthenticatedError
+from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Role
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.loopback import is_loopback
 
 if TYPE_CHECKING:
     from starlette.types import Scope
+
+    from rlservo.serve_app.server.api_key_file import CurrentKeys
 
 # Every path of ours can be written in it. What needs escaping, or is read differently by different programs, is not
 # routed at all: control characters, encoded and doubled slashes, dot segments, ';', '\'.
@@ -30,10 +33,14 @@ HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+?)\.?(?::[0-9]{1,5})?")
 SECONDS = re.compile(rb"[0-9]{1,9}(\.[0-9]{1,9})?")
 READING = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that change nothing
 OWN_SITES = frozenset({b"same-origin", b"none"})  # 'none' is the user, not a page; 'same-site' is another port or name
+ALL_COUNT = frozenset({b"host", b"origin", b"sec-fetch-site", b"content-type", b"content-encoding"})
 UNREADABLE = b"x-rlservo-unreadable"  # says which header is not UTF-8, where `mend_headers` has made it so
 TIMEOUT = b"x-request-timeout-seconds"  # Ray Serve's; infinity makes its event loop raise
 PAGE_SCHEMES = (b"http://", b"https://")  # a proxy may have ended TLS
 HOSTS_REMEMBERED = 256
+REQUEST_ID = b"x-request-id"
+LABEL = b"x-session-id"  # whose request it is, where a canary runs; Ray Serve's own routing knows the header, too
+HEADERS = "rlservo.headers"  # in a connection's scope: what `fold_headers` gave
 ANY_HOST = "*"
 
 
@@ -84,46 +91,88 @@ class Hosts:
         return address.is_loopback or not self._local
 
 
+class Authorizer:
+    """Decides by the key that a request presents whether it may use what its route, or its method, grants."""
+
+    def __init__(self, keys: CurrentKeys) -> None:
+        self._keys = keys
+
+    @property
+    def needs_keys(self) -> bool:
+        """Whether whoever wants actions needs a key."""
+        return bool(self._keys.accepted.keys)
+
+    def authorize(self, presented: bytes | None, access: Access) -> Key | None:
+        """Return the key that opens this, None where it needs none. Raises UnauthenticatedError or ForbiddenError."""
+        if access is Access.open:
+            return None
+        admin, accepted = access is not Access.act, self._keys.accepted
+        if not accepted.keys and not (admin and accepted.operator):
+            if admin:
+                raise ForbiddenError(
+                    "administration needs an admin key, and this server has none: see 'rlservo key --help'"
+                )
+            return None
+        if presented is None:
+            what = "administration needs an admin" if admin else "this server wants an API"
+            raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
+        key = accepted.find(presented)
+        if key is None:
+            raise UnauthenticatedError("this API key is not known to the server")
+        if admin and key.role is not Role.admin:
+            raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key")
+        return key
+
+
 class RequestChecks:
-    """Reads a request's headers, once, and refuses what no client of ours sends."""
+    """Refuses, by their headers, HTTP requests and WebSockets that no client of ours sends or that have no key."""
 
-    def __init__(self, hosts: Hosts) -> None:
+    def __init__(self, hosts: Hosts, authorizer: Authorizer) -> None:
         self._hosts = hosts
+        self._authorizer = authorizer
 
-    def read(self, scope: Scope) -> tuple[bytes | None, str | None]:
-        """Return (the API key presented, the name of a header that is not UTF-8); None for what is not there.
+    def check(self, scope: Scope, headers: Mapping[bytes, bytes], access: Access) -> Key | None:
+        """Return the key that opens what `access` says; `headers` are the scope's (`fold_headers`).
 
-        Raises ForbiddenError for another host's request or another origin's page, RequestError for two hosts.
+        Raises ForbiddenError for another host's request or another origin's page, UnauthenticatedError or
+        ForbiddenError by the key, RequestError for a header that is not UTF-8.
         """
-        host = origin = site = key = unreadable = None
-        for name, value in scope["headers"]:
-            if name == b"host":
-                if host is not None:
-                    raise RequestError("the request has two Host headers: send one")
-                host = value
-            elif name == b"origin":  # of several, which no browser sends, none is anybody's
-                origin = value if origin is None else b"several origins"
-            elif name == b"sec-fetch-site":
-                site = value if site is None else b"several"
-            elif name == b"authorization":
-                if key is None:
-                    key = _bearer(value)
-            elif name == b"x-api-key" and key is None:
-                key = value.strip()
-            elif name == UNREADABLE:
-                unreadable = value.decode("latin-1")
-            if not value.isascii() and not _is_utf8(value):
-                unreadable = name.decode("latin-1")
+        host = headers.get(b"host")
+        if host is not None and b"," in host:
+            raise RequestError("the request has two Host headers: send one")
         if host is not None and not self._hosts.permit(host):
             raise ForbiddenError(
                 f"this server is not called '{host[:100].decode('latin-1')}': call it by its address, or name it in "
                 "RLSERVO_ALLOWED_HOSTS"
             )
-        if (origin is not None or site is not None) and (
+        if (b"origin" in headers or b"sec-fetch-site" in headers) and (
             scope["type"] == "websocket" or scope["method"] not in READING
         ):
-            _check_page(origin, site, host)
-        return key, unreadable
+            _check_page(headers.get(b"origin"), headers.get(b"sec-fetch-site"), host)
+        key = self._authorizer.authorize(presented_key(headers), access)
+        if UNREADABLE in headers or not all(map(bytes.isascii, headers.values())):
+            _check_readable(headers)
+        return key
+
+
+def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
+    """Return headers by name: of several of one name the first, or all, where every one of them must be right."""
+    pairs = list(headers)
+    folded = dict(pairs)
+    if len(folded) == len(pairs):
+        return folded
+    folded = {}
+    for name, value in pairs:
+        folded[name] = folded[name] + b", " + value if name in folded and name in ALL_COUNT else folded.get(name, value)
+        if not _is_utf8(value):
+            folded[UNREADABLE] = name
+    return folded
+
+
+def header_text(headers: Mapping[bytes, bytes], name: bytes) -> str | None:
+    """Return a header as text, None where it is not there."""
+    value = headers.get(name)
+    return None if value is None else value.decode("latin-1")
 
 
 def mend_headers(headers: list[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
@@ -148,18 +197,24 @@ def _is_utf8(value: bytes) -> bool:
     return True
 
 
-def presented_key(headers: list[tuple[bytes, bytes]]) -> bytes | None:
-    """Return the API key among the headers, where only that is wanted (gRPC)."""
-    for name, value in headers:
-        key = _bearer(value) if name == b"authorization" else value.strip() if name == b"x-api-key" else None
-        if key is not None:
-            return key
-    return None
+def presented_key(headers: Mapping[bytes, bytes]) -> bytes | None:
+    """Return the API key among the headers."""
+    value = headers.get(b"authorization")
+    if value is not None:
+        scheme, _, key = value.partition(b" ")
+        if scheme.lower() in SCHEMES:
+            return key.strip()
+    value = headers.get(b"x-api-key")
+    return None if value is None else value.strip()
 
 
-def _bearer(value: bytes) -> bytes | None:
-    scheme, _, key = value.partition(b" ")
-    return key.strip() if scheme.lower() in SCHEMES else None
+def _check_readable(headers: Mapping[bytes, bytes]) -> None:
+    """Raise RequestError for a header that is not UTF-8."""
+    unreadable = headers.get(UNREADABLE)
+    if unreadable is None:
+        unreadable = next((name for name, value in headers.items() if not _is_utf8(value)), None)
+    if unreadable is not None:
+        raise RequestError(f"the header '{unreadable[:64].decode('latin-1')}' is not UTF-8")
 
 
 def _check_page(origin: bytes | None, site: bytes | None, host: bytes | None) -> None:

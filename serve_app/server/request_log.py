@@ -12,7 +12,9 @@ import sys
 import time
 from typing import Any
 
+from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.policy_store import Decision
 
 LOGGER = "rlservo"
 FIELDS = "fields"  # where a record carries its fields
@@ -67,71 +69,64 @@ class RequestLog:
         self.every = settings.log_requests
         self._values = settings.log_values
 
-    def answered(
-        self,
-        protocol: str,
-        policy: str,
-        version: str,
-        seconds: float,
-        *,
-        batch: int,
-        request_id: str | None,
-        seq: int | None = None,
-    ) -> None:
-        """Write a request that got its action; ask `every` before. `seq` is its number on a stream."""
+    def write_answer(self, request: Request, decision: Decision, seconds: float) -> None:
+        """Write a request that got its action; ask `every` before."""
         fields: dict[str, Any] = {
-            "request_id": _short(request_id),
-            "protocol": protocol,
-            "policy": policy,
-            "version": version,
+            "request_id": _shorten(request.request_id),
+            "protocol": request.protocol,
+            "policy": decision.name,
+            "version": decision.version,
             "code": "ok",
             "ms": round(seconds * 1e3, 3),
-            "batch": batch,
+            "batch": decision.batch or 1,
         }
-        if seq is not None:
-            fields["seq"] = seq
+        if request.on_websocket and request.seq is not None:
+            fields["seq"] = request.seq
         _requests.info("answered", extra={FIELDS: fields})
 
-    def failed(
-        self,
-        protocol: str,
-        policy: str,
-        version: str | None,
-        code: str,
-        sentence: str,
-        *,
-        request_id: str | None,
-        seconds: float | None = None,
-        seq: Any = None,
-        peer: str | None = None,
-    ) -> None:
-        """Write a request that got none; `seq` is its client's number on a stream, `peer` its client's address."""
+    def write_failure(self, request: Request, code: str, sentence: str) -> None:
+        """Write a request that got none."""
         if not _requests.isEnabledFor(logging.INFO):
             return
         fields: dict[str, Any] = {
-            "request_id": _short(request_id),
+            "request_id": _shorten(request.request_id),
+            "protocol": request.protocol,
+            "policy": request.policy[:64],
+            "version": request.version and request.version[:32],
+            "code": code,
+            "ms": round((time.perf_counter() - request.received) * 1e3, 3),
+        }
+        if request.on_websocket and request.seq is not None:
+            fields["seq"] = request.seq
+        self._write_refusal(fields, sentence)
+
+    def write_unread(
+        self, protocol: str, code: str, sentence: str, *, request_id: str | None, peer: str | None
+    ) -> None:
+        """Write a request that was refused before it was routed; `peer` is its client's address."""
+        fields: dict[str, Any] = {
+            "request_id": _shorten(request_id),
             "protocol": protocol,
-            "policy": policy[:64],
-            "version": version and version[:32],
+            "policy": "",
+            "version": None,
             "code": code,
         }
-        if seconds is not None:
-            fields["ms"] = round(seconds * 1e3, 3)
-        if type(seq) is int:
-            fields["seq"] = seq
         if peer is not None:
             fields["peer"] = peer
+        self._write_refusal(fields, sentence)
+
+    def _write_refusal(self, fields: dict[str, Any], sentence: str) -> None:
         if self._values:
             fields["error"] = sentence
         _requests.info("refused", extra={FIELDS: fields})
 
 
-def administered(
+def write_change(
     change: str, code: str, *, key: str, peer: str | None, request_id: str | None, generation: int | None = None
 ) -> None:
     """Write a change of what is served, or one that was refused: whose key asked for it, from which address."""
     fields: dict[str, Any] = {
-        "request_id": _short(request_id),
+        "request_id": _shorten(request_id),
         "change": change.strip(),
         "code": code,
         "key": key,
@@ -142,5 +137,5 @@ def administered(
     _administration.info("changed" if code == "ok" else "refused", extra={FIELDS: fields})
 
 
-def _short(request_id: str | None) -> str | None:
+def _shorten(request_id: str | None) -> str | None:
     return request_id and request_id[:LONGEST_ID]

@@ -83,7 +83,7 @@ class Metrics:
         self._streams: dict[str, int] = {}
         self.sources: list[Callable[[], Iterable[Metric]]] = []  # further families, asked for when somebody looks
 
-    def answered(self, protocol: str, decision: Decision, batch: int, seconds: float) -> None:
+    def record_answer(self, protocol: str, decision: Decision, seconds: float) -> None:
         """Count a request that got its action `seconds` after it arrived."""
         key = (decision.name, decision.version, protocol)
         series = self._answered.get(key)
@@ -91,16 +91,16 @@ class Metrics:
             series = self._answered[key] = _Series()
         series.latency.add(seconds)
         series.inference.add(decision.infer_ms / 1e3)
-        series.batch.add(batch)
+        series.batch.add(decision.batch or 1)
         series.runs += 1 / decision.sharers
         series.last_answer_s = time.time()
 
-    def failed(self, protocol: str, policy: str, version: str, code: str) -> None:
+    def count_failure(self, protocol: str, policy: str, version: str, code: str) -> None:
         """Count a request that got none; `policy` is empty unless it is loaded, so that nobody can make up labels."""
         key = (policy, version, protocol, code)
         self._failed[key] = self._failed.get(key, 0) + 1
 
-    def stream(self, policy: str, change: int) -> None:
+    def count_stream(self, policy: str, change: int) -> None:
         """Count a WebSocket that opened (1) or closed (-1)."""
         self._streams[policy] = self._streams.get(policy, 0) + change
 

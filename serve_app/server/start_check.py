@@ -10,9 +10,10 @@ from rlservo.export.contract.errors import BundleError, RlservoError
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.loaded_policies import Library
-from rlservo.serve_app.versions.plan import ServedConfig, plan_of
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
+from rlservo.serve_app.versions.plan import ServedConfig
+from rlservo.serve_app.versions.plan_changes import plan_of
+from rlservo.serve_app.versions.policy_store import PolicyStore, load_policy
 from rlservo.serve_app.versions.repository import Repository, raise_all
 
 
@@ -25,7 +26,8 @@ def load_served(
     """
     settings = settings or ServerSettings.from_environment(environment={})
     calls, limits = BlockingCalls(), settings.bundle_limits
-    library = Library(Repository(paths, limits), partial(Policy.load, limits=limits))
+    load = partial(load_policy, threads=settings.threads, options=settings.policy_options, limits=limits)
+    library = LoadedPolicies(Repository(paths, limits), load)
     available = calls.wait(
         library.repository.available, config, timeout_s=settings.scan_timeout_s, what="looking through the folders"
     )

@@ -59,7 +59,7 @@ class BlockingCalls:
         try:
             await asyncio.wait_for(returned, deadline - time.monotonic())
         except asyncio.TimeoutError:
-            raise _given_up(what, timeout_s) from None
+            raise _timeout_error(what, timeout_s) from None
         return future.result()
 
     def wait(self, function: Callable[..., Result], *arguments: Any, timeout_s: float, what: str) -> Result:
@@ -70,7 +70,7 @@ class BlockingCalls:
         except TimeoutError:
             if future.done():  # the function's own
                 raise
-            raise _given_up(what, timeout_s) from None
+            raise _timeout_error(what, timeout_s) from None
 
     def _running(self) -> int:
         self._threads = {thread for thread in self._threads if thread.is_alive()}
@@ -94,5 +94,5 @@ class BlockingCalls:
         return future
 
 
-def _given_up(what: str, timeout_s: float) -> UnavailableError:
+def _timeout_error(what: str, timeout_s: float) -> UnavailableError:
     return UnavailableError(f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?")

@@ -12,9 +12,11 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.plan import now
 from rlservo.serve_app.versions.repository import Repository
 
+Loadable = tuple[str, str, str]  # (name, version, hash)
+
 
 @dataclass(frozen=True)
-class Loaded:
+class LoadedPolicy:
     """A policy that was proven on this machine."""
 
     policy: Policy
@@ -22,20 +24,20 @@ class Loaded:
     loaded_at: str
 
 
-class Library:
+class LoadedPolicies:
     """The policies in memory, by name, version and hash."""
 
     def __init__(self, repository: Repository, load: Callable[[Path], Policy] = Policy.load) -> None:
         """`load` loads and proves one bundle; raises BundleError."""
         self.repository = repository
         self._load = load
-        self._loaded: dict[tuple[str, str, str], Loaded] = {}
+        self._loaded: dict[Loadable, LoadedPolicy] = {}
 
-    def get(self, name: str, version: str, digest: str) -> Loaded | None:
+    def get(self, name: str, version: str, digest: str) -> LoadedPolicy | None:
         """Return the policy if the bundle with that hash is in memory."""
         return self._loaded.get((name, version, digest))
 
-    def load(self, name: str, version: str, digest: str) -> Loaded:
+    def load(self, name: str, version: str, digest: str) -> LoadedPolicy:
         """Load and prove a bundle, unless it is in memory.
 
         Raises what `Repository.find` and `Policy.load` raise, and BundleTamperedError when the folder holds another
@@ -53,14 +55,14 @@ class Library:
             contract = policy.contract
             # It was not exchanged meanwhile, neither now nor when its name was read and its hash accepted.
             if (contract.name, contract.version, policy.digest) == (name, version, digest):
-                loaded = self._loaded[name, version, digest] = Loaded(policy, digest, now())
+                loaded = self._loaded[name, version, digest] = LoadedPolicy(policy, digest, now())
                 return loaded
         raise BundleTamperedError(
             f"{folder} is not the bundle that was accepted as version {version} of '{name}' (its hashes are others): "
             "export changes under a new version, or load this one again"
         )
 
-    def keep(self, served: Mapping[tuple[str, str, str], Loaded], proposed: Collection[tuple[str, str, str]]) -> None:
+    def keep(self, served: Mapping[Loadable, LoadedPolicy], proposed: Collection[Loadable]) -> None:
         """Hold what is served, keep what is proposed, and let all others go; who computes with one is not disturbed.
 
         In place: a thread may be adding one at this moment.

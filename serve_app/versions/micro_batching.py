@@ -22,8 +22,8 @@ Check = Callable[[], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Computed:
-    """What one observation came to."""
+class RunResult:
+    """The network's outputs for one request."""
 
     outputs: Tensors  # `[1, ...]`
     milliseconds: float  # that the run took, for all that were in it
@@ -31,13 +31,13 @@ class Computed:
 
 
 @dataclass(frozen=True, slots=True)
-class _Waiting:
+class _Pending:
     feed: Mapping[str, NDArray[np.generic]]
     check: Check | None
-    future: asyncio.Future[Computed]
+    future: asyncio.Future[RunResult]
 
-    def is_wanted(self) -> bool:
-        """Whether it is still to be computed; whose check says no is told so."""
+    def admit(self) -> bool:
+        """Return whether to compute it. A failed check is set on the caller's future."""
         if self.future.done():  # its caller has gone
             return False
         try:
@@ -56,14 +56,14 @@ class Batcher:
         """`run` computes a batch, `most` is the largest."""
         self._run = run
         self._most = most
-        self._waiting: list[_Waiting] = []
+        self._pending: list[_Pending] = []
         self._arrived = 0  # in this turn
         self._several = False  # in the turn before
         self.runs = 0  # since the start
         self.observations = 0
 
-    async def compute(self, feed: Mapping[str, NDArray[np.generic]], check: Check | None = None) -> Computed:
-        """Return what `feed`, a batch of one, comes to; `check` is asked right before it is computed.
+    async def compute(self, feed: Mapping[str, NDArray[np.generic]], check: Check | None = None) -> RunResult:
+        """Compute `feed`, a batch of one; `check` is called right before.
 
         Raises what `run` and `check` raise.
         """
@@ -75,17 +75,17 @@ class Batcher:
         if not self._several:
             (alone,) = self._compute([feed])
             return alone
-        mine: asyncio.Future[Computed] = loop.create_future()
-        self._waiting.append(_Waiting(feed, check, mine))
-        if len(self._waiting) == self._most:
+        mine: asyncio.Future[RunResult] = loop.create_future()
+        self._pending.append(_Pending(feed, check, mine))
+        if len(self._pending) == self._most:
             self._compute_all()
         return await mine
 
-    def compute_now(self, feed: Tensors) -> Computed:
-        """Return what a batch that came as one comes to: it waits for nobody. Raises what `run` raises."""
+    def compute_now(self, feed: Tensors) -> RunResult:
+        """Compute a batch that came as one: it waits for nobody. Raises what `run` raises."""
         started = time.perf_counter()
         outputs = self._run(feed)
-        return Computed(outputs, (time.perf_counter() - started) * 1e3, 1)  # one run, whatever is in it
+        return RunResult(outputs, (time.perf_counter() - started) * 1e3, 1)  # one run, whatever is in it
 
     def _end_turn(self) -> None:
         self._compute_all()
@@ -93,20 +93,20 @@ class Batcher:
         self._arrived = 0
 
     def _compute_all(self) -> None:
-        waiting = [each for each in self._waiting if each.is_wanted()]
-        self._waiting = []
-        if not waiting:
+        pending = [each for each in self._pending if each.admit()]
+        self._pending = []
+        if not pending:
             return
         try:
-            computed = self._compute([each.feed for each in waiting])
+            computed = self._compute([each.feed for each in pending])
         except Exception as error:
-            for each in waiting:
+            for each in pending:
                 each.future.set_exception(error)
             return
-        for each, one in zip(waiting, computed, strict=True):
+        for each, one in zip(pending, computed, strict=True):
             each.future.set_result(one)
 
-    def _compute(self, feeds: Sequence[Mapping[str, NDArray[np.generic]]]) -> list[Computed]:
+    def _compute(self, feeds: Sequence[Mapping[str, NDArray[np.generic]]]) -> list[RunResult]:
         rows = len(feeds)
         started = time.perf_counter()
         outputs = self._run({name: np.concatenate([feed[name] for feed in feeds]) for name in feeds[0]})
@@ -117,6 +117,6 @@ class Batcher:
         self.runs += 1
         self.observations += rows
         return [
-            Computed({name: output[row : row + 1] for name, output in outputs.items()}, milliseconds, rows)
+            RunResult({name: output[row : row + 1] for name, output in outputs.items()}, milliseconds, rows)
             for row in range(rows)
         ]

@@ -13,27 +13,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, find_bundles, read_contract
+from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, read_contract
 from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import (
-    BundleError,
-    RequestError,
-    RlservoError,
+    StateNeededError,
     UnknownPolicyError,
     UnknownVersionError,
     UsageError,
 )
-from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec, leaf_specs
+from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.micro_batching import Batcher
-from rlservo.serve_app.versions.plan import PRODUCTION, PolicyPlan
+from rlservo.serve_app.versions.plan import PolicyPlan
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeNote:
-    """What a reply says of its episode."""
+    """Fields of a reply about its episode."""
 
     state: Mapping[str, Any] | None = None  # for the client to carry, as `carried_state.py` has it
     session_id: str | int | None = None
@@ -59,7 +57,7 @@ class Decision:
 class _Canary:
     policy: Policy
     share: float
-    needs_session: bool  # a policy with a memory cannot change in the middle of an episode
+    needs_label: bool  # a stateful policy cannot change in the middle of an episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,100 +69,58 @@ class Shadow:
     policy: Policy
 
 
+@dataclass(frozen=True, slots=True)
+class _Served:
+    """One policy's loaded versions, and which of them are for what."""
+
+    plan: PolicyPlan
+    versions: Mapping[str, Policy]  # oldest first
+    default: Policy
+    canary: _Canary | None
+    shadow: Shadow | None
+
+
 class PolicyStore:
-    """Several policies in several versions; a name's default is its `production` alias, without plans the newest."""
+    """Several policies in several versions, each served by its plan."""
 
     def __init__(
         self,
         policies: Iterable[Policy],
-        plans: Mapping[str, PolicyPlan] | None = None,
+        plans: Mapping[str, PolicyPlan],
         *,
         changed: Iterable[str] = (),
         replaces: PolicyStore | None = None,
     ) -> None:
-        """Take loaded policies, and by name which are to do what; those `changed` were served otherwise before.
+        """Take loaded policies, and by name the plan that each is served by; those `changed` were served otherwise.
 
         A plan may name versions that are not among the policies; an alias, canary or shadow that leads to one is left
-        out. Raises UsageError when two have the same name and version, when the default version is not there (no other
-        takes its place), or, without plans, when there is no policy. What goes on of a store that this one `replaces`
-        is the micro-batching of the policies that both have.
+        out. Raises UsageError when the default version is not there: no other takes its place. What goes on of a store
+        that this one `replaces` is the micro-batching of the policies that both have.
         """
-        self._policies: dict[str, dict[str, Policy]] = {}
+        self.plans = plans
         self._changed = frozenset(changed)
-        for policy in policies:
-            name, version = policy.contract.name, policy.contract.version
-            versions = self._policies.setdefault(name, {})
-            # '1' and '1.0.0' compare equal, so neither would be the newest.
-            same = next((v for v in versions if version_key(v) == version_key(version)), None)
-            if same is not None:
-                raise UsageError(
-                    f"policy '{name}' version {version} is in both {versions[same].path} and {policy.path}: "
-                    "serve one of them, or export one under another name or version"
-                )
-            versions[version] = policy
-        if not self._policies and plans is None:
-            raise UsageError("no policy to serve: give at least one bundle folder")
-        for name, versions in self._policies.items():
-            self._policies[name] = dict(sorted(versions.items(), key=lambda item: version_key(item[0])))
-        self._aliases: dict[str, dict[str, Policy]] = {}
-        self._default: dict[str, Policy] = {}
-        self._canary: dict[str, _Canary] = {}
-        self._shadow: dict[str, Shadow] = {}
-        for name, versions in self._policies.items():
-            self._arrange(name, versions, (plans or {}).get(name) or _newest(versions))
+        loaded: dict[str, dict[str, Policy]] = {}
+        for policy in sorted(policies, key=lambda each: version_key(each.contract.version)):
+            loaded.setdefault(policy.contract.name, {})[policy.contract.version] = policy
+        self._served = {name: _serve(name, versions, plans[name]) for name, versions in loaded.items()}
         before: dict[Policy, Batcher] = {} if replaces is None else replaces._batchers
         self._batchers: dict[Policy, Batcher] = {
             policy: before.get(policy) or Batcher(policy.network(), policy.options.micro_batch)
-            for versions in self._policies.values()
+            for versions in loaded.values()
             for policy in versions.values()
             if _wants_batches(policy)
         }
         self.batches = bool(self._batchers)
         """Whether some policy computes together what comes at the same time."""
 
-    @classmethod
-    def load(
-        cls,
-        paths: Iterable[str | Path],
-        *,
-        threads: int = 1,
-        options: Mapping[str, PolicyOptions] | None = None,
-    ) -> PolicyStore:
-        """Load every bundle at or below `paths` (bundles, policy folders, repositories).
-
-        `options` are by policy name; '*' is for those not named.
-
-        Hashes, graphs and golden vectors are checked. A server with some of its policies would be found out by a
-        robot, so one bad bundle refuses the start: raises BundleError that lists every bad one, or UsageError.
-        """
-        folders: dict[Path, Path] = {}  # resolved -> as given: the same folder given twice is loaded once
-        failures: list[RlservoError] = []
-        for path in paths:
-            try:
-                folders.update({folder.resolve(): folder for folder in find_bundles(path)})
-            except BundleError as error:
-                failures.append(error)
-        policies: list[Policy] = []
-        for folder in folders.values():
-            try:
-                policies.append(load_policy(folder, threads=threads, options=options))
-            except BundleError as error:
-                failures.append(error)
-        if len(failures) == 1:
-            raise failures[0]
-        if failures:
-            sentences = "; ".join(error.message for error in failures)
-            raise BundleError(f"{len(failures)} bundles cannot be served: {sentences}")
-        return cls(policies)
-
     @property
     def names(self) -> tuple[str, ...]:
         """The policies' names, sorted."""
-        return tuple(sorted(self._policies))
+        return tuple(sorted(self._served))
 
     def versions(self, name: str) -> tuple[str, ...]:
         """The versions of a policy, oldest first. Raises UnknownPolicyError."""
-        return tuple(self._versions(name))
+        return tuple(self._find(name).versions)
 
     def default(self, name: str) -> str:
         """The version of whoever asks for none. Raises UnknownPolicyError."""
@@ -175,32 +131,38 @@ class PolicyStore:
 
         Raises UnknownPolicyError or UnknownVersionError.
         """
+        served = self._find(name)
         if version is None:
-            default = self._default.get(name)
-            if default is not None:
-                return default
-        versions = self._versions(name)
-        policy = versions.get(version or "") or self._aliases[name].get(version or "")
+            return served.default
+        plan = served.plan
+        policy = served.versions.get(plan.version_of(version) or "")
         if policy is None:
-            aliases = self._aliases[name]
+            aliases = [alias for alias, target in sorted(plan.aliases.items()) if target in served.versions]
             also = f", aliases are {', '.join(aliases)}" if aliases else ""
             raise UnknownVersionError(
-                f"policy '{name}' has no version '{str(version)[:32]}': loaded are {', '.join(versions)}{also}",
-                {"policy": name, "versions": list(versions), "aliases": list(aliases)},
+                f"policy '{name}' has no version '{version[:32]}': loaded are {', '.join(served.versions)}{also}",
+                {"policy": name, "versions": list(served.versions), "aliases": aliases},
             )
         return policy
 
     def find(self, name: str, identity: str) -> Policy | None:
-        """Return the policy of a name that a memory belongs to (`Policy.identity`), if it is loaded."""
-        return next((each for each in self._policies.get(name, {}).values() if each.identity == identity), None)
+        """Return the policy of a name that a recurrent state is of (`Policy.identity`), if it is loaded."""
+        served = self._served.get(name)
+        versions = () if served is None else served.versions.values()
+        return next((each for each in versions if each.identity == identity), None)
+
+    def has(self, policy: Policy) -> bool:
+        """Whether this very policy is loaded, and not another one under its name and version."""
+        served = self._served.get(policy.contract.name)
+        return served is not None and served.versions.get(policy.contract.version) is policy
 
     def is_certain(self, name: str, version: str | None) -> bool:
-        """Whether a memory that does not say whose it is can only be of the policy that this request gets.
+        """Whether a recurrent state that does not say whose it is can only be of the policy that this request gets.
 
         So it is where the version itself is named (an alias may lead elsewhere by now), and where there is and was
         only one.
         """
-        versions = self._versions(name)
+        versions = self._find(name).versions
         return version in versions or (len(versions) == 1 and name not in self._changed)
 
     def version_of(self, name: str, reference: str) -> str:
@@ -210,21 +172,21 @@ class PolicyStore:
         except UnknownPolicyError:
             return ""
 
-    def choose(self, name: str, version: str | None, session: str | None) -> Policy:
-        """Return the policy that a request gets: as `get`, but where a canary runs, a share of the sessions get that.
+    def choose(self, name: str, version: str | None, label: str | None) -> Policy:
+        """Return the policy that a request gets: as `get`, but where a canary runs, a share of the labels get that.
 
-        All requests of a session get the same one, on every replica, for as long as the share does not change; a larger
+        All requests of a label get the same one, on every replica, for as long as the share does not change; a larger
         share keeps those it had. Raises what `get` raises.
         """
-        if version is None and self._canary:
-            canary = self._canary.get(name)
-            if canary is not None and _draw(name, session, canary.needs_session) < canary.share:
+        if version is None:
+            canary = self._find(name).canary
+            if canary is not None and _draw(name, label, canary.needs_label) < canary.share:
                 return canary.policy
         return self.get(name, version)
 
     def shadow(self, name: str) -> Shadow | None:
         """Return the version that computes along, if there is one."""
-        return self._shadow.get(name)
+        return self._find(name).shadow
 
     def batcher_of(self, policy: Policy) -> Batcher | None:
         """Return what gathers the single observations for a policy; None where each is computed by itself."""
@@ -238,13 +200,13 @@ class PolicyStore:
         *,
         explore: bool = False,
         seed: int | None = None,
-        session: str | None = None,
+        label: str | None = None,
     ) -> Decision:
         """Decide for `obs`: an action for one observation, a batch for a batch.
 
         Raises UnknownPolicyError, UnknownVersionError and what `Policy.act` raises.
         """
-        return _act(self._stateless(name, version, session), obs, explore, seed)
+        return _act(self._stateless(name, version, label), obs, explore, seed)
 
     async def act_together(
         self,
@@ -252,96 +214,88 @@ class PolicyStore:
         version: str | None,
         obs: Observation,
         *,
-        session: str | None = None,
+        label: str | None = None,
         check: Callable[[], None] | None = None,
     ) -> Decision:
         """Decide as `act` does without exploring; with what else is there in one run where the policy's options say so.
 
-        `check` is asked again right before the network runs. Raises what it and `act` raise.
+        `check` is called again right before the network runs. Raises what it and `act` raise.
         """
-        policy = self._stateless(name, version, session)
+        policy = self._stateless(name, version, label)
         batcher = self._batchers.get(policy)
         if batcher is None:
             return _act(policy, obs)
-        policy.notices.clear()
         started = time.perf_counter()
-        feed, batch = policy.read(obs)
-        notices = take_notices(policy)
-        read_ms = (time.perf_counter() - started) * 1e3
-        single = len(next(iter(feed.values()))) == 1  # also a batch of one: the Open Inference Protocol has no other
+        feed, batch, notices = policy.parse(obs)
+        parse_ms = (time.perf_counter() - started) * 1e3
+        rows = len(next(iter(feed.values())))
+        single = rows == 1  # also a batch of one: the Open Inference Protocol has no other
         computed = await batcher.compute(feed, check) if single else batcher.compute_now(feed)
         started = time.perf_counter()
-        action = policy.action(computed.outputs, batch=batch)
-        infer_ms = read_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
-        space = policy.contract.action_space
+        action = policy.build_action(computed.outputs, batch=batch)
+        infer_ms = parse_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
         version = policy.contract.version
-        sharers = computed.requests
-        return Decision(action, name, version, infer_ms, batch_of(action, space), notices, sharers=sharers)
+        return Decision(action, name, version, infer_ms, rows if batch else None, notices, sharers=computed.requests)
 
     def close(self) -> None:
         """Close every policy; what is waiting to be computed with others is computed."""
         self._batchers = {}
-        for versions in self._policies.values():
-            for policy in versions.values():
+        for served in self._served.values():
+            for policy in served.versions.values():
                 policy.close()
 
-    def _arrange(self, name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> None:
-        default = versions.get(plan.default or "")
-        if default is None:
-            raise UsageError(f"policy '{name}' is to be served as version {plan.default}, which is not loaded")
-        self._default[name] = default
-        self._aliases[name] = {alias: versions[v] for alias, v in sorted(plan.aliases.items()) if v in versions}
-        canary = plan.canary and versions.get(plan.version_of(plan.canary.version) or "")
-        if canary and plan.canary:
-            self._canary[name] = _Canary(canary, plan.canary.share, canary.episodic)
-        shadow = versions.get((plan.shadow and plan.version_of(plan.shadow)) or "")
-        if shadow is not None and shadow is not default:
-            self._shadow[name] = Shadow(default.contract.version, shadow.contract.version, shadow.twin())
-
-    def _stateless(self, name: str, version: str | None, session: str | None) -> Policy:
-        policy = self.choose(name, version, session)
-        if policy.episodic:  # its memory belongs to one episode, and a server has many callers
-            raise RequestError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}", NEEDS)
+    def _stateless(self, name: str, version: str | None, label: str | None) -> Policy:
+        policy = self.choose(name, version, label)
+        if policy.is_stateful:  # its recurrent state belongs to one episode, and a server has many callers
+            raise StateNeededError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}")
         return policy
 
-    def _versions(self, name: str) -> Mapping[str, Policy]:
-        versions = self._policies.get(name)
-        if versions is None:
+    def _find(self, name: str) -> _Served:
+        served = self._served.get(name)
+        if served is None:
             raise UnknownPolicyError(
                 f"no policy '{name[:64]}' is loaded: this server has {', '.join(self.names) or 'none'}",
                 {"policies": list(self.names)},
             )
-        return versions
+        return served
+
+
+def _serve(name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> _Served:
+    default = versions.get(plan.default or "")
+    if default is None:
+        raise UsageError(f"policy '{name}' is to be served as version {plan.default}, which is not loaded")
+    canary: _Canary | None = None
+    if plan.canary is not None:
+        policy = versions.get(plan.version_of(plan.canary.version) or "")
+        canary = None if policy is None else _Canary(policy, plan.canary.share, policy.is_stateful)
+    shadow: Shadow | None = None
+    if plan.shadow is not None:
+        policy = versions.get(plan.version_of(plan.shadow) or "")
+        if policy is not None and policy is not default:
+            shadow = Shadow(default.contract.version, policy.contract.version, policy.clone())
+    return _Served(plan, versions, default, canary, shadow)
 
 
 def _wants_batches(policy: Policy) -> bool:
     """Return whether single observations are computed together: the options say so, and nothing else goes in."""
     contract = policy.contract
     observed = leaf_specs(contract.observation_space, "obs")
-    return policy.options.micro_batch > 1 and not policy.episodic and len(contract.inputs) == len(observed)
-
-
-def _newest(versions: Mapping[str, Policy]) -> PolicyPlan:
-    return PolicyPlan(versions=dict.fromkeys(versions, ""), aliases={PRODUCTION: list(versions)[-1]})
+    return policy.options.micro_batch > 1 and not policy.is_stateful and len(contract.inputs) == len(observed)
 
 
 def _act(policy: Policy, obs: Observation, explore: bool = False, seed: int | None = None) -> Decision:
-    if policy.notices:
-        policy.notices.clear()
     started = time.perf_counter()
-    action = policy.act(obs, explore=explore, seed=seed)
+    step = policy.step(obs, explore=explore, seed=seed)
     infer_ms = (time.perf_counter() - started) * 1e3
     contract = policy.contract
-    notices = take_notices(policy) if policy.notices else ()
-    batch = batch_of(action, contract.action_space)
-    return Decision(action, contract.name, contract.version, infer_ms, batch, notices)
+    return Decision(step.action, contract.name, contract.version, infer_ms, step.batch, step.notices)
 
 
-def _draw(name: str, session: str | None, needs_session: bool) -> float:
-    """Return a number in [0, 1): the session's own, or without one a random one."""
-    if session is None:
-        return 1.0 if needs_session else random.random()
-    digest = hashlib.blake2b(f"{name}/{session}".encode("utf-8", "surrogatepass"), digest_size=8).digest()
+def _draw(name: str, label: str | None, needs_label: bool) -> float:
+    """Return a number in [0, 1): the label's own, or without one a random one."""
+    if label is None:
+        return 1.0 if needs_label else random.random()
+    digest = hashlib.blake2b(f"{name}/{label}".encode("utf-8", "surrogatepass"), digest_size=8).digest()
     return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
 
 
@@ -354,23 +308,6 @@ NEEDS_LAST = (
     f"has a limit on the step from one action to the next: {CARRY}, or 'last_action' (in the Open Inference Protocol "
     f"an input, or 'sequence_start' for the first), or {SESSION}"
 )
-NEEDS: dict[str, Any] = {"send": "state"}
-"""Details of both refusals: a client that did not know that it has to carry something learns it from them."""
-
-
-def batch_of(action: Any, space: SpaceSpec) -> int | None:
-    """Return how many actions a batch holds; None for a single one. The first leaf tells."""
-    while isinstance(space, DictSpec | TupleSpec):
-        key: Any = next(iter(space.spaces)) if isinstance(space, DictSpec) else 0
-        action, space = action[key], space.spaces[key]
-    return len(action) if action.ndim > len(space.shape) else None
-
-
-def take_notices(policy: Policy) -> tuple[str, ...]:
-    """Return what the policy noticed since it was last asked."""
-    taken = tuple(policy.notices)
-    policy.notices.clear()
-    return taken
 
 
 def load_policy(

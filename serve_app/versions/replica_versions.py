@@ -13,11 +13,10 @@ import contextlib
 import logging
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import Any, NoReturn
 
-from rlservo.export.contract.contract import Contract, version_key
+from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import (
     BundleError,
     PartlyAppliedError,
@@ -26,8 +25,8 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
-from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.loaded_policies import Library, Loaded
+from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions.loaded_policies import Loadable, LoadedPolicies, LoadedPolicy
 from rlservo.serve_app.versions.plan import (
     FailedVersion,
     Plan,
@@ -36,43 +35,25 @@ from rlservo.serve_app.versions.plan import (
     ServedConfig,
     config_hash,
     now,
-    plan_of,
 )
-from rlservo.serve_app.versions.plan import load as add_version
+from rlservo.serve_app.versions.plan_ledger import ATTEMPTS, Ledger, PlanLedger
+from rlservo.serve_app.versions.plan_proof import prove
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.repository import Key, raise_all
+from rlservo.serve_app.versions.repository import Key
+from rlservo.serve_app.versions.version_loader import VersionLoader
 
 logger = logging.getLogger(__name__)
 
-ATTEMPTS = 10  # at a number in the ledger, before a change gives up
-WATCH_PERIOD_S = 2.0  # [s] between looks at the ledger, for a replica that nobody told
+LEDGER_POLL_S = 2.0  # [s] between looks at the ledger, for a replica that nobody told
 RETRY_PERIOD_S = 30.0  # [s] between attempts of a replica that could not follow
 REFUSALS = (BundleError, RefusedError, UsageError)  # of the repository, of the proof
 
-Result = TypeVar("Result")
-Loadable = tuple[str, str, str]  # (name, version, hash)
 Change = Callable[[Plan], dict[str, PolicyPlan]]
 
 
-class Ledger(Protocol):
-    """Numbered plans that all replicas see and only add to."""
-
-    def newest(self) -> int:
-        """Return the highest number, 0 when there is none."""
-        ...
-
-    def read(self, generation: int) -> bytes | None:
-        """Return a plan; None when it is not there (any more)."""
-        ...
-
-    def append(self, generation: int, content: bytes) -> bool:
-        """Write a plan under a number that is free; return False when it is not."""
-        ...
-
-
 @dataclass(frozen=True)
-class Following:
-    """What a replica answers when it is told of a plan."""
+class ReplicaProgress:
+    """How far a replica has followed the plans, as it answers when it is to follow one."""
 
     replica: str
     generation: int
@@ -88,17 +69,17 @@ class VersionState:
     loaded_at: str | None = None
 
 
-Broadcast = Callable[[int], Awaitable[Sequence[Following]]]
+Broadcast = Callable[[int], Awaitable[Sequence[ReplicaProgress]]]
 Gather = Callable[[], Awaitable[Sequence[Any]]]
 IsCurrent = Callable[[Any], Awaitable[bool]]
 
 
-class Control:
-    """What this replica serves, and how that changes."""
+class ReplicaVersions:
+    """Versions that this replica serves, and their changes."""
 
     def __init__(
         self,
-        library: Library,
+        policies: LoadedPolicies,
         ledger: Ledger,
         *,
         replica: str = "",
@@ -117,23 +98,16 @@ class Control:
         self.plan: Plan | None = None
         self.replica = replica
         self.gather = gather
-        self._library = library
-        self._ledger = ledger
+        self._loader = VersionLoader(policies, scan_timeout_s=scan_timeout_s, load_timeout_s=load_timeout_s)
+        self._ledger = PlanLedger(ledger)
         self._broadcast = broadcast
         self._is_current = is_current
-        self._serving: dict[str, PolicyPlan] = {}
         self._served: dict[str, set[str]] = {}  # every identity that was ever served here, by name
-        self._loading: dict[Loadable, asyncio.Task[Loaded]] = {}
-        self._given_up: dict[Loadable, UnavailableError] = {}
         self._proposed: list[set[Loadable]] = []  # what changes that are under way have loaded, and no plan has yet
-        self._calls = BlockingCalls()
-        self._scan_timeout_s = scan_timeout_s
-        self._load_timeout_s = load_timeout_s
         self._failed: dict[Key, str] = {}
         self._behind: tuple[str, ...] = ()
         self._tried_at = 0.0
         self._writing = asyncio.Lock()  # held while a change that has been proven is written down
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="ledger")
 
     async def configure(self, document: Any) -> None:
         """Serve what a configuration says, unless the ledger says something later.
@@ -143,12 +117,12 @@ class Control:
         """
         digest = config_hash(document)
         for _ in range(ATTEMPTS):
-            before = await self._newest()
+            before = await self._ledger.newest()
             if before is not None and (before.config == digest or await self._is_late(document)):
                 await self._apply(before)
                 return
             plan = await self._configured(document, digest, before)
-            if await self._append(plan):
+            if await self._ledger.append(plan):
                 await self._apply(plan)
                 return
         raise UnavailableError("the other replicas keep changing what is served: configure again")
@@ -159,10 +133,10 @@ class Control:
         Raises what `Repository.find` and `change` raise, and UnavailableError where the repository does not answer.
         """
         try:
-            found, digest = await self._look(self._library.repository.find_digest, name, version)
+            found, digest = await self._loader.find_digest(name, version)
         except REFUSALS as error:
             await self._refuse(what, error)
-        return await self.change(lambda before: add_version(before, name, found, digest), what=what)
+        return await self.change(lambda before: plan_changes.load(before, name, found, digest), what=what)
 
     async def change(self, change: Change, *, what: str) -> Plan:
         """Make a change and return the plan when every replica serves it.
@@ -171,7 +145,7 @@ class Control:
         version cannot be served (then nothing has changed), and PartlyAppliedError when some replicas could not follow
         (the change stands).
         """
-        before = await self._newest()
+        before = await self._ledger.newest()
         if before is None or self.store is None:
             raise UnavailableError("the policies are still being loaded: try again shortly")
         policies = change(before)
@@ -179,7 +153,7 @@ class Control:
         self._proposed.append(proposed)
         try:
             try:
-                await self._prove(policies, before.policies)  # takes its time, while others change what they want
+                await prove(self._loader, policies, before.policies)  # meanwhile others may change what they want
                 plan = await self._write(change, what)
             except REFUSALS as error:
                 await self._refuse(what, error)
@@ -200,16 +174,17 @@ class Control:
         """Append a change of the newest plan, or the refusal of one, to the ledger."""
         async with self._writing:
             for _ in range(ATTEMPTS):
-                before = await self._newest()
+                before = await self._ledger.newest()
                 if before is None:
                     raise UnavailableError("the policies are still being loaded: try again shortly")
                 if isinstance(change, Refusal):
                     plan = before.refusing(change)
                 else:
                     policies = change(before)
-                    await self._prove(policies, before.policies)  # loaded by now, unless others changed the same policy
+                    # Loaded by now, unless others changed the same policy.
+                    await prove(self._loader, policies, before.policies)
                     plan = before.after(policies, what)
-                if await self._append(plan):
+                if await self._ledger.append(plan):
                     return plan
         raise UnavailableError("others keep changing what is served: try again")
 
@@ -217,38 +192,34 @@ class Control:
         """Write down for all that a change was refused, and why; raise RefusedError."""
         plan = await self._write(_refusal(what, error), what)
         await self._apply(plan)
-        with contextlib.suppress(PartlyAppliedError):  # who was not told looks for himself
+        with contextlib.suppress(PartlyAppliedError):  # who was not told polls the ledger
             await self._tell(plan.generation)
         raise RefusedError(f"refused, and nothing has changed: {error.message}", error.details) from None
 
-    async def follow(self, generation: int = 0, *, again: bool = False) -> Following:
+    async def follow(self, generation: int = 0, *, again: bool = False) -> ReplicaProgress:
         """Serve the newest plan; return whether this replica could. `again`: try also what was given up before."""
         reached = self.plan.generation if self.plan is not None else 0
-        if self._behind or reached < generation or reached < await self._in_thread(self._ledger.newest):
-            plan = await self._newest()
+        if self._behind or reached < generation or reached < await self._ledger.newest_generation():
+            plan = await self._ledger.newest()
             if plan is not None:
                 await self._apply(plan, again=again)
-        return self.following()
+        return self.progress()
 
-    def following(self) -> Following:
+    def progress(self) -> ReplicaProgress:
         """Return where this replica stands."""
-        return Following(self.replica, self.plan.generation if self.plan is not None else 0, self._behind)
+        return ReplicaProgress(self.replica, self.plan.generation if self.plan is not None else 0, self._behind)
 
-    async def watch(self) -> None:
-        """Follow what nobody told this replica of, until cancelled: it was starting, or cut off, at the time."""
+    async def poll_ledger(self) -> None:
+        """Follow plans that this replica was not told of (it was starting, or cut off), until cancelled."""
         while True:
-            await asyncio.sleep(WATCH_PERIOD_S)
+            await asyncio.sleep(LEDGER_POLL_S)
             try:
-                newest = await self._in_thread(self._ledger.newest)
+                newest = await self._ledger.newest_generation()
                 late = bool(self._behind) and time.monotonic() - self._tried_at > RETRY_PERIOD_S
                 if late or newest > (self.plan.generation if self.plan is not None else 0):
                     await self.follow(again=late)
             except Exception as error:  # the ledger may be out of reach for a while; what is served goes on
                 logger.warning("the ledger of policies could not be followed: %s", error)
-
-    def arranged(self, name: str) -> PolicyPlan | None:
-        """Return the plan by which this replica serves a policy."""
-        return self._serving.get(name)
 
     def states(self) -> dict[str, dict[str, VersionState]]:
         """Return how every version stands that is served, should be, or was refused."""
@@ -257,14 +228,13 @@ class Control:
             for failed in self.plan.refused.versions if self.plan.refused is not None else ():
                 states[failed.name, failed.version] = VersionState("failed", failed.reason)
         states.update({key: VersionState("failed", reason) for key, reason in self._failed.items()})
-        for name, policy in self._serving.items():
+        for name, policy in ({} if self.store is None else self.store.plans).items():
             for version, digest in policy.versions.items():
-                loaded = self._library.get(name, version, digest)
+                loaded = self._loader.policies.get(name, version, digest)
                 if loaded is not None:
                     reason = states[name, version].reason if (name, version) in states else ""
                     states[name, version] = VersionState("ready", reason, loaded.loaded_at)
-        loading = {(name, version) for name, version, _ in self._loading}
-        states.update({key: VersionState("loading") for key in loading if key not in states})
+        states.update({key: VersionState("loading") for key in self._loader.loading if key not in states})
         by_name: dict[str, dict[str, VersionState]] = {}
         for (name, version), state in sorted(states.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
             by_name.setdefault(name, {})[version] = state
@@ -272,15 +242,15 @@ class Control:
 
     def close(self) -> None:
         """End the ledger's thread."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
+        self._ledger.close()
 
     async def _configured(self, document: Any, digest: str, before: Plan | None) -> Plan:
         """Return the plan that a configuration means, or the one that refuses it."""
         try:
-            config = ServedConfig.read(document)
-            available = await self._look(self._library.repository.available, config)
-            policies = plan_of(config, available, before)
-            await self._prove(policies, {} if before is None else before.policies)
+            config = ServedConfig.parse(document)
+            available = await self._loader.available(config)
+            policies = plan_changes.plan_of(config, available, before)
+            await prove(self._loader, policies, {} if before is None else before.policies)
         except RlservoError as error:
             if before is None:
                 raise
@@ -290,112 +260,31 @@ class Control:
             return Plan(generation=1, config=digest, policies=policies, changed_at=now(), changed_by="configuration")
         return before.after(policies, "configuration").model_copy(update={"config": digest})
 
-    async def _prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> None:
-        """Load what is new or newly relied on in `policies`. Raises RefusedError with all that cannot be served."""
-        failures: list[tuple[Key, RlservoError]] = []
-        for name, policy in policies.items():
-            was = before.get(name)
-            if policy == was:
-                continue
-            relied_on = {policy.default, *policy.aliases.values()}
-            known = {} if was is None else was.versions
-            for version, digest in policy.versions.items():
-                if known.get(version) != digest or version in relied_on:
-                    try:
-                        await self._load(name, version, digest)
-                    except RlservoError as error:
-                        failures.append(((name, version), error))
-            if not failures:
-                await self._check_companions(name, policy)
-        if failures:
-            details = {"versions": [{"name": n, "version": v, "reason": e.message} for (n, v), e in failures]}
-            try:
-                raise_all([BundleError(error.message) for _, error in failures])
-            except BundleError as error:
-                raise RefusedError(error.message, details) from None
-
-    async def _check_companions(self, name: str, policy: PolicyPlan) -> None:
-        """Refuse a canary or shadow that reads or gives something else than the default version."""
-        references = {"canary": policy.canary and policy.canary.version, "shadow": policy.shadow}
-        for role, reference in references.items():
-            version = policy.version_of(reference) if reference else None
-            if version is None or policy.default is None:
-                continue
-            theirs = (await self._load(name, version, policy.versions[version])).policy.contract
-            ours = (await self._load(name, policy.default, policy.versions[policy.default])).policy.contract
-            if _interface(theirs) != _interface(ours):
-                raise RefusedError(
-                    f"policy '{name}' version {version} cannot be the {role} of version {policy.default}: its "
-                    "observations or actions are of other names, types or shapes"
-                )
-            if role == "canary" and theirs.state != ours.state:
-                raise RefusedError(
-                    f"policy '{name}' version {version} cannot be the canary of version {policy.default}: what it "
-                    "remembers of an episode is something else"
-                )
-            if role == "shadow" and theirs.state:
-                raise RefusedError(
-                    f"policy '{name}' version {version} remembers its episode: a shadow computes on single observations"
-                )
-
-    async def _look(self, function: Callable[..., Result], *arguments: Any) -> Result:
-        what = "looking through the policies' folders"
-        return await self._calls.run(function, *arguments, timeout_s=self._scan_timeout_s, what=what)
-
-    async def _load(self, name: str, version: str, digest: str, *, again: bool = True) -> Loaded:
-        """Load a version unless it is in memory; not `again`: one that was given up is not waited for another time."""
-        loaded = self._library.get(name, version, digest)
-        if loaded is not None:
-            return loaded
-        key = (name, version, digest)
-        if key in self._given_up and not again:
-            raise self._given_up[key]
-        task = self._loading.get(key)
-        if task is None:  # whoever else wants it meanwhile waits for the same
-            task = self._loading[key] = asyncio.create_task(self._load_now(key))
-            task.add_done_callback(lambda done: self._loaded(key, done))
-        return await asyncio.shield(task)
-
-    async def _load_now(self, key: Loadable) -> Loaded:
-        what = f"loading policy '{key[0]}' version {key[1]}"
-        try:
-            loaded = await self._calls.run(self._library.load, *key, timeout_s=self._load_timeout_s, what=what)
-        except UnavailableError as given_up:
-            self._given_up[key] = given_up
-            raise
-        self._given_up.pop(key, None)
-        return loaded
-
-    def _loaded(self, key: Loadable, done: asyncio.Task[Loaded]) -> None:
-        del self._loading[key]
-        if not done.cancelled():
-            done.exception()  # who waited has it; if nobody did any more, asyncio would complain
-
     async def _apply(self, plan: Plan, *, again: bool = False) -> None:
         """Serve a plan: policy by policy as a whole, so that one which cannot be loaded stays as it was.
 
         Raises BundleError when this replica serves nothing yet and a default version cannot be loaded.
         """
         self._tried_at = time.monotonic()
-        found: dict[Loadable, Loaded | RlservoError] = {}
+        found: dict[Loadable, LoadedPolicy | RlservoError] = {}
         for name, wanted in plan.policies.items():
             for version, digest in wanted.versions.items():
                 try:
-                    found[name, version, digest] = await self._load(name, version, digest, again=again)
+                    found[name, version, digest] = await self._loader.load(name, version, digest, again=again)
                 except RlservoError as error:
                     found[name, version, digest] = error
         self._arrange(plan, found)
 
-    def _arrange(self, plan: Plan, found: Mapping[Loadable, Loaded | RlservoError]) -> None:
+    def _arrange(self, plan: Plan, found: Mapping[Loadable, LoadedPolicy | RlservoError]) -> None:
         """Serve a plan with what of it could be loaded. Nothing waits here: who asks sees all of the old or the new."""
         if self.plan is not None and plan.generation < self.plan.generation:
             return  # while this one was being loaded, a later one has been served
         serving: dict[str, PolicyPlan] = {}
-        kept: dict[Loadable, Loaded] = {}
+        kept: dict[Loadable, LoadedPolicy] = {}
         failed: dict[Key, str] = {}
         behind: list[str] = []
         for name, wanted in plan.policies.items():
-            loaded: dict[Loadable, Loaded] = {}
+            loaded: dict[Loadable, LoadedPolicy] = {}
             errors: dict[str, RlservoError] = {}
             for version, digest in wanted.versions.items():
                 one = found[name, version, digest]
@@ -405,11 +294,11 @@ class Control:
                 else:
                     loaded[name, version, digest] = one
             behind += [error.message for error in errors.values()]
-            was = self._serving.get(name)
+            was = None if self.store is None else self.store.plans.get(name)
             if errors and was is not None:
                 wanted = was
                 keys = [(name, version, digest) for version, digest in was.versions.items()]
-                loaded = {key: each for key in keys if (each := self._library.get(*key)) is not None}
+                loaded = {key: each for key in keys if (each := self._loader.policies.get(*key)) is not None}
             elif errors and wanted.default in errors:
                 if self.store is not None:
                     continue  # not served here rather than as another version; `behind` says so
@@ -419,53 +308,30 @@ class Control:
                 )
             serving[name] = wanted
             kept.update(loaded)
-        self._library.keep(kept, set().union(*self._proposed))
+        self._loader.policies.keep(kept, set().union(*self._proposed))
         policies = [loaded.policy for loaded in kept.values()]
         for policy in policies:
             self._served.setdefault(policy.contract.name, set()).add(policy.identity)
         changed = [name for name, identities in self._served.items() if len(identities) > 1]
         self.store = PolicyStore(policies, serving, changed=changed, replaces=self.store)
-        self._given_up = {key: error for key, error in self._given_up.items() if key in found}
-        self.plan, self._serving, self._failed, self._behind = plan, serving, failed, tuple(behind)
+        self._loader.forget_others(found)
+        self.plan, self._failed, self._behind = plan, failed, tuple(behind)
         if behind:
             logger.error("generation %d cannot be served as it should: %s", plan.generation, "; ".join(behind))
         else:
             logger.info("serving generation %d (%s)", plan.generation, plan.changed_by)
 
-    async def _tell(self, generation: int) -> list[Following]:
+    async def _tell(self, generation: int) -> list[ReplicaProgress]:
         """Tell every replica; return those that did not follow."""
-        replies = [self.following()] if self._broadcast is None else await self._broadcast(generation)
+        replies = [self.progress()] if self._broadcast is None else await self._broadcast(generation)
         return [reply for reply in replies if reply.behind or reply.generation < generation]
 
     async def _is_late(self, document: Any) -> bool:
         return self._is_current is not None and not await self._is_current(document)
 
-    async def _newest(self) -> Plan | None:
-        for _ in range(ATTEMPTS):  # it may be gone by the time it is read, when many follow at once
-            generation = await self._in_thread(self._ledger.newest)
-            if generation == 0:
-                return None
-            content = await self._in_thread(self._ledger.read, generation)
-            if content is not None:
-                return Plan.model_validate_json(content)
-        raise UnavailableError("the ledger of policies changes faster than it can be read")
-
-    async def _append(self, plan: Plan) -> bool:
-        return await self._in_thread(self._ledger.append, plan.generation, plan.model_dump_json().encode())
-
-    async def _in_thread(self, function: Callable[..., Result], *arguments: Any) -> Result:
-        return await asyncio.get_running_loop().run_in_executor(self._thread, function, *arguments)
-
 
 def _loadables(policies: Mapping[str, PolicyPlan]) -> set[Loadable]:
     return {(name, version, digest) for name, each in policies.items() for version, digest in each.versions.items()}
-
-
-def _interface(contract: Contract) -> tuple[Any, ...]:
-    """Return what a caller must know of a policy: what goes in and what comes out."""
-    inputs = tuple(tensor for tensor in contract.inputs if not tensor.name.startswith("state_in."))
-    actions = tuple(tensor for tensor in contract.outputs if tensor.name.split(".")[0] == "action")
-    return inputs, actions
 
 
 def _refusal(change: str, error: RlservoError) -> Refusal:

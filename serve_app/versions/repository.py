@@ -2,7 +2,7 @@
 
 A name or version that a request brings is only ever compared with what the folders hold; no path is made of it.
 Everything here blocks (hashing, onnxruntime, golden vectors), and may do so for ever where a file system hangs:
-`replica_versions.py` calls it through `BlockingCalls`.
+`version_loader.py` calls it through `BlockingCalls`.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ BOUNDS = (1e-6, 1e-5, 1e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0
 
 
 class _Series:
-    """What is known of one candidate beside one default version."""
+    """Differences and counts of one candidate beside one default version."""
 
     def __init__(self) -> None:
         self.counts = np.zeros(len(BOUNDS) + 1, np.int64)
@@ -49,10 +49,10 @@ class Shadows:
     def offer(self, shadow: Shadow, obs: Any, decision: Decision) -> None:
         """Have the candidate compute on `obs` some time later. Never waits.
 
-        One that remembers its episode is left out: it would need a memory of its own beside every caller's.
+        One that remembers its episode is left out: it would need a recurrent state of its own beside every caller's.
         """
-        if shadow.policy.episodic:
-            self._of(shadow, decision).left_out += 1
+        if shadow.policy.is_stateful:
+            self._series_of(shadow, decision).left_out += 1
             return
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="shadow", daemon=True)
@@ -60,7 +60,7 @@ class Shadows:
         try:
             self._waiting.put_nowait((shadow, obs, decision))
         except queue.Full:
-            self._of(shadow, decision).left_out += 1
+            self._series_of(shadow, decision).left_out += 1
 
     def describe(self, policy: str, version: str, shadow: str) -> dict[str, Any]:
         """Return how the candidate compares so far, on this replica."""
@@ -98,7 +98,7 @@ class Shadows:
     def _run(self) -> None:
         while True:
             shadow, obs, decision = self._waiting.get()
-            series = self._of(shadow, decision)
+            series = self._series_of(shadow, decision)
             try:
                 differences = _differences(shadow.policy.act(obs), decision.action, batch=decision.batch)
             except RlservoError:  # its action left the space, say: that is what a shadow is run for
@@ -112,7 +112,7 @@ class Shadows:
             series.total += float(differences.sum())
             series.largest = max(series.largest, float(differences.max(initial=0.0)))
 
-    def _of(self, shadow: Shadow, decision: Decision) -> _Series:
+    def _series_of(self, shadow: Shadow, decision: Decision) -> _Series:
         return self._series.setdefault((decision.name, decision.version, shadow.version), _Series())
 
 

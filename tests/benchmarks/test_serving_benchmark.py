@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -24,7 +23,6 @@ import soak as soak_module
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 from soak import Track, mix, soak
 from speed import report
@@ -34,6 +32,7 @@ from speed.machine import OTHER, PROXY, REPLICA, processes
 from speed.report import Result, Verdict, verdicts
 from speed.rounds import JSON1, JSON16, Rounds, Sample, check_answers
 from speed.servers import Exchange, Server, listening, running
+from stores import load_store
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 UR5 = ROOT / "examples" / "checkpoints" / "ur5_positioning"
@@ -41,17 +40,14 @@ needs_wrk = pytest.mark.skipif(shutil.which("wrk") is None, reason="wrk is not i
 
 
 @pytest.fixture(scope="module")
-def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
-    out = tmp_path_factory.mktemp("policies")
-    command = [sys.executable, "-m", "rlservo.deploy.cli", "export", str(UR5), "--out", str(out), "--name", "ur5"]
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
-    return case_of(out / "ur5", UR5)
+def case(shipped: Path) -> Case:
+    return case_of(shipped / "ur5", UR5)
 
 
 @pytest.fixture(scope="module")
 def server(case: Case) -> Iterator[Server]:
     """Our application in this process, behind uvicorn instead of Ray Serve."""
-    store = PolicyStore.load([case.bundle.path])
+    store = load_store(case.bundle.path)
     app = create_app(lambda: store, ServerSettings())
     with socket.create_server(("127.0.0.1", 0)) as listener:
         uvicorn_server = uvicorn.Server(uvicorn.Config(app, log_level="critical", access_log=False))

@@ -1,6 +1,8 @@
 """Sequences as `tritonclient` keeps them, over every way it has, by the unchanged client in an environment of its own.
 
-python triton_sequences.py HTTP_HOST:PORT GRPC_HOST:PORT MODEL < {"obs": [[...], ...]}   prints the actions, as JSON.
+python triton_sequences.py HTTP_HOST:PORT GRPC_HOST:PORT MODEL KEY < {"obs": [[...], ...]}
+
+prints the actions, as JSON.
 Every way plays two sequences in turns; the second one starts a step later, and sees the observations backwards.
 """
 
@@ -39,6 +41,11 @@ def tensor(kind: Any, obs: Any) -> list[Any]:
     return [given]
 
 
+def keyed(key: str) -> dict[str, str]:
+    """Return the headers of one request: the HTTP client writes its own into what it is given."""
+    return {"authorization": f"Bearer {key}"}
+
+
 def play(obs: Any, ids: tuple[Any, Any], ask: Callable[[Any, dict[str, Any]], Any]) -> list[list[Any]]:
     actions: list[list[Any]] = [[], []]
     for which, seen, options in steps(obs, *ids):
@@ -46,19 +53,19 @@ def play(obs: Any, ids: tuple[Any, Any], ask: Callable[[Any, dict[str, Any]], An
     return actions
 
 
-async def play_aio(obs: Any, ids: tuple[Any, Any], kind: Any, url: str, model: str) -> list[list[Any]]:
+async def play_aio(obs: Any, ids: tuple[Any, Any], kind: Any, url: str, model: str, key: str) -> list[list[Any]]:
     actions: list[list[Any]] = [[], []]
     async with kind.InferenceServerClient(url) as client:
         for which, seen, options in steps(obs, *ids):
-            reply = await client.infer(model, tensor(kind, seen), **options)
+            reply = await client.infer(model, tensor(kind, seen), **options, headers=keyed(key))
             actions[which].append(reply.as_numpy("action")[0].tolist())
     return actions
 
 
-def play_stream(obs: Any, ids: tuple[Any, Any], client: Any, model: str) -> list[list[Any]]:
+def play_stream(obs: Any, ids: tuple[Any, Any], client: Any, model: str, key: str) -> list[list[Any]]:
     """Send everything at once on one stream, and read afterwards: replies come in the order of requests."""
     replies: queue.Queue[Any] = queue.Queue()
-    client.start_stream(partial(lambda q, result, error: q.put((result, error)), replies))
+    client.start_stream(partial(lambda q, result, error: q.put((result, error)), replies), headers=keyed(key))
     sent = list(steps(obs, *ids))
     for number, (_, seen, options) in enumerate(sent):
         client.async_stream_infer(model, tensor(triton_grpc, seen), request_id=str(number), **options)
@@ -73,24 +80,24 @@ def play_stream(obs: Any, ids: tuple[Any, Any], client: Any, model: str) -> list
 
 
 def main() -> None:
-    http_url, grpc_url, model = sys.argv[1:4]
+    http_url, grpc_url, model, key = sys.argv[1:5]
     obs = np.array(json.load(sys.stdin)["obs"], np.float32)
     out: dict[str, Any] = {}
     with triton_http.InferenceServerClient(http_url) as http, triton_grpc.InferenceServerClient(grpc_url) as grpc:
 
         def over_http(seen: Any, options: dict[str, Any]) -> Any:
-            return http.infer(model, tensor(triton_http, seen), **options)
+            return http.infer(model, tensor(triton_http, seen), **options, headers=keyed(key))
 
         def over_http_async(seen: Any, options: dict[str, Any]) -> Any:
-            return http.async_infer(model, tensor(triton_http, seen), **options).get_result()
+            return http.async_infer(model, tensor(triton_http, seen), **options, headers=keyed(key)).get_result()
 
         def over_grpc(seen: Any, options: dict[str, Any]) -> Any:
-            return grpc.infer(model, tensor(triton_grpc, seen), **options)
+            return grpc.infer(model, tensor(triton_grpc, seen), **options, headers=keyed(key))
 
         def over_grpc_async(seen: Any, options: dict[str, Any]) -> Any:
             replies: queue.Queue[Any] = queue.Queue()
             put = partial(lambda q, result, error: q.put((result, error)), replies)
-            grpc.async_infer(model, tensor(triton_grpc, seen), put, **options)
+            grpc.async_infer(model, tensor(triton_grpc, seen), put, **options, headers=keyed(key))
             result, error = replies.get(timeout=30)
             if error is not None:
                 raise error
@@ -100,7 +107,7 @@ def main() -> None:
         out["http async"] = play(obs, (12, "twelve"), over_http_async)
         out["grpc"] = play(obs, (11, "eleven"), over_grpc)  # ended above, and begun again here
         out["grpc async"] = play(obs, (14, "14"), over_grpc_async)  # two sequences
-        out["stream"] = play_stream(obs, (15, "fifteen"), grpc, model)
+        out["stream"] = play_stream(obs, (15, "fifteen"), grpc, model, key)
         refusals = []
         for ask in (over_http, over_grpc):
             for options in ({"sequence_id": 99}, {"sequence_id": 11}):  # never begun; ended
@@ -110,8 +117,8 @@ def main() -> None:
                 except InferenceServerException as error:
                     refusals.append(error.message())
         out["refusals"] = refusals
-    out["http aio"] = asyncio.run(play_aio(obs, (16, "sixteen"), triton_http_aio, http_url, model))
-    out["grpc aio"] = asyncio.run(play_aio(obs, (17, "seventeen"), triton_grpc_aio, grpc_url, model))
+    out["http aio"] = asyncio.run(play_aio(obs, (16, "sixteen"), triton_http_aio, http_url, model, key))
+    out["grpc aio"] = asyncio.run(play_aio(obs, (17, "seventeen"), triton_grpc_aio, grpc_url, model, key))
     print(json.dumps(out))
 
 

@@ -1,7 +1,13 @@
-"""The command line as a user types it: real commands, their output, their exit codes, their one-sentence errors."""
+"""The command line as a user types it: real commands, their output, their exit codes, their one-sentence errors.
+
+Each kind of command runs in a process of its own once; where more of them export or verify, they run in this process,
+because to import RLlib takes longer than what is tested.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import shutil
 import subprocess
@@ -12,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from rlservo.deploy import cli, terminal
 from rlservo.deploy.serve_commands import parse_env_arguments
 from rlservo.export.contract.errors import UsageError
 
@@ -24,13 +31,34 @@ def rlservo(*words: object, cwd: Path | None = None) -> subprocess.CompletedProc
     return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd)
 
 
+def rlservo_here(*words: object) -> subprocess.CompletedProcess[str]:
+    """Run the command line in this process."""
+    command = ["rlservo", *map(str, words)]
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    for console in (terminal.output, terminal.errors):
+        console.cache_clear()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        patch.setattr(sys, "argv", command)
+        try:
+            cli.main()
+        except SystemExit as end:
+            assert end.code is None or isinstance(end.code, int)
+            code = end.code or 0
+    return subprocess.CompletedProcess(command, code, out.getvalue(), err.getvalue())
+
+
 @pytest.fixture(scope="module")
-def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A repository with the UR5 policy, exported by the command line."""
-    out = tmp_path_factory.mktemp("policies")
-    done = rlservo("export", UR5, "--out", out, "--name", "ur5")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
+    """The UR5 policy, exported by the command line into a repository."""
+    done = rlservo("export", UR5, "--out", tmp_path_factory.mktemp("policies"), "--name", "ur5", "--json")
     assert done.returncode == 0, done.stderr
-    return out
+    return done
+
+
+@pytest.fixture(scope="module")
+def policies(exported: subprocess.CompletedProcess[str]) -> Path:
+    """That repository."""
+    return Path(json.loads(exported.stdout)["path"]).parents[1]
 
 
 @pytest.fixture
@@ -62,9 +90,8 @@ def test_export_says_what_it_proved_and_where_it_wrote(tmp_path: Path) -> None:
     assert checked.returncode == 0
 
 
-def test_export_as_json_prints_one_document(tmp_path: Path) -> None:
-    done = rlservo("export", UR5, "--out", tmp_path, "--json")
-    document = json.loads(done.stdout)
+def test_export_as_json_prints_one_document(exported: subprocess.CompletedProcess[str]) -> None:
+    document = json.loads(exported.stdout)
     assert Path(document["path"]).is_dir()
     assert 0 < document["seconds"] < 300 and 50 < document["peak_memory_mb"] < 5000
     assert document["contract"]["observation_space"]["elements"][0] == {"name": "target_r", "unit": "m"}
@@ -72,21 +99,21 @@ def test_export_as_json_prints_one_document(tmp_path: Path) -> None:
 
 
 def test_all_modules_of_a_checkpoint_behind_a_uri_are_exported_as_one_list(tmp_path: Path) -> None:
-    done = rlservo("export", UR5.as_uri(), "--out", tmp_path, "--all-modules", "--json")
+    done = rlservo_here("export", UR5.as_uri(), "--out", tmp_path, "--all-modules", "--json")
     assert done.returncode == 0, done.stderr
     (document,) = json.loads(done.stdout)
     assert Path(document["path"]) == tmp_path / "end-effector-positioning-ur" / "1"
     assert f"loading {UR5.as_uri()}: checkpoints are pickles" in done.stderr
     refused(
-        rlservo("export", UR5, "--out", tmp_path, "--all-modules", "--module-id", "default_policy"),
+        rlservo_here("export", UR5, "--out", tmp_path, "--all-modules", "--module-id", "default_policy"),
         2,
         "--all-modules exports every module: leave --module-id and --agent-id out",
     )
 
 
-def test_exporting_twice_makes_the_next_version(policies: Path, tmp_path: Path) -> None:
+def test_exporting_twice_makes_the_next_version(tmp_path: Path) -> None:
     for version in ("1", "2"):
-        done = rlservo("export", UR5, "--out", tmp_path, "--name", "ur5")
+        done = rlservo_here("export", UR5, "--out", tmp_path, "--name", "ur5")
         assert str(tmp_path / "ur5" / version) in done.stdout
 
 
@@ -105,7 +132,7 @@ def test_verify_proves_the_bundle_again(policies: Path) -> None:
 
 
 def test_verify_refuses_another_policys_checkpoint(policies: Path) -> None:
-    done = rlservo("verify", policies, "--checkpoint", UR5.parent / "mir100_navigation")
+    done = rlservo_here("verify", policies, "--checkpoint", UR5.parent / "mir100_navigation")
     refused(done, 2, "shape (27,), the checkpoint's have (4,): they do not belong together")
 
 
@@ -244,7 +271,7 @@ def test_unknown_command_and_option_exit_with_2() -> None:
 def test_prune_keeps_what_export_needs(tmp_path: Path) -> None:
     done = rlservo("prune", UR5, "--out", tmp_path / "small")
     assert done.returncode == 0, done.stderr
-    assert rlservo("export", tmp_path / "small", "--out", tmp_path / "out").returncode == 0
+    assert rlservo_here("export", tmp_path / "small", "--out", tmp_path / "out").returncode == 0
 
 
 def test_env_arguments_are_json_or_strings() -> None:

@@ -13,7 +13,8 @@ import pytest
 import yaml
 
 from rlservo.serve_app.ray_serve.environment import CLUSTER, HAPROXY_BINARY, LOCAL
-from rlservo.serve_app.ray_serve.haproxy_wrapper import CHECK_SECRET, find_binary
+from rlservo.serve_app.ray_serve.haproxy.configuration import CHECK_SECRET
+from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
 
 ROOT = Path(__file__).resolve().parents[2]
 CLEAN = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "RLSERVO_"))}

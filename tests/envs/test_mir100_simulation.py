@@ -240,7 +240,7 @@ def test_driving_into_a_wall_is_a_collision_and_the_wall_holds() -> None:
     assert not sim.in_collision
     drive(sim, 0.5, 0.0, 20)
     assert sim.in_collision
-    assert sim.touched() == ["wall_east"]
+    assert sim.contacts() == ["wall_east"]
     nose = sim.pose[0] + BODY_CENTRE[0] + LENGTH / 2
     assert nose == pytest.approx(EAST, abs=0.03)
     assert sim.velocity[0] == pytest.approx(0.0, abs=0.01)
@@ -253,7 +253,7 @@ def test_driving_into_a_cube_is_a_collision() -> None:
     assert not sim.in_collision
     drive(sim, 0.5, 0.0, 20)
     assert sim.in_collision
-    assert sim.touched() == ["cube_0"]
+    assert sim.contacts() == ["cube_0"]
 
 
 def test_a_contact_early_in_a_cycle_is_still_reported_at_its_end_and_forgotten_a_cycle_later() -> None:
@@ -261,7 +261,7 @@ def test_a_contact_early_in_a_cycle_is_still_reported_at_its_end_and_forgotten_a
     against_the_wall = EAST - BODY_CENTRE[0] - LENGTH / 2 + 0.001  # one millimetre into it
     assert sim.place((against_the_wall, 0.0, 0.0))
     drive(sim, -1.0, 0.0, 1)
-    assert sim.touched() == []  # it has moved off by now
+    assert sim.contacts() == []  # it has moved off by now
     assert sim.in_collision
     drive(sim, -1.0, 0.0, 1)
     assert not sim.in_collision

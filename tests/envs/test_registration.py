@@ -19,7 +19,7 @@ LIST = "import gymnasium; print(sorted(name for name in gymnasium.registry if na
         "import rlservo.envs.registration",
         "import rlservo.envs.discovery as d; d.install(); d.install()",
         "import rlservo.envs.registration as r; r.register_envs(); r.register_envs()",
-        "import ray.rllib",
+        pytest.param("import ray.rllib", marks=pytest.mark.slow),
     ],
 )
 def test_six_environments_are_registered_whatever_comes_first(first: str) -> None:

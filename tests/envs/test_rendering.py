@@ -24,6 +24,7 @@ print("closed")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="needs a virtual display (Debian: xvfb)")
 def test_windows_open_and_close_one_after_another() -> None:
     environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
+import runpy
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
+from ctypes.util import find_library
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -44,11 +50,32 @@ def run_script(script: str, *arguments: str, home: Path) -> Ended:
     return Ended(done.returncode, done.stdout, done.stderr)
 
 
-def run_helper(script: str, *arguments: str, folder: Path, given: str = "") -> str:
-    """Run a script of the tests' own and return its last line, a JSON document."""
+def run_here(script: str, *arguments: str, home: Path) -> Ended:
+    """Run a script in this process, for what starts no Ray: to import RLlib takes longer than that."""
+    out, err, code, before = io.StringIO(), io.StringIO(), 0, dict(os.environ)
+    try:
+        with contextlib.ExitStack() as stack:
+            patch = stack.enter_context(pytest.MonkeyPatch.context())
+            patch.setattr(sys, "argv", command(script, *arguments)[1:])
+            patch.chdir(home)
+            stack.enter_context(contextlib.redirect_stdout(out))
+            stack.enter_context(contextlib.redirect_stderr(err))
+            stack.enter_context(warnings.catch_warnings(action="ignore"))
+            os.environ.update(environment(home))
+            runpy.run_path(str(EXAMPLES / script), run_name="__main__")
+    except SystemExit as end:
+        assert end.code is None or isinstance(end.code, int), end.code
+        code = end.code or 0
+    finally:  # a script sets what Ray is to see
+        os.environ.clear()
+        os.environ.update(before)
+    return Ended(code, out.getvalue(), err.getvalue())
+
+
+def run_helper(script: str, *arguments: str, folder: Path) -> str:
+    """Run a script of the tests' own and return its output; the last line is a JSON document."""
     done = subprocess.run(
         [sys.executable, "-W", "ignore", str(HERE / script), *arguments],
-        input=given,
         capture_output=True,
         text=True,
         timeout=550,
@@ -70,16 +97,78 @@ def run_helper_fixture() -> Callable[..., str]:
     return run_helper
 
 
+@pytest.fixture(scope="session", name="run_here")
+def run_here_fixture() -> Callable[..., Ended]:
+    return run_here
+
+
+def _inference(script: str, *more: str) -> tuple[str, ...]:
+    return (script, *more, "--stop-iters", "1", "--num-episodes-during-inference", "2", "--storage", "runs")
+
+
+def _again(name: str, *changes: str) -> tuple[str, ...]:
+    return ("train_shipped.py", name, *(word for change in changes for word in ("--set", change)))
+
+
+OFFSCREEN = bool(os.environ.get("DISPLAY") or find_library("EGL") or find_library("OSMesa"))
+IN_ONE_RAY = {
+    "ur": _inference("training_inference_ur.py"),
+    "mir": _inference("training_inference_mir.py", "--num-cpus", "1"),
+    "tour": ("tour.py", "--quick", *(() if OFFSCREEN else ("--no-video",))),
+    "again": _again(
+        "cartpole_dqn",
+        "stop.env_steps=400", "steps_per_iteration=300", "training.num_steps_sampled_before_learning_starts=200",
+    ),
+    "judged": _again(
+        "mir100_obstacle_avoidance",
+        "stop.env_steps=5000", "stop.episodes=3", "validation.above=0", "validation.episodes=2",
+        "training.train_batch_size_per_learner=2048", "training.num_epochs=1",
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Trained:
+    """How a script ended, in which folder, and what it left in the home folder."""
+
+    ended: Ended
+    folder: Path
+    home: frozenset[str]
+    videos: bool = OFFSCREEN  # whether there is an OpenGL library to make them with
+
+
 @pytest.fixture(scope="session")
-def refusals(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, list[list[str]]], list[Ended]]:
-    """Return a function that runs a script's `main` with many wrong command lines in one process."""
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Trained]]:
+    """Return a function that runs a script of IN_ONE_RAY once; all of them share a process and a Ray."""
+    folder, home = tmp_path_factory.mktemp("one_ray"), tmp_path_factory.mktemp("home")
+    command = [sys.executable, "-W", "ignore", str(HERE / "train_in_one_ray.py")]
+    with (
+        (folder / "errors.txt").open("w") as errors,
+        subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment(home),
+            cwd=home,
+        ) as process,
+    ):  # fmt: skip
 
-    def run(script: str, arguments: list[list[str]]) -> list[Ended]:
-        folder = tmp_path_factory.mktemp("refused")
-        out = run_helper("run_many.py", script, folder=folder, given=json.dumps(arguments))
-        return [Ended(**one) for one in json.loads(out.splitlines()[-1])]
+        @cache
+        def train(name: str) -> Trained:
+            assert process.stdin is not None and process.stdout is not None
+            process.stdin.write(json.dumps([str(folder / name), *IN_ONE_RAY[name]]) + "\n")
+            process.stdin.flush()
+            reply = process.stdout.readline()
+            assert reply, (folder / "errors.txt").read_text()[-5000:]
+            one = json.loads(reply)
+            return Trained(Ended(one["code"], one["out"], one["err"]), folder / name, frozenset(one["home"]))
 
-    return run
+        try:
+            yield train
+        finally:
+            assert process.stdin is not None
+            process.stdin.close()  # the last request: it ends, and its Ray with it
+            try:
+                process.wait(200)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
 
 @dataclass(frozen=True)

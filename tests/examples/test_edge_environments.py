@@ -1,10 +1,9 @@
-"""The trainer with environments at the edge, and on a cluster that loses a node. All real trainings."""
+"""The trainer with environments at the edge. All real trainings."""
 
 from __future__ import annotations
 
 import json
 import re
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,24 +15,12 @@ from rlservo.serve_app.runtime.policy import Policy
 pytestmark = pytest.mark.slow
 
 
-HALVES = (  # about as long each, at the same time: most of it is processes that start
-    ["Float64", "Promises32", "Camera", "Endless"],
-    ["Crashing", "Crashing runner", "Crashing for good"],
-)
-
-
 @pytest.fixture(scope="module")
 def edges(tmp_path_factory: pytest.TempPathFactory, run_helper: Any) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("edges")
-
-    def train(names: list[str]) -> dict[str, Any]:
-        out = run_helper("train_edges.py", str(folder), *names, folder=folder)
-        found: dict[str, Any] = json.loads(out.splitlines()[-1])
-        return found
-
-    with ThreadPoolExecutor() as pool:
-        first, second = pool.map(train, HALVES)
-    return folder, first | second
+    out = run_helper("train_edges.py", str(folder), folder=folder)
+    found: dict[str, Any] = json.loads(out.splitlines()[-1])
+    return folder, found
 
 
 @pytest.mark.parametrize("name", ["Float64", "Promises32"])
@@ -69,12 +56,3 @@ def test_crashes_are_survived_by_remaking_the_environment_or_the_runner(name: st
 def test_crash_in_the_driver_without_the_flag_ends_the_training_with_its_cause(edges: Any) -> None:
     found = edges[1]["Crashing for good"]
     assert re.search(r"training failed: .*error.txt, and --resume .* goes on", found["error"])
-
-
-def test_training_survives_a_node_killed_on_the_way(tmp_path: Path, run_helper: Any) -> None:
-    out = run_helper("train_on_two_nodes.py", str(tmp_path), folder=tmp_path)
-    end = json.loads(out.splitlines()[-1])
-    assert (end["before"], end["after"], end["code"]) == (2, 1, 0), out
-    iterations = [int(n) for n in re.findall(r"^\w+_00000 +(\d+) ", out, re.MULTILINE)]
-    assert iterations[-1] == 5
-    assert list(tmp_path.glob("runs/policies/cart-pole/1/contract.json"))

@@ -22,11 +22,11 @@ def returns(ended: Any) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("script", "name"), ROBOTS)
 def test_checkpoint_and_bundle_run_the_same_episodes_and_the_bundle_needs_no_clipping(
-    script: str, name: str, tmp_path: Path, run_script: Any
+    script: str, name: str, tmp_path: Path, run_script: Any, run_here: Any
 ) -> None:
     bundle = export_checkpoint(CHECKPOINTS / name, tmp_path, notify=lambda _: None).path
     raw = run_script(script, str(CHECKPOINTS / name), "--num-episodes", "2", home=tmp_path)
-    exported = run_script(script, "--bundle", str(bundle), "--num-episodes", "2", home=tmp_path)
+    exported = run_here(script, "--bundle", str(bundle), "--num-episodes", "2", home=tmp_path)
     assert returns(raw) == returns(exported)
     clipped, actions = map(int, re.search(r"clipped (\d+) of (\d+) actions", raw.out).groups())  # type: ignore[union-attr]
     assert 0 < clipped <= actions
@@ -34,13 +34,13 @@ def test_checkpoint_and_bundle_run_the_same_episodes_and_the_bundle_needs_no_cli
 
 
 @pytest.mark.slow
-def test_wrong_paths_are_refused_in_a_sentence(tmp_path: Path, run_script: Any) -> None:
+def test_wrong_paths_are_refused_in_a_sentence(tmp_path: Path, run_here: Any) -> None:
     for script, arguments, code, sentence in (
         ("policy_from_cp_ur.py", [], 2, "give either a checkpoint's path or --bundle"),
         ("policy_from_cp_ur.py", [str(tmp_path)], 1, "is not an RLlib checkpoint"),
         ("policy_from_cp_ur.py", [str(CHECKPOINTS / "mir100_navigation")], 2, "trained for another environment"),
     ):
-        ended = run_script(script, *arguments, home=tmp_path)
+        ended = run_here(script, *arguments, home=tmp_path)
         assert ended.code == code, ended
         assert re.search(sentence, ended.err.strip().splitlines()[-1])
         assert "Traceback" not in ended.err

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -66,43 +65,11 @@ def test_trials_at_once_must_fit_and_a_growing_cluster_is_not_judged(scripts: An
 
 @pytest.mark.slow
 @pytest.mark.parametrize("script", ["simple_trainer", "training_inference_mir"])
-def test_run_that_needs_more_than_this_machine_has_is_not_resumed(
-    script: str, refusals: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_run_that_needs_more_than_this_machine_has_is_not_resumed(script: str, run_here: Any, tmp_path: Path) -> None:
     run = {"algorithm": "PPO", "env_id": "CartPole-v1", "env_config": {}, "num_cpus": 401, "swept": []}
     run |= {"num_cpus": 0} if script != "simple_trainer" else {}
     rest = {"log_level": "ERROR", "app_dir": "."}
     (tmp_path / "run.json").write_text(json.dumps(run | {"request": [{"CPU": 1.0}] * 401, "rest": rest}))
-    (ended,) = refusals(script, [["--resume", str(tmp_path)]])
+    ended = run_here(f"{script}.py", "--resume", str(tmp_path), home=tmp_path)
     assert ended.code == 2
     assert re.search(r"40\d CPUs asked for .*; this machine has \d+ CPUs?: go on where there are as many", ended.err)
-
-
-@pytest.mark.slow
-def test_one_core_is_enough_for_robo_gyms_script(run_script: Any, tmp_path: Path) -> None:
-    done = run_script(
-        "training_inference_mir.py", "--num-cpus", "1", "--stop-iters", "1", "--num-episodes-during-inference", "1",
-        home=tmp_path,
-    )  # fmt: skip
-    assert done.code == 0, done.out + done.err
-    assert "2 sampling processes with 8 simulators each, 1 cores" in done.out
-    assert "waiting for" not in done.err
-
-
-@pytest.mark.slow
-def test_cluster_that_cannot_hold_the_run_refuses_it_and_one_that_grows_says_what_it_waits_for(
-    run_helper: Any, tmp_path: Path
-) -> None:
-    answer = json.loads(run_helper("train_without_room.py", str(tmp_path), folder=tmp_path).splitlines()[-1])
-    assert answer["refused"]["code"] == 2
-    assert re.search(
-        r"error: 3 CPUs asked for \(3 processes with 1 CPU each\); the cluster at [\d.:]+ has 1 CPU: give --num-cpus 0",
-        answer["refused"]["said"],
-    )
-    assert "run: " not in answer["refused"]["said"]
-    assert answer["grew"]["code"] == 0, answer
-    line = "waiting for 3 CPUs (3 processes with 1 CPU each): the cluster has 1 CPU, 1 of them free; Ctrl-C stops"
-    assert answer["grew"]["said"].count(line) >= 1
-    assert answer["grew"]["after_s"] >= 9.0
-    assert answer["interrupted"]["code"] == 130
-    assert "stopped; go on with" in answer["interrupted"]["said"]

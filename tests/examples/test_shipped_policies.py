@@ -9,8 +9,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
-import os
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -124,7 +122,7 @@ def test_the_recurrent_policy_needs_its_memory(bundles: dict[str, Path]) -> None
 def test_each_card_states_what_was_measured(name: str) -> None:
     folder = SHIPPED / name
     card = (folder / "README.md").read_text(encoding="utf-8")
-    figures = [evaluate_shipped.Measured(**one) for one in card_figures(name)]
+    figures = [evaluate_shipped.Evaluation(**one) for one in card_figures(name)]
     table = card.partition(evaluate_shipped.BEGIN)[2].partition(evaluate_shipped.END)[0].strip()
     assert table == evaluate_shipped.render(figures)
     assert {(one.episodes, one.seed) for one in figures} == {(evaluate_shipped.EPISODES, evaluate_shipped.SEED)}
@@ -147,34 +145,28 @@ def test_each_folder_is_small_and_complete(name: str) -> None:
     assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
-def run_script(script: str, *arguments: str, home: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "HOME": str(home)}  # a local Ray writes its token into the home folder
-    command = [sys.executable, str(EXAMPLES / script), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, cwd=home)
-
-
 @pytest.mark.slow
-def test_training_again_leaves_a_curve_and_a_checkpoint_that_exports(tmp_path: Path) -> None:
-    done = run_script("train_shipped.py", "cartpole_dqn", "--set", "stop.env_steps=3000", home=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    run = tmp_path / "runs" / "cartpole_dqn"
-    assert len((run / "curve.csv").read_text().splitlines()) == 3  # 2,000 steps an iteration
+def test_training_again_leaves_a_curve_and_a_checkpoint_that_exports(
+    trained: Any, run_here: Any, tmp_path: Path
+) -> None:
+    done = trained("again").ended
+    assert done.code == 0, done.out + done.err
+    run = trained("again").folder / "runs" / "cartpole_dqn"
+    assert len((run / "curve.csv").read_text().splitlines()) == 3  # 300 steps an iteration
     assert (run / "curve.png").exists()
     arguments = ("cartpole_dqn", "--checkpoint", str(run / "checkpoint"), "--episodes", "3")
-    measured = run_script("evaluate_shipped.py", *arguments, home=tmp_path)
-    assert measured.returncode == 0, measured.stderr
-    assert "| anywhere | 3 |" in measured.stdout
+    measured = run_here("evaluate_shipped.py", *arguments, home=tmp_path)
+    assert measured.code == 0, measured.err
+    assert "| anywhere | 3 |" in measured.out
 
 
 @pytest.mark.slow
-def test_checkpoints_are_judged_as_the_cards_do_where_the_settings_ask_for_it(tmp_path: Path) -> None:
-    changes = ("stop.env_steps=20000", "stop.episodes=3", "validation.above=0", "validation.episodes=2")
-    arguments = [word for change in changes for word in ("--set", change)]
-    done = run_script("train_shipped.py", "mir100_obstacle_avoidance", *arguments, home=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count("% success of the exported policy over 2 episodes") == 1  # next in 100,000 steps
-    run = tmp_path / "runs" / "mir100_obstacle_avoidance"
-    assert len((run / "curve.csv").read_text().splitlines()) == 4  # 8,192 steps an iteration
+def test_checkpoints_are_judged_as_the_cards_do_where_the_settings_ask_for_it(trained: Any) -> None:
+    done = trained("judged").ended
+    assert done.code == 0, done.out + done.err
+    assert done.out.count("% success of the exported policy over 2 episodes") == 1  # next in 80,000 steps
+    run = trained("judged").folder / "runs" / "mir100_obstacle_avoidance"
+    assert len((run / "curve.csv").read_text().splitlines()) == 4  # 2,048 steps an iteration
     assert (run / "checkpoint" / "rllib_checkpoint.json").exists()
 
 
@@ -190,9 +182,9 @@ def test_checkpoints_are_judged_as_the_cards_do_where_the_settings_ask_for_it(tm
     ],
 )
 def test_wrong_argument_is_refused_in_a_sentence(
-    script: str, arguments: tuple[str, ...], sentence: str, tmp_path: Path
+    script: str, arguments: tuple[str, ...], sentence: str, tmp_path: Path, run_here: Any
 ) -> None:
-    done = run_script(script, *arguments, home=tmp_path)
-    assert done.returncode == 2
-    assert sentence in " ".join(done.stderr.split())
-    assert "Traceback" not in done.stderr
+    done = run_here(script, *arguments, home=tmp_path)
+    assert done.code == 2
+    assert sentence in " ".join(done.err.split())
+    assert "Traceback" not in done.err

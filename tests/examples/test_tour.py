@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,9 @@ import pytest
 pytestmark = pytest.mark.slow
 
 
-def test_every_stop_ends_in_a_bundle(tmp_path: Path, run_script: Any) -> None:
-    picture = [] if os.environ.get("DISPLAY") or _offscreen() else ["--no-video"]
-    ended = run_script("tour.py", "--quick", *picture, home=tmp_path)
+def test_every_stop_ends_in_a_bundle(trained: Any) -> None:
+    run = trained("tour")
+    ended, folder = run.ended, run.folder
     assert ended.code == 0, ended.out + ended.err
     assert ended.out.count("the environment check passed") == 3
     assert len(re.findall(r"random actions: mean return -?[\d.]+", ended.out)) == 3
@@ -25,21 +24,15 @@ def test_every_stop_ends_in_a_bundle(tmp_path: Path, run_script: Any) -> None:
     crossing = ended.out.split("=== FrozenLake: export")[1].split("===")[0]
     assert "the exported policy: return 1.00 in 6 steps" in crossing  # the shortest way: it has learnt
     assert re.search(r"step +0: value +-?[\d.]+, action mean", ended.out)
-    bundles = {path.parent.parent.name for path in (tmp_path / "tour" / "bundles").glob("*/*/contract.json")}
+    bundles = {path.parent.parent.name for path in (folder / "tour" / "bundles").glob("*/*/contract.json")}
     assert len(bundles) == 3
-    if not picture:
-        films = list((tmp_path / "tour" / "videos").glob("*/*.mp4"))
+    if run.videos:
+        films = list((folder / "tour" / "videos").glob("*/*.mp4"))
         assert len(films) == 3 and all(film.stat().st_size > 1000 for film in films)
-    assert not (tmp_path / "ray_results").exists()
+    assert "ray_results" not in run.home
 
 
-def _offscreen() -> bool:
-    from ctypes.util import find_library
-
-    return bool(find_library("EGL") or find_library("OSMesa"))
-
-
-def test_unknown_stop_is_refused_in_a_sentence(tmp_path: Path, run_script: Any) -> None:
-    ended = run_script("tour.py", "atari", home=tmp_path)
+def test_unknown_stop_is_refused_in_a_sentence(tmp_path: Path, run_here: Any) -> None:
+    ended = run_here("tour.py", "atari", home=tmp_path)
     assert ended.code == 2
     assert "atari is no stop of the tour: expected cartpole, frozenlake, ur5" in ended.err

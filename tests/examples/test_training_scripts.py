@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +15,26 @@ SCRIPTS = ("training_inference_ur.py", "training_inference_mir.py")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_short_run_trains_exports_and_runs_episodes(script: str, run_script: Any, tmp_path: Path) -> None:
-    done = run_script(
-        script, "--stop-iters", "1", "--num-episodes-during-inference", "2", "--storage", "runs", home=tmp_path
-    )
+@pytest.mark.parametrize("name", ["ur", "mir"])
+def test_short_run_trains_exports_and_runs_episodes(name: str, trained: Any) -> None:
+    run = trained(name)
+    done = run.ended
     assert done.code == 0, done.out + done.err
+    # One core is enough: RLlib's two sampling processes share it.
+    assert "2 sampling processes with 8 simulators each, 1 cores" in done.out
+    assert "waiting for" not in done.err
     assert re.search(r"^\w+_00000 +1 +8,\d\d\d +-?\d", done.out, re.MULTILINE)
     assert "best checkpoint: " in done.out
-    bundles = list((tmp_path / "runs" / "policies").glob("*/1/contract.json"))
+    bundles = list((run.folder / "runs" / "policies").glob("*/1/contract.json"))
     assert len(bundles) == 1
     assert "success" in done.out.split("bundle: ")[1]
-    assert {path.name for path in tmp_path.iterdir()} <= {"runs", ".cache", ".config"}
+    assert {path.name for path in run.folder.iterdir()} == {"runs"}
+    assert run.home <= {".cache", ".config"}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_wrong_arguments_are_refused_in_a_sentence(script: str, refusals: Callable[..., Any]) -> None:
+def test_wrong_arguments_are_refused_in_a_sentence(script: str, run_here: Any, tmp_path: Path) -> None:
     wrong = {
         "--framework tf": "PyTorch only .* use --framework torch",
         "--run A3C": "--run A3C: expected one of PPO",
@@ -43,8 +45,8 @@ def test_wrong_arguments_are_refused_in_a_sentence(script: str, refusals: Callab
         "--storage /dev/null/runs": "--storage /dev/null/runs: cannot be written: Not a directory",
         "--resume .": "not the folder of a run",
     }
-    arguments = [one.split() for one in wrong]
-    for sentence, ended in zip(wrong.values(), refusals(script.removesuffix(".py"), arguments), strict=True):
+    for arguments, sentence in wrong.items():
+        ended = run_here(script, *arguments.split(), home=tmp_path)
         assert ended.code == 2
         assert re.search(sentence, ended.err.strip().splitlines()[-1])
         assert "Traceback" not in ended.err
@@ -52,17 +54,17 @@ def test_wrong_arguments_are_refused_in_a_sentence(script: str, refusals: Callab
 
 @pytest.mark.slow
 def test_more_gpus_than_there_are_are_refused_before_anything_starts(
-    refusals: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    run_here: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RLLIB_NUM_GPUS", "64")
-    (ended,) = refusals("training_inference_ur", [[]])
+    ended = run_here("training_inference_ur.py", home=tmp_path)
     assert ended.code == 2
     assert re.search(r"RLLIB_NUM_GPUS is 64: this machine has \d+ GPUs", ended.err.strip().splitlines()[-1])
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_help_lists_robo_gyms_arguments(script: str, run_script: Any, tmp_path: Path) -> None:
-    done = run_script(script, "--help", home=tmp_path)
+def test_help_lists_robo_gyms_arguments(script: str, run_here: Any, tmp_path: Path) -> None:
+    done = run_here(script, "--help", home=tmp_path)
     assert done.code == 0
     for argument in (
         "--run", "--num-cpus", "--framework", "--stop-iters", "--stop-timesteps", "--stop-reward",

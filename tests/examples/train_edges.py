@@ -1,6 +1,9 @@
 """Train on edge environments for a moment, as the trainer would, in one Ray; print one JSON document.
 
-python train_edges.py FOLDER NAME [NAME ...]      NAME is one of RUNS
+python train_edges.py FOLDER
+
+Where Tune is not what an environment is at the edge of, its algorithm trains in this process: a trial's own process
+takes longer to start than to train.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ import io
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 sys.path[:0] = [str(EXAMPLES), str(Path(__file__).parent / "app")]
@@ -40,12 +44,14 @@ RUNS = {
 }
 
 
-def main(folder: Path, names: list[str]) -> None:
+TUNED = ("Endless", "Crashing for good")  # what Tune makes of no return, and of a trial that fails
+
+
+def main(folder: Path) -> None:
     training_run.pickle_by_value(simple_trainer, episode_traces)
     found = {}
     with training_run.ray_session(num_cpus=2, app_dir=Path(__file__).parent / "app"):
-        for name in names:
-            more = RUNS[name]
+        for name, more in RUNS.items():
             env = f"edge_environments:edge/{name.split()[0]}-v0"
             common = ["--num-cpus", "0", "--name-env", env, "--stop-iters", "2", "--hidden", "16"]
             if name.startswith("Crashing"):  # an absolute path: Tune's workers run in the trial's folder
@@ -60,27 +66,36 @@ def main(folder: Path, names: list[str]) -> None:
             with contextlib.redirect_stdout(said):
                 try:
                     config, run, _ = simple_trainer.set_up(args)
-                    outcome = training_run.train(
-                        config,
-                        run,
-                        storage=folder / "runs",
-                        stop={"training_iteration": args.stop_iters, training_run.STEPS: args.stop_timesteps},
-                        checkpoint_frequency=1,
-                    )
-                    training_run.report(outcome, run)
+                    stop = {"training_iteration": args.stop_iters, training_run.STEPS: args.stop_timesteps}
+                    train = train_with_tune if name in TUNED else train_here
+                    checkpoint, steps = train(config, run, folder / "runs" / name, stop)
                     bundle = training_run.export_and_run(
-                        training_run.best_checkpoint_of(outcome),
+                        checkpoint,
                         folder / "policies" / name.replace(" ", "-"),
                         env_id=run.env_id,
                         env_config=run.env_config,
                         episodes=0 if name.startswith(("Endless", "Crashing")) else 1,
                     )
-                    found[name] = {"bundle": str(bundle), "steps": outcome.best.env_steps}
+                    found[name] = {"bundle": str(bundle), "steps": steps}
                 except training_run.RlservoError as error:
                     found[name] = {"error": error.message}
             found[name]["said"] = said.getvalue()
     print(json.dumps(found))
 
 
+def train_with_tune(config: Any, run: Any, storage: Path, stop: dict[str, float]) -> tuple[Path, int]:
+    outcome = training_run.train(config, run, storage=storage, stop=stop, checkpoint_frequency=1)
+    training_run.report(outcome, run)
+    return training_run.best_checkpoint_of(outcome), outcome.best.env_steps
+
+
+def train_here(config: Any, run: Any, storage: Path, stop: dict[str, float]) -> tuple[Path, int]:
+    with training_run.built(training_run.build(config)) as algorithm:
+        result = algorithm.train()
+        while all(result[name] < limit for name, limit in stop.items()):
+            result = algorithm.train()
+        return Path(algorithm.save_to_path(str(storage))), int(result[training_run.STEPS])
+
+
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2:])
+    main(Path(sys.argv[1]))

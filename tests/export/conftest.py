@@ -1,22 +1,15 @@
-"""Real checkpoints for the export tests, trained once a session in a process and a Ray cluster of their own."""
+"""What the export tests share beside the trained checkpoints of `tests/checkpoints.py`."""
 
 from __future__ import annotations
 
-import os
-import secrets
 import shutil
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from checkpoints import APP
 from rlservo.export.graph.one_thread import one_thread
-
-ZOO = Path(__file__).resolve().parents[1] / "zoo"
-APP = ZOO / "app"
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -36,39 +29,6 @@ def notices() -> list[str]:
 def app() -> Path:
     """The folder with the user's own code that some of the checkpoints need."""
     return APP
-
-
-def trained(script: str) -> Iterator[Path]:
-    """Run a training script into a folder of its own, and remove the folder afterwards."""
-    # A short path: Ray's sockets live below it, and a socket's path may have 107 characters.
-    folder = Path(tempfile.mkdtemp(prefix="zoo-"))
-    # With the token in its environment Ray writes none to the user's home.
-    environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
-    command = [sys.executable, "-W", "ignore", str(ZOO / script), str(folder)]
-    try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=580)
-        assert done.returncode == 0, done.stderr[-3000:]
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-@pytest.fixture(scope="session")
-def zoo() -> Iterator[Path]:
-    """A folder of checkpoints `<name>/` and what the environment saw, `<name>.npz`."""
-    yield from trained("train_zoo.py")
-
-
-@pytest.fixture(scope="session")
-def wide_zoo() -> Iterator[Path]:
-    """The same for spaces, recurrent policies, connectors and algorithms of every kind."""
-    yield from trained("train_wide_zoo.py")
-
-
-@pytest.fixture(scope="session")
-def old_zoo() -> Iterator[Path]:
-    """The same for RLlib's old API stack."""
-    yield from trained("train_old_zoo.py")
 
 
 @pytest.fixture

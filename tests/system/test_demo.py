@@ -33,7 +33,7 @@ def test_demo_reaches_the_targets_draws_a_picture_and_leaves_nothing(tmp_path: P
     for _ in range(2):  # a second one right after works too
         done = subprocess.run(
             [sys.executable, "-m", "rlservo.deploy.cli", "demo", "--out", str(out), "--episodes", "5"],
-            capture_output=True, text=True, timeout=240, cwd=ROOT,
+            capture_output=True, text=True, timeout=900, cwd=ROOT,
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
         assert done.stdout.count("5 of 5 ") == 2

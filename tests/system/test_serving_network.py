@@ -5,17 +5,16 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import os
 import queue
 import re
 import socket
-import threading
 import time
 import uuid
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import grpc
 import numpy as np
@@ -24,18 +23,18 @@ import pytest
 from rlservo.export.contract.errors import UnauthenticatedError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.ray_serve.ingress import PROCESS
-from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.processes import LOG_BYTES, MARK, cut_log, free_ports
+from rlservo.serve_app.protocols.http_endpoint import PROCESS
+from rlservo.serve_app.ray_serve.processes import MARK
+from rlservo.serve_app.ray_serve.server_log import LOG_BYTES, cut_log
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
+from servers import STREAM_IDLE_S, LiveServer, served_in_thread
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
 LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}
 # Listeners that may be elsewhere than on loopback when the server is asked for loopback: (process, why). None.
 ELSEWHERE: dict[str, str] = {}
-IDLE_S = 8.0
 BODY = json.dumps({"obs": [0.1] * 27}).encode()
 ACT = b"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: 127.0.0.1:%d\r\ncontent-type: application/json\r\n%s"
 HANDSHAKE = (
@@ -94,44 +93,6 @@ def processes_of(folder: Path) -> frozenset[int]:
     return frozenset(pid for pid, row in status.items() if row[0] == session or row[2] == mark)
 
 
-@contextlib.contextmanager
-def serving(policies: Path, *, with_grpc: bool, with_key: bool, **settings: Any) -> Iterator[Server]:
-    port, grpc_port = free_ports(2)
-    key, line = new_key("tests")
-    ready, stop = threading.Event(), threading.Event()
-    failures: list[BaseException] = []
-
-    def serve() -> None:
-        try:
-            serve_policies(
-                [policies],
-                port=port,
-                grpc_port=grpc_port if with_grpc else None,
-                settings={
-                    "stream_idle_s": IDLE_S,
-                    "max_connections_per_address": 300,
-                    **({"api_keys": line} if with_key else {}),
-                    **settings,
-                },
-                on_ready=lambda _: ready.set(),
-                stop=stop,
-            )
-        except BaseException as error:
-            failures.append(error)
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        while not ready.wait(0.1):
-            assert thread.is_alive(), failures
-        folder = _folder_of(port)
-        yield Server(port, grpc_port if with_grpc else None, folder, key, processes_of(folder))
-    finally:
-        stop.set()
-        thread.join()
-    assert failures == []
-
-
 def _folder_of(port: int) -> Path:
     """Return the folder of the server on a port, as its cluster's process was told."""
     for entry in Path("/proc").iterdir():
@@ -145,9 +106,9 @@ def _folder_of(port: int) -> Path:
 
 
 @pytest.fixture(scope="module")
-def server(policies: Path) -> Iterator[Server]:
-    with serving(policies, with_grpc=True, with_key=True) as made:
-        yield made
+def server(live_server: LiveServer) -> Server:
+    folder = _folder_of(live_server.port)
+    return Server(live_server.port, live_server.grpc_port, folder, live_server.key, processes_of(folder))
 
 
 def act(port: int, key: str, source: str = "127.0.0.1") -> int:
@@ -236,15 +197,15 @@ def test_a_grpc_stream_may_be_silent_for_as_long_as_the_setting_says(server: Ser
         call = stream(iter(requests.get, b"end"), metadata=[("authorization", f"Bearer {server.key}")])
         requests.put(b"")
         next(call)
-        time.sleep(IDLE_S - 2)  # longer than HAProxy waits for a client of HTTP
+        time.sleep(STREAM_IDLE_S - 2)  # longer than HAProxy waits for a client of HTTP
         requests.put(b"")
         next(call)
         started = time.monotonic()
         with pytest.raises(grpc.RpcError) as raised:
             next(call)
     assert raised.value.code() is grpc.StatusCode.DEADLINE_EXCEEDED
-    assert raised.value.details() == f"the stream was silent for {IDLE_S:g} s: open another one"
-    assert IDLE_S - 1 < time.monotonic() - started < IDLE_S + 20
+    assert raised.value.details() == f"the stream was silent for {STREAM_IDLE_S:g} s: open another one"
+    assert STREAM_IDLE_S - 1 < time.monotonic() - started < STREAM_IDLE_S + 20
     requests.put(b"end")
 
 
@@ -258,7 +219,7 @@ def test_a_silent_websocket_is_ended_by_the_replica_with_a_sentence(server: Serv
             piece = connection.recv(65536)
             assert piece, received
             received += piece
-        assert time.monotonic() - started > IDLE_S - 1
+        assert time.monotonic() - started > STREAM_IDLE_S - 1
 
 
 @pytest.mark.parametrize(
@@ -346,6 +307,15 @@ def test_what_is_logged_is_bounded(server: Server) -> None:
     assert all(file.stat().st_size < 2 * LOG_BYTES for file in server.folder.rglob("*.log"))
 
 
+def test_nothing_of_the_server_waits_for_the_machines_other_work(server: Server) -> None:
+    """Ray's workers run at nice 15 otherwise, and with them replicas and HAProxy."""
+    levels = set()
+    for pid in processes_of(server.folder):
+        with contextlib.suppress(ProcessLookupError):
+            levels.add(os.getpriority(os.PRIO_PROCESS, pid))
+    assert levels == {os.getpriority(os.PRIO_PROCESS, 0)}
+
+
 def test_a_log_is_cut_to_its_last_lines(tmp_path: Path) -> None:
     file = tmp_path / "server.log"
     with file.open("ab") as writer:
@@ -364,10 +334,11 @@ def test_a_log_is_cut_to_its_last_lines(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def after_serve(policies: Path) -> Iterator[Server]:
     """A server whose requests pass through Ray Serve's own handling, and that has no gRPC port."""
-    with serving(
-        policies, with_grpc=False, with_key=True, ahead_of_serve=False, default_policy="ur5", max_ongoing_requests=1
-    ) as made:
-        yield made
+    key, line = new_key("tests")
+    settings = {"ahead_of_serve": False, "default_policy": "ur5", "max_ongoing_requests": 1, "api_keys": line}
+    with served_in_thread([policies], settings=settings) as port:
+        folder = _folder_of(port)
+        yield Server(port, None, folder, key, processes_of(folder))
 
 
 def test_without_a_grpc_port_nobody_speaks_grpc(after_serve: Server) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,47 +17,18 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.ray_serve.launcher import serve_policies
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.api_keys import new_key
+from servers import LiveServer
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
-KEY, LINE = new_key("cell-7")
 BATCH = np.random.default_rng(3).standard_normal((1024, 27)).astype(np.float32)
 
 
-@pytest.fixture(scope="module")
-def port(policies: Path) -> Iterator[int]:
-    (port,) = free_ports(1)
-    ready, stop = threading.Event(), threading.Event()
-    failures: list[Exception] = []
-
-    def serve() -> None:
-        try:
-            serve_policies(
-                [policies],
-                port=port,
-                settings={"api_keys": LINE, "default_policy": "ur5"},
-                on_ready=lambda _: ready.set(),
-                stop=stop,
-            )
-        except Exception as error:
-            failures.append(error)
-            ready.set()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        assert ready.wait(120) and not failures, failures
-        yield port
-    finally:
-        stop.set()
-        thread.join(60)
-    assert not thread.is_alive()
-
-
-def call(port: int, method: str, path: str, body: bytes | None = None, **headers: str) -> tuple[int, Any, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-    sent = {"authorization": f"Bearer {KEY}"} | {name.replace("_", "-"): value for name, value in headers.items()}
+def call(
+    server: LiveServer, method: str, path: str, body: bytes | None = None, **headers: str
+) -> tuple[int, Any, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    sent = {"authorization": server.bearer} | {name.replace("_", "-"): value for name, value in headers.items()}
     connection.request(method, path, body, sent)
     reply = connection.getresponse()
     content = reply.read()
@@ -67,11 +36,11 @@ def call(port: int, method: str, path: str, body: bytes | None = None, **headers
     return reply.status, reply.headers, content
 
 
-def test_a_batch_of_1024_goes_through_as_binary_tensors(port: int, ur5: Path) -> None:
+def test_a_batch_of_1024_goes_through_as_binary_tensors(live_server: LiveServer, ur5: Path) -> None:
     tensor = {"name": "obs", "shape": [1024, 27], "datatype": "FP32", "parameters": {"binary_data_size": BATCH.nbytes}}
     header = json.dumps({"inputs": [tensor], "parameters": {"binary_data_output": True}}).encode()
     status, headers, reply = call(
-        port,
+        live_server,
         "POST",
         "/v2/models/ur5/infer",
         header + BATCH.tobytes(),
@@ -83,11 +52,13 @@ def test_a_batch_of_1024_goes_through_as_binary_tensors(port: int, ur5: Path) ->
         np.testing.assert_allclose(action, policy.act(BATCH), rtol=1e-6)
 
 
-def test_a_stream_runs_through_the_proxy(port: int, ur5: Path) -> None:
-    url = f"ws://127.0.0.1:{port}/"
+def test_a_stream_runs_through_the_proxy(live_server: LiveServer, ur5: Path) -> None:
+    url = f"ws://127.0.0.1:{live_server.port}/"
     with (
         Policy.load(ur5) as policy,
-        websockets.sync.client.connect(url, additional_headers={"authorization": f"Api-Key {KEY}"}) as stream,
+        websockets.sync.client.connect(
+            url, additional_headers={"authorization": f"Api-Key {live_server.key}"}
+        ) as stream,
     ):
         assert msgpack.unpackb(stream.recv())["policy"] == "ur5"
         for seq in range(200):
@@ -102,25 +73,25 @@ def test_a_stream_runs_through_the_proxy(port: int, ur5: Path) -> None:
         assert json.loads(stream.recv())["code"] == "bad-request"
 
 
-def test_without_a_key_nothing_gets_through(port: int) -> None:
+def test_without_a_key_nothing_gets_through(live_server: LiveServer) -> None:
     for method, path in (("GET", "/v1/policies"), ("POST", "/v1/policies/ur5/act"), ("POST", "/v2/models/ur5/infer")):
-        status, _, reply = call(port, method, path, b"{}", authorization="Bearer nobody")
+        status, _, reply = call(live_server, method, path, b"{}", authorization="Bearer nobody")
         assert (status, json.loads(reply)["code"]) == (401, "unauthenticated")
     with pytest.raises(InvalidStatus) as caught:
-        websockets.sync.client.connect(f"ws://127.0.0.1:{port}/").__enter__()
+        websockets.sync.client.connect(f"ws://127.0.0.1:{live_server.port}/").__enter__()
     assert caught.value.response.status_code == 401
     assert json.loads(caught.value.response.body or b"")["code"] == "unauthenticated"
 
 
-def test_prometheus_reads_what_the_replica_answered(port: int) -> None:
+def test_prometheus_reads_what_the_replica_answered(live_server: LiveServer) -> None:
     call(
-        port,
+        live_server,
         "POST",
         "/v1/policies/ur5/act",
         json.dumps({"obs": BATCH[0].tolist()}).encode(),
         content_type="application/json",
     )
-    status, headers, text = call(port, "GET", "/metrics")
+    status, headers, text = call(live_server, "GET", "/metrics")
     assert status == 200 and headers["content-type"].startswith("text/plain")
     assert b'rlservo_requests_total{code="ok",policy="ur5",protocol="json",replica="' in text
 

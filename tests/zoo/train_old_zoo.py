@@ -4,7 +4,7 @@
 
 writes OUT/<name>/ (a checkpoint) and OUT/<name>.npz (what the environment saw in RLlib's own evaluation: observations,
 and the actions that reached `env.step`, exploration off and the filter frozen). It runs in a process of its own and
-starts a cluster of its own in OUT/ray, which it stops.
+starts a cluster of its own, which it stops.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import ray
 from ray import tune
 from ray.rllib.algorithms.appo import APPOConfig
 from ray.rllib.algorithms.cql import CQLConfig
@@ -33,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent / "app"))
 import old_zoo_parts  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
 import old_zoo_registry  # pyright: ignore[reportMissingImports]
-from train_zoo import leaves  # pyright: ignore[reportMissingImports]
+from train_zoo import leaves, ray_for_training  # pyright: ignore[reportMissingImports]
 
 STEPS = 100  # recorded
 REFUSED = {
@@ -242,8 +241,7 @@ def main(out: Path, only: list[str]) -> None:
     tune.register_env("old_toy", old_zoo_parts.OldToy)
     tune.register_env("old_pair", old_zoo_parts.OldPair)
     old_zoo_registry.register()
-    ray.init(num_cpus=1, include_dashboard=False, _temp_dir=str(out / "ray"), configure_logging=False)
-    try:
+    with ray_for_training():
         for name, config in chosen(out, only):
             algorithm = config.build_algo()
             algorithm.train()
@@ -253,8 +251,6 @@ def main(out: Path, only: list[str]) -> None:
                     np.savez(out / f"{name if agent == 'agent' else f'{name}_{agent}'}.npz", **pairs)
             algorithm.stop()
             print(name, flush=True)
-    finally:
-        ray.shutdown()
 
 
 if __name__ == "__main__":

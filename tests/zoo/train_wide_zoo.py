@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet
-import ray
 import torch
 from ray import tune
 from ray.rllib.algorithms.appo import APPOConfig
@@ -43,7 +42,7 @@ sys.path[:0] = [str(HERE / "app"), str(HERE)]
 import zoo_rules  # noqa: E402  # pyright: ignore[reportMissingImports]
 import zoo_spaces  # noqa: E402  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
 import zoo_team  # noqa: E402  # pyright: ignore[reportMissingImports]
-from train_zoo import leaves, record  # noqa: E402  # pyright: ignore[reportMissingImports]
+from train_zoo import leaves, ray_for_training, record  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 SMALL = DefaultModelConfig(fcnet_hiddens=[16])
 LSTM = DefaultModelConfig(fcnet_hiddens=[8], use_lstm=True, lstm_cell_size=8, max_seq_len=10)
@@ -277,8 +276,7 @@ def configurations(out: Path) -> dict[str, Any]:
 def main(out: Path, only: list[str]) -> None:
     tune.register_env("spaces", zoo_spaces.Spaces)
     tune.register_env("team", zoo_team.Team)
-    ray.init(num_cpus=1, include_dashboard=False, _temp_dir=str(out / "ray"), configure_logging=False)
-    try:
+    with ray_for_training():
         for name, config in configurations(out).items():
             if only and name not in only:
                 continue
@@ -294,8 +292,6 @@ def main(out: Path, only: list[str]) -> None:
                 record(algorithm, out / f"{name}.npz")
             algorithm.stop()
             print(name, flush=True)
-    finally:
-        ray.shutdown()
 
 
 if __name__ == "__main__":

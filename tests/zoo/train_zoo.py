@@ -4,18 +4,22 @@
 
 writes OUT/<name>/ (a checkpoint) and OUT/<name>.npz (observations, and the actions RLlib sent to env.step for them with
 exploration off and the filter frozen). It runs in a process of its own, so that the tests can show that an export
-starts no Ray; it starts a cluster of its own in OUT/ray, and stops it.
+starts no Ray; it starts a cluster of its own, and stops it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import ray
+import torch
 from ray import tune
 from ray.rllib.algorithms.appo import APPOConfig
 from ray.rllib.algorithms.dqn import DQNConfig
@@ -129,11 +133,34 @@ def leaves(tree: Any, name: str) -> dict[str, Any]:
     return {name: np.copy(tree)}
 
 
+@contextlib.contextmanager
+def ray_for_training() -> Iterator[None]:
+    """Start a cluster of one core with a folder of its own: a short path, a socket's may have 107 characters."""
+    torch.set_num_threads(1)  # these networks are so small that a second thread only costs
+    with tempfile.TemporaryDirectory(prefix="zoo-", dir="/tmp", ignore_cleanup_errors=True) as folder:
+        try:
+            start_ray(folder)
+            yield
+        finally:
+            ray.shutdown()
+
+
+def start_ray(folder: str, attempts: int = 3) -> None:
+    """Start Ray; on a busy machine it may miss its own 30 s (ray 2.60), so it is tried again."""
+    for attempt in range(1, attempts + 1):
+        try:
+            ray.init(num_cpus=1, include_dashboard=False, _temp_dir=folder, configure_logging=False)
+            return
+        except Exception:  # Ray raises plain Exception, RuntimeError, and its own
+            ray.shutdown()
+            if attempt == attempts:
+                raise
+
+
 def main(out: Path, only: list[str]) -> None:
     tune.register_env("toy", zoo_parts.Toy)
     gym.register("zoo/Toy-v0", entry_point="zoo_parts:Toy")
-    ray.init(num_cpus=1, include_dashboard=False, _temp_dir=str(out / "ray"), configure_logging=False)
-    try:
+    with ray_for_training():
         for name, config in configurations().items():
             if only and name not in only:
                 continue
@@ -145,8 +172,6 @@ def main(out: Path, only: list[str]) -> None:
             record(algorithm, out / f"{name}.npz")
             algorithm.stop()
             print(name, flush=True)
-    finally:
-        ray.shutdown()
 
 
 if __name__ == "__main__":

@@ -42,8 +42,8 @@ def test_both_clocks_give_the_same_ur_trajectory_and_only_one_takes_its_time(ser
         seconds[clock] = time.monotonic() - began
         runs[clock] = states
     assert runs["fast"] == runs["real"]
-    assert seconds["real"] == pytest.approx(1.5, abs=0.12)
-    assert seconds["fast"] < 0.5
+    assert 1.45 < seconds["real"] < 3.0  # a busy machine is late; the rate itself is tested below
+    assert seconds["fast"] < seconds["real"] / 2
 
 
 def test_both_clocks_give_the_same_mir100_trajectory(serve: Serve) -> None:
@@ -60,14 +60,14 @@ def test_both_clocks_give_the_same_mir100_trajectory(serve: Serve) -> None:
         seconds[clock] = time.monotonic() - began
         runs[clock] = states
     assert runs["fast"] == runs["real"]
-    assert seconds["real"] == pytest.approx(1.0, abs=0.12)
+    assert 0.95 < seconds["real"] < 2.0
 
 
 def test_setstate_takes_its_cycles_in_real_time(serve: Serve) -> None:
     client = serve(Mir100Settings(clock="real"))
     began = time.monotonic()
     assert client.set_state(state=[0.0] * 6)
-    assert time.monotonic() - began == pytest.approx(0.2, abs=0.1)
+    assert 0.15 < time.monotonic() - began < 1.0
 
 
 def test_in_real_time_a_silent_client_finds_the_arm_stopped_and_the_object_moved_on(serve: Serve) -> None:
@@ -95,29 +95,46 @@ def test_in_fast_time_nothing_happens_between_calls(serve: Serve) -> None:
     assert client.state() == before
 
 
-def test_client_that_thinks_within_the_cycle_keeps_the_rate_and_late_one_is_not_punished() -> None:
+class Wall:
+    """Takes the place of the module `time`: only sleeping takes time."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+def test_client_that_thinks_within_the_cycle_keeps_the_rate_and_late_one_is_not_punished(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wall = Wall()
+    monkeypatch.setattr("rlservo.envs.robot_server.clock.time", wall)
     clock = Clock("real", 0.05)
-    Clock.wait(clock.passed(1))
-    began = time.monotonic()
+    Clock.wait(clock.count_cycles(1))
+    began = wall.monotonic()
     for _ in range(10):
-        time.sleep(0.03)
-        Clock.wait(clock.passed(1))
-    assert time.monotonic() - began == pytest.approx(0.5, abs=0.04)
-    time.sleep(0.2)  # late: the next cycle is a whole one, not what is left of a schedule
-    began = time.monotonic()
-    assert clock.missed() == 0
-    Clock.wait(clock.passed(1))
-    assert time.monotonic() - began == pytest.approx(0.05, abs=0.03)
+        wall.sleep(0.03)
+        Clock.wait(clock.count_cycles(1))
+    assert wall.monotonic() - began == pytest.approx(0.5)
+    wall.sleep(0.2)  # late: the next cycle is a whole one, not what is left of a schedule
+    began = wall.monotonic()
+    assert clock.count_missed_cycles() == 0
+    Clock.wait(clock.count_cycles(1))
+    assert wall.monotonic() - began == pytest.approx(0.05)
 
 
 def test_long_silence_is_simulated_for_a_minute_at_most() -> None:
     clock = Clock("real", 0.1)
-    assert clock.missed() == 0  # nothing has begun
-    clock.passed(1)
+    assert clock.count_missed_cycles() == 0  # nothing has begun
+    clock.count_cycles(1)
     assert clock._due is not None
     clock._due -= 3.0
-    assert clock.missed() == pytest.approx(29, abs=1)
-    assert clock.missed() == 0  # counted once
+    assert clock.count_missed_cycles() == pytest.approx(29, abs=1)
+    assert clock.count_missed_cycles() == 0  # counted once
     clock._due -= 3600.0
-    assert clock.missed() == 600
-    assert clock.missed() == 0
+    assert clock.count_missed_cycles() == 600
+    assert clock.count_missed_cycles() == 0

@@ -394,14 +394,15 @@ def test_impossible_options_are_one_sentence(arguments: tuple[str, ...], message
 
 
 def test_robot_server_without_a_client_ends_itself_called_or_not_and_one_with_a_client_stays() -> None:
-    servers = RobotServers(orphan_s=1.0)
+    servers = RobotServers(orphan_s=3.0)
     try:
-        left, kept = servers.start(UR), servers.start(UR)
+        left = servers.start(UR)
         get_state(left)  # comes and goes
-        never_called = servers.start(UR)
+        kept = servers.start(UR)
         with grpc.insecure_channel(f"127.0.0.1:{kept}") as channel:
             call = channel.unary_unary(f"/{ROBOT_SERVER}/GetState", response_deserializer=State.FromString)
             call(Empty().SerializeToString(), timeout=5)
+            never_called = servers.start(UR)  # now: on a busy machine a start takes as long as a server waits
             assert count_connections(kept) == 1
             assert wait_for(lambda: left not in servers.running, 20.0)
             assert wait_for(lambda: never_called not in servers.running, 20.0)

@@ -17,7 +17,7 @@ from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.commands.export import export_checkpoint
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 from rlservo.export.graph.onnx_file import run_onnx
-from rlservo.export.rllib.new_stack import load_checkpoint
+from rlservo.export.rllib.restore import restore
 
 MODULE = "learner_group/learner/rl_module/default_policy"
 
@@ -74,7 +74,7 @@ def test_a_filter_whose_statistics_were_not_saved_is_refused(
     damaged = copy_of("pendulum")
     shutil.rmtree(damaged / "env_runner")
     with user_code(app.parent), pytest.raises(CheckpointError, match="the observation filter's statistics"):
-        load_checkpoint(locate_checkpoint(damaged), notices.append)
+        restore(locate_checkpoint(damaged), Path(), notices.append)
     (damaged / "class_and_ctor_args.pkl").unlink()
     with pytest.raises(CheckpointError, match="it has neither env_runner/"):
         locate_checkpoint(damaged)
@@ -136,7 +136,7 @@ def test_a_truncated_pickle_is_named(copy_of: Callable[[str], Path], notices: li
     whole = (damaged / file).read_bytes()
     (damaged / file).write_bytes(whole[: len(whole) // 2])
     with pytest.raises(CheckpointError, match=r"truncated or damaged") as caught:
-        load_checkpoint(locate_checkpoint(damaged), notices.append)
+        restore(locate_checkpoint(damaged), Path(), notices.append)
     assert str(damaged) in caught.value.message
 
 
@@ -161,7 +161,7 @@ def test_a_lost_filter_state_is_refused_and_not_replaced_by_an_empty_filter(
     folder = damaged / "env_runner/env_to_module_connector/MeanStdFilter"
     folder.rename(damaged / "elsewhere")
     with pytest.raises(CheckpointError, match="the observation filter's statistics"):
-        load_checkpoint(locate_checkpoint(damaged), notices.append)
+        restore(locate_checkpoint(damaged), Path(), notices.append)
 
 
 def rewrite_weights(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
@@ -177,7 +177,7 @@ def test_missing_weights_of_the_policy_are_refused_and_not_left_random(
     damaged = copy_of("pendulum")
     rewrite_weights(damaged, lambda state: state.pop("pi.net.mlp.0.weight"))
     with pytest.raises(CheckpointError, match=r"lacks weights .* pi\.net\.mlp\.0\.weight"):
-        load_checkpoint(locate_checkpoint(damaged), notices.append)
+        restore(locate_checkpoint(damaged), Path(), notices.append)
 
 
 def test_without_the_critics_weights_there_is_no_value_output_and_a_notice(
@@ -190,7 +190,7 @@ def test_without_the_critics_weights_there_is_no_value_output_and_a_notice(
             del state[key]
 
     rewrite_weights(damaged, drop_critic)
-    assert load_checkpoint(locate_checkpoint(damaged), notices.append).network.names == ("action_dist_inputs",)
+    assert restore(locate_checkpoint(damaged), Path(), notices.append).network.names == ("action_dist_inputs",)
     assert "no value head" in " ".join(notices)
 
 
@@ -198,7 +198,7 @@ def test_weights_that_are_not_finite_are_refused(copy_of: Callable[[str], Path],
     damaged = copy_of("pendulum")
     rewrite_weights(damaged, lambda state: np.copyto(state["pi.net.mlp.0.bias"], np.nan))
     with pytest.raises(CheckpointError, match="training diverged"):
-        load_checkpoint(locate_checkpoint(damaged), notices.append)
+        restore(locate_checkpoint(damaged), Path(), notices.append)
 
 
 def test_a_part_that_another_ray_wrote_and_this_one_cannot_read_says_so(copy_of: Callable[[str], Path]) -> None:
@@ -208,7 +208,7 @@ def test_a_part_that_another_ray_wrote_and_this_one_cannot_read_says_so(copy_of:
     (pipeline / "metadata.json").write_text(json.dumps({**written, "ray_version": "2.44.1"}))
     (pipeline / "class_and_ctor_args.pkl").write_bytes(pickle.dumps({"class": dict, "ctor_args_and_kwargs": ((), {})}))
     with pytest.raises(CheckpointError, match=r"Ray 2\.44\.1 wrote it and this is Ray .*: export with Ray 2"):
-        load_checkpoint(locate_checkpoint(damaged), lambda _: None)
+        restore(locate_checkpoint(damaged), Path(), lambda _: None)
 
 
 def test_modules_saved_together_are_taken_one_by_one(wide_zoo: Path, tmp_path: Path, app: Path) -> None:

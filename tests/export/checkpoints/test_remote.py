@@ -9,7 +9,7 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from rlservo.export.checkpoints.remote import fetched
+from rlservo.export.checkpoints.remote import fetch
 from rlservo.export.commands.export import export_checkpoint
 from rlservo.export.commands.verify import verify_bundle
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError, UsageError
@@ -67,5 +67,5 @@ def test_errors_name_the_uri_and_leave_nothing(tmp_path: Path, bucket: str, noti
 
 
 def test_a_local_path_is_used_where_it_is(zoo: Path) -> None:
-    with fetched(str(zoo / "pendulum"), lambda _: None) as folder:
+    with fetch(str(zoo / "pendulum"), lambda _: None) as folder:
         assert folder == zoo / "pendulum"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gymnasium
 import pytest
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from rich.console import Console
 
 from rlservo.export.commands.element_names import read_elements
@@ -65,18 +66,41 @@ def test_verify_reports_success_where_the_environment_tells(
 
 @pytest.mark.parametrize(("name", "action"), [("lstm_box", "box"), ("act_nested", "nested"), ("previous", "discrete")])
 def test_verify_drives_recurrent_and_nested_policies(
-    wide_zoo: Path, app: Path, tmp_path: Path, notices: list[str], spaces: str, name: str, action: str
+    wide_zoo: Path, recurrent: Path, app: Path, tmp_path: Path, notices: list[str], spaces: str, name: str, action: str
 ) -> None:
-    exported = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append)
-    assert exported.contract.provenance.env_config["action"] == action
-    result = verify_bundle(
-        exported.path, wide_zoo / name, env_id=spaces, episodes=3, app_dir=app, notify=notices.append
-    )
+    if (recurrent / name).exists():
+        bundle = Path(shutil.copytree(recurrent / name / "1", tmp_path / name / "1"))
+    else:
+        bundle = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append).path
+    assert read_contract(bundle).provenance.env_config["action"] == action
+    result = verify_bundle(bundle, wide_zoo / name, env_id=spaces, episodes=3, app_dir=app, notify=notices.append)
     evaluation = result.evaluation
     assert evaluation is not None and evaluation.episodes == 3 and evaluation.return_bundle != 0.0
     assert evaluation.return_bundle == pytest.approx(evaluation.return_checkpoint, rel=1e-4)
-    assert load_bundle(exported.path).contract.evaluations == (evaluation,)
-    assert not [file for file in exported.path.iterdir() if file.name.startswith(".")]
+    assert load_bundle(bundle).contract.evaluations == (evaluation,)
+    assert not [file for file in bundle.iterdir() if file.name.startswith(".")]
+
+
+def test_verify_drives_where_the_actions_do_not_start_at_zero(
+    zoo: Path, tmp_path: Path, notices: list[str], toy: str
+) -> None:
+    exported = export_checkpoint(zoo / "started", tmp_path, notify=notices.append)
+    result = verify_bundle(exported.path, zoo / "started", env_id=toy, episodes=2, notify=notices.append)
+    assert result.evaluation is not None
+    assert result.evaluation.return_bundle == pytest.approx(result.evaluation.return_checkpoint, rel=1e-5)
+
+
+def test_an_interrupted_verification_writes_no_half_of_a_comparison(
+    zoo: Path, tmp_path: Path, notices: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    exported = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
+    monkeypatch.setattr(PendulumEnv, "step", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        verify_bundle(exported.path, zoo / "pendulum", env_id="Pendulum-v1", episodes=2, notify=notices.append)
+    assert read_contract(exported.path).evaluations == ()
 
 
 def test_verify_catches_another_checkpoint(zoo: Path, tmp_path: Path, notices: list[str]) -> None:
@@ -94,9 +118,9 @@ def test_verify_refuses_what_is_no_bundle_and_an_environment_that_does_not_fit(
     with pytest.raises(BundleError):
         verify_bundle(tmp_path, zoo / "pendulum", notify=notices.append)
     exported = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
-    with pytest.raises(UsageError, match="gives observations of shape"):
+    with pytest.raises(UsageError, match=r"does not fit CartPole-v1: the observation has shape \(4,\) there"):
         verify_bundle(exported.path, zoo / "pendulum", env_id="CartPole-v1", notify=notices.append)
-    with pytest.raises(UsageError, match="cannot be made"):
+    with pytest.raises(UsageError, match="is not registered"):
         verify_bundle(exported.path, zoo / "pendulum", env_id="No/Such-v0", notify=notices.append)
     assert read_contract(exported.path).evaluations == ()
 
@@ -187,9 +211,12 @@ ROBOT_NAMES = [f"{joint}_joint_{what}" for joint in ("shoulder_pan", "shoulder_l
 
 @pytest.mark.parametrize("name", ["act_nested", "lstm_previous", "image", "obs_tuple"])
 def test_the_report_of_any_policy_fits_a_terminal_and_breaks_no_name(
-    wide_zoo: Path, app: Path, tmp_path: Path, notices: list[str], name: str
+    wide_zoo: Path, recurrent: Path, app: Path, tmp_path: Path, notices: list[str], name: str
 ) -> None:
-    contract = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append).contract
+    if (recurrent / name).exists():
+        contract = read_contract(recurrent / name / "1")
+    else:
+        contract = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append).contract
     file = io.StringIO()
     Console(width=80, file=file).print(contract_report(contract))
     shown = file.getvalue()

@@ -302,7 +302,6 @@ class Untouched(nn.Module):
     """A network that gives its input as the action."""
 
     names: tuple[str, ...] = ()
-    given = 1
 
     def forward(self, obs: Tensor) -> tuple[Tensor, ...]:
         return (obs.float(),)

@@ -23,8 +23,7 @@ from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.commands.export import export_checkpoint
 from rlservo.export.contract.errors import RequestError
 from rlservo.export.recipe.trees import named_leaves
-from rlservo.export.rllib.new_stack import load_checkpoint
-from rlservo.export.rllib.old_stack import load_old_stack
+from rlservo.export.rllib.restore import restore
 from rlservo.serve_app.runtime.policy import Policy
 
 DRAWS = 1200
@@ -61,7 +60,8 @@ def drawn_by_rllib(zoo: Path, app: Path, name: str) -> Mapping[str, Any]:
     with user_code(app):
         files = locate_checkpoint(zoo / name)
         assert isinstance(files, CheckpointFiles)
-        ours = load_checkpoint(files, lambda _: None).pipelines
+        loop: Any = restore(files, app, lambda _: None).start_loop()
+        ours = loop.pipelines
     (obs,) = observed(zoo, name).values()
     episodes = [ours.begin(obs) for _ in range(DRAWS)]
     torch.manual_seed(1)
@@ -89,8 +89,8 @@ def test_the_old_stack_explores_as_rllib_does(old_zoo: Path, app: Path, tmp_path
     with user_code(app):
         files = locate_checkpoint(old_zoo / name)
         assert isinstance(files, OldStackFiles)
-        restored = load_old_stack(files, app, lambda _: None)
-    policy, loop = restored._policy, restored.loop()
+        loop: Any = restore(files, app, lambda _: None).start_loop()
+    policy = loop.policy
     seen: list[Any] = []
     compute = policy.compute_actions_from_input_dict
 

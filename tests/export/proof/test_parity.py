@@ -17,18 +17,19 @@ from rlservo.export.contract.contract import Parity
 from rlservo.export.contract.errors import ParityError
 from rlservo.export.graph.onnx_file import run_onnx, write_onnx
 from rlservo.export.graph.policy_graph import PolicyGraph
-from rlservo.export.proof.parity import GraphLoop, prove, record, record_moved
+from rlservo.export.proof.parity import GraphLoop, prove, record, record_perturbed
 from rlservo.export.recipe.recipe import ObservationFilter, Recipe, Transform
-from rlservo.export.recipe.runners import Outputs, Runner
+from rlservo.export.recipe.runners import Outputs, Runner, first_step
 from rlservo.export.recipe.samples import BATCH_SIZES, draw_batches
-from rlservo.export.rllib.new_stack import Checkpoint, load_checkpoint
+from rlservo.export.rllib.restore import restore
+from rlservo.export.rllib.restored_policy import RestoredPolicy
 
 
 @pytest.fixture
-def load(zoo: Path, app: Path, notices: list[str]) -> Callable[[str], Checkpoint]:
-    def load(name: str) -> Checkpoint:
+def load(zoo: Path, app: Path, notices: list[str]) -> Callable[[str], RestoredPolicy]:
+    def load(name: str) -> RestoredPolicy:
         with user_code(app):
-            return load_checkpoint(locate_checkpoint(zoo / name), notices.append)
+            return restore(locate_checkpoint(zoo / name), app, notices.append)
 
     return load
 
@@ -38,19 +39,19 @@ def filter_of(recipe: Recipe) -> ObservationFilter:
     return recipe.filter
 
 
-def prove_as(checkpoint: Checkpoint, recipe: Recipe, tmp_path: Path) -> Parity:
+def prove_as(checkpoint: RestoredPolicy, recipe: Recipe, tmp_path: Path) -> Parity:
     """Prove a graph built from `recipe` against RLlib's own pipeline of `checkpoint`."""
     graph = PolicyGraph(recipe, checkpoint.network)
-    recorded = record(checkpoint.reference, draw_batches(checkpoint.recipe, seed=3), checkpoint.loop)
-    pair = next(one.batch for one in recorded if len(one.batch) == 2)
+    references = record(checkpoint.start_loop, draw_batches(checkpoint.recipe, seed=3))
+    pair = next(one.batch for one in references if len(one.batch) == 2)
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(2, np.bool_))
     write_onnx(graph, example, tmp_path / "policy.onnx")
-    moved = functools.partial(record_moved, checkpoint.reference, recorded, checkpoint.loop)
-    return prove(checkpoint.recipe, recorded, {"onnx": run_onnx(tmp_path / "policy.onnx")}, moved=moved)
+    perturb = functools.partial(record_perturbed, checkpoint.start_loop, references)
+    return prove(checkpoint.recipe, references, {"onnx": run_onnx(tmp_path / "policy.onnx")}, perturb=perturb)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "unbounded", "offset", "grid", "double"])
-def test_the_filter_as_rllib_has_it_passes(load: Callable[[str], Checkpoint], tmp_path: Path, name: str) -> None:
+def test_the_filter_as_rllib_has_it_passes(load: Callable[[str], RestoredPolicy], tmp_path: Path, name: str) -> None:
     checkpoint = load(name)
     assert checkpoint.recipe.filter is not None
     result = prove_as(checkpoint, checkpoint.recipe, tmp_path).formats["onnx"]
@@ -58,7 +59,7 @@ def test_the_filter_as_rllib_has_it_passes(load: Callable[[str], Checkpoint], tm
 
 
 @pytest.mark.parametrize("name", ["pendulum", "unbounded", "offset", "grid", "double"])
-def test_a_dropped_filter_is_caught(load: Callable[[str], Checkpoint], tmp_path: Path, name: str) -> None:
+def test_a_dropped_filter_is_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path, name: str) -> None:
     checkpoint = load(name)
     steps = tuple(step for step in checkpoint.recipe.steps if step is not checkpoint.recipe.filter)
     with pytest.raises(ParityError, match="likely observations: output"):
@@ -70,7 +71,7 @@ def tampered_filter(recipe: Recipe, **changes: Any) -> Recipe:
     return dataclasses.replace(recipe, steps=tuple(changed if step is recipe.filter else step for step in recipe.steps))
 
 
-def test_swapped_mean_and_std_are_caught(load: Callable[[str], Checkpoint], tmp_path: Path) -> None:
+def test_swapped_mean_and_std_are_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path) -> None:
     checkpoint = load("pendulum")
     frozen = filter_of(checkpoint.recipe)
     swapped = tampered_filter(checkpoint.recipe, mean=frozen.std.astype(np.float64), std=frozen.mean.astype(np.float32))
@@ -78,13 +79,13 @@ def test_swapped_mean_and_std_are_caught(load: Callable[[str], Checkpoint], tmp_
         prove_as(checkpoint, swapped, tmp_path)
 
 
-def test_a_missing_filter_clip_is_caught(load: Callable[[str], Checkpoint], tmp_path: Path) -> None:
+def test_a_missing_filter_clip_is_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path) -> None:
     checkpoint = load("pendulum")
     with pytest.raises(ParityError):
         prove_as(checkpoint, tampered_filter(checkpoint.recipe, clip=None), tmp_path)
 
 
-def test_a_biased_std_is_caught(load: Callable[[str], Checkpoint], tmp_path: Path) -> None:
+def test_a_biased_std_is_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path) -> None:
     checkpoint = load("pendulum")
     n = filter_of(checkpoint.recipe).count
     biased = filter_of(checkpoint.recipe).std * np.float32(np.sqrt((n - 1) / n))
@@ -97,17 +98,20 @@ def test_a_biased_std_is_caught(load: Callable[[str], Checkpoint], tmp_path: Pat
     [("pendulum", "clip"), ("pendulum", "none"), ("mixed", "clip"), ("clipped", "unsquash"), ("clipped", "none")],
 )
 def test_a_wrong_action_transform_is_caught(
-    load: Callable[[str], Checkpoint], tmp_path: Path, name: str, transform: Transform
+    load: Callable[[str], RestoredPolicy], tmp_path: Path, name: str, transform: Transform
 ) -> None:
     checkpoint = load(name)
     if transform == "none":  # actions of a fresh network stay within bounds: make some that do not
-        for module in (checkpoint.network.module, checkpoint.pipelines.module):
+        loop: Any = checkpoint.start_loop()
+        for module in (checkpoint.network.module, loop.pipelines.module):
             module.pi.net.mlp[-1].weight *= 50
     with pytest.raises(ParityError, match="output 'action'"):
         prove_as(checkpoint, dataclasses.replace(checkpoint.recipe, transform=transform), tmp_path)
 
 
-def test_squashing_the_mean_where_rllib_does_not_is_caught(load: Callable[[str], Checkpoint], tmp_path: Path) -> None:
+def test_squashing_the_mean_where_rllib_does_not_is_caught(
+    load: Callable[[str], RestoredPolicy], tmp_path: Path
+) -> None:
     checkpoint = load("sac")
     assert checkpoint.recipe.mode == "mean"
     with pytest.raises(ParityError, match="output 'action'"):
@@ -115,7 +119,7 @@ def test_squashing_the_mean_where_rllib_does_not_is_caught(load: Callable[[str],
 
 
 def test_changed_weights_are_caught_in_the_discrete_action_too(
-    load: Callable[[str], Checkpoint], tmp_path: Path
+    load: Callable[[str], RestoredPolicy], tmp_path: Path
 ) -> None:
     checkpoint = load("cart_pole")
     checkpoint.network.module.pi.net.mlp[-1].weight *= -1
@@ -123,10 +127,10 @@ def test_changed_weights_are_caught_in_the_discrete_action_too(
         prove_as(checkpoint, checkpoint.recipe, tmp_path)
 
 
-def test_a_discrete_choice_may_differ_only_where_rllibs_scores_tie(load: Callable[[str], Checkpoint]) -> None:
+def test_a_discrete_choice_may_differ_only_where_rllibs_scores_tie(load: Callable[[str], RestoredPolicy]) -> None:
     checkpoint = load("cart_pole")
-    recorded = record(checkpoint.reference, draw_batches(checkpoint.recipe, seed=3))[:1]
-    outputs = recorded[0].outputs
+    references = record(checkpoint.start_loop, draw_batches(checkpoint.recipe, seed=3))[:1]
+    outputs = references[0].outputs
 
     def flipped_at(rows: list[int]) -> Runner:
         action = outputs["action"].astype(np.int64)
@@ -134,37 +138,39 @@ def test_a_discrete_choice_may_differ_only_where_rllibs_scores_tie(load: Callabl
         return lambda obs: {**outputs, "action": action}
 
     with pytest.raises(ParityError, match=r"sample 4: the export chooses \d, RLlib \d"):
-        prove(checkpoint.recipe, recorded, {"onnx": flipped_at([4])})
+        prove(checkpoint.recipe, references, {"onnx": flipped_at([4])})
     outputs["action_dist_inputs"][4] = 0.25
-    assert prove(checkpoint.recipe, recorded, {"onnx": flipped_at([4])}).samples == 257
+    assert prove(checkpoint.recipe, references, {"onnx": flipped_at([4])}).samples == 257
 
 
-def test_an_error_names_output_element_sample_and_both_values(load: Callable[[str], Checkpoint]) -> None:
+def test_an_error_names_output_element_sample_and_both_values(load: Callable[[str], RestoredPolicy]) -> None:
     checkpoint = load("mixed")
-    recorded = record(checkpoint.reference, draw_batches(checkpoint.recipe, seed=3))
-    wrong: dict[int, Outputs] = {id(one): {**one.outputs, "action": one.outputs["action"].copy()} for one in recorded}
-    wrong[id(recorded[0])]["action"][11, 2] += 0.5
-    answers = iter(recorded)
+    references = record(checkpoint.start_loop, draw_batches(checkpoint.recipe, seed=3))
+    wrong: dict[int, Outputs] = {id(one): {**one.outputs, "action": one.outputs["action"].copy()} for one in references}
+    wrong[id(references[0])]["action"][11, 2] += 0.5
+    answers = iter(references)
     with pytest.raises(ParityError) as caught:
-        prove(checkpoint.recipe, recorded, {"onnx": lambda obs: wrong[id(next(answers))]}, labels=["x", "y", "gripper"])
-    expected = float(recorded[0].outputs["action"][11, 2])
+        prove(
+            checkpoint.recipe, references, {"onnx": lambda obs: wrong[id(next(answers))]}, labels=["x", "y", "gripper"]
+        )
+    expected = float(references[0].outputs["action"][11, 2])
     assert "output 'action', element 2 (gripper), sample 11" in caught.value.message
     assert caught.value.details["reference"] == pytest.approx(expected)
     assert caught.value.details["exported"] == pytest.approx(expected + 0.5)
 
 
-def test_the_reference_does_not_drift(load: Callable[[str], Checkpoint]) -> None:
+def test_the_reference_does_not_drift(load: Callable[[str], RestoredPolicy]) -> None:
     checkpoint = load("pendulum")
     obs = {"obs": np.array([[0.1, 0.9, 3.0]], np.float32)}
-    before = checkpoint.reference(obs)
+    before = first_step(checkpoint.start_loop(), obs)
     for batch in draw_batches(checkpoint.recipe, seed=5):
-        checkpoint.reference({"obs": batch.obs.copy()})
-    after = checkpoint.reference(obs)
+        first_step(checkpoint.start_loop(), {"obs": batch.obs.copy()})
+    after = first_step(checkpoint.start_loop(), obs)
     for name, values in before.items():
         np.testing.assert_array_equal(after[name], values)
 
 
-def test_samples_reach_the_filters_clip_the_bounds_and_every_batch_size(load: Callable[[str], Checkpoint]) -> None:
+def test_samples_reach_the_filters_clip_the_bounds_and_every_batch_size(load: Callable[[str], RestoredPolicy]) -> None:
     recipe = load("pendulum").recipe
     batches = draw_batches(recipe, seed=0)
     assert {len(batch.obs) for batch in batches} == set(BATCH_SIZES)

@@ -30,9 +30,11 @@ from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.torchscript_file import run_torchscript
 from rlservo.export.proof.parity import GraphLoop, prove, record
 from rlservo.export.recipe.recipe import Flatten, FrameStack, Previous, Recipe, StateLeaf
+from rlservo.export.recipe.runners import first_step
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.recipe.trees import named_leaves
-from rlservo.export.rllib.new_stack import Checkpoint, load_checkpoint
+from rlservo.export.rllib.restore import restore
+from rlservo.export.rllib.restored_policy import RestoredPolicy
 from rlservo.serve_app.runtime.policy import Policy
 
 RECURRENT = ["lstm_box", "lstm_discrete", "lstm_previous", "previous", "user_gru", "appo_lstm", "stacked", "act_nested",
@@ -118,11 +120,11 @@ def test_what_does_not_match_leaves_nothing(
 
 @pytest.mark.parametrize("name", ["polar", "bearing_module"])
 def test_distance_and_bearing_hold_for_extreme_observations(
-    load: Callable[[str], Checkpoint], export: Callable[[str], ExportResult], name: str
+    load: Callable[[str], RestoredPolicy], export: Callable[[str], ExportResult], name: str
 ) -> None:
     numbers = np.float32([0.0, -0.0, 1.0, -1.0, 0.5, -7.0, 1e-42, -1e-38, 1e5, -1e5, 1e15, 1e30, -1e30])
     obs = np.array([(x, y, z) for x in numbers for y in numbers for z in (0.3, -0.0, -2.0)], np.float32)
-    expected, result = load(name).reference({"obs": obs.copy()}), export(name)
+    expected, result = first_step(load(name).start_loop(), {"obs": obs.copy()}), export(name)
     script = run_torchscript(result.path / "policy.ts", ["obs"], [one.name for one in result.contract.outputs])
     for run in (run_onnx(result.path / "policy.onnx"), script):
         for output, values in run({"obs": obs}).items():
@@ -210,23 +212,23 @@ def test_a_state_that_begins_with_other_numbers_than_zero_is_kept(export: Callab
 
 
 @pytest.fixture
-def load(wide_zoo: Path, app: Path, notices: list[str]) -> Callable[[str], Checkpoint]:
-    def load(name: str) -> Checkpoint:
+def load(wide_zoo: Path, app: Path, notices: list[str]) -> Callable[[str], RestoredPolicy]:
+    def load(name: str) -> RestoredPolicy:
         with user_code(app):
-            return load_checkpoint(locate_checkpoint(wide_zoo / name), notices.append)
+            return restore(locate_checkpoint(wide_zoo / name), app, notices.append)
 
     return load
 
 
-def prove_as(checkpoint: Checkpoint, recipe: Recipe, tmp_path: Path, swap: Mapping[str, str] = {}) -> None:
+def prove_as(checkpoint: RestoredPolicy, recipe: Recipe, tmp_path: Path, swap: Mapping[str, str] = {}) -> None:
     """Prove a graph built from `recipe`, its states exchanged as `swap` says, against RLlib's own pipeline."""
-    recorded = record(checkpoint.reference, draw_batches(checkpoint.recipe, seed=3), checkpoint.loop)
+    references = record(checkpoint.start_loop, draw_batches(checkpoint.recipe, seed=3))
     graph = PolicyGraph(recipe, checkpoint.network)
-    pair = next(one.batch for one in recorded if len(one.batch) == 2)
+    pair = next(one.batch for one in references if len(one.batch) == 2)
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(2, np.bool_))
     write_onnx(graph, example, tmp_path / "policy.onnx")
     run = run_onnx(tmp_path / "policy.onnx")
-    prove(recipe, recorded, {"onnx": lambda inputs: run({swap.get(name, name): v for name, v in inputs.items()})})
+    prove(recipe, references, {"onnx": lambda inputs: run({swap.get(name, name): v for name, v in inputs.items()})})
 
 
 def changed(recipe: Recipe, **changes: Any) -> Recipe:
@@ -234,14 +236,14 @@ def changed(recipe: Recipe, **changes: Any) -> Recipe:
 
 
 @pytest.mark.parametrize("name", ["lstm_box", "act_nested"])
-def test_a_swapped_state_is_caught(load: Callable[[str], Checkpoint], tmp_path: Path, name: str) -> None:
+def test_a_swapped_state_is_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path, name: str) -> None:
     checkpoint = load(name)
     prove_as(checkpoint, checkpoint.recipe, tmp_path)
     with pytest.raises(ParityError, match="of the sequences"):
         prove_as(checkpoint, checkpoint.recipe, tmp_path, {"state_in.c": "state_in.h", "state_in.h": "state_in.c"})
 
 
-def test_a_state_that_is_not_reset_is_caught(load: Callable[[str], Checkpoint], tmp_path: Path) -> None:
+def test_a_state_that_is_not_reset_is_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path) -> None:
     checkpoint = load("user_gru")
     (memory,) = checkpoint.recipe.network_state
     zero = dataclasses.replace(memory, initial=np.zeros_like(memory.initial))
@@ -249,7 +251,7 @@ def test_a_state_that_is_not_reset_is_caught(load: Callable[[str], Checkpoint], 
         prove_as(checkpoint, changed(checkpoint.recipe, network_state=(zero,)), tmp_path)
 
 
-def test_leaves_flattened_in_another_order_are_caught(load: Callable[[str], Checkpoint], tmp_path: Path) -> None:
+def test_leaves_flattened_in_another_order_are_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path) -> None:
     checkpoint = load("obs_multi_discrete")
     (flatten,) = checkpoint.recipe.steps
     assert isinstance(flatten, Flatten)
@@ -258,7 +260,7 @@ def test_leaves_flattened_in_another_order_are_caught(load: Callable[[str], Chec
         prove_as(checkpoint, changed(checkpoint.recipe, steps=(Flatten(turned),)), tmp_path)
 
 
-def test_a_forgotten_action_is_caught(load: Callable[[str], Checkpoint], tmp_path: Path) -> None:
+def test_a_forgotten_action_is_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path) -> None:
     checkpoint = load("previous")
     previous = checkpoint.recipe.steps[0]
     assert isinstance(previous, Previous)
@@ -267,18 +269,18 @@ def test_a_forgotten_action_is_caught(load: Callable[[str], Checkpoint], tmp_pat
         prove_as(checkpoint, changed(checkpoint.recipe, steps=(*other, *checkpoint.recipe.steps[1:])), tmp_path)
 
 
-def test_frames_in_the_wrong_order_are_caught(load: Callable[[str], Checkpoint], tmp_path: Path) -> None:
+def test_frames_in_the_wrong_order_are_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path) -> None:
     checkpoint = load("stacked")
     assert isinstance(checkpoint.recipe.steps[0], FrameStack)
-    recorded = record(checkpoint.reference, draw_batches(checkpoint.recipe, seed=3), checkpoint.loop)
-    pair = next(one.batch for one in recorded if len(one.batch) == 2)
+    references = record(checkpoint.start_loop, draw_batches(checkpoint.recipe, seed=3))
+    pair = next(one.batch for one in references if len(one.batch) == 2)
     example = GraphLoop(lambda inputs: inputs, checkpoint.recipe.state).complete(pair.inputs, np.ones(2, np.bool_))
     write_onnx(PolicyGraph(checkpoint.recipe, checkpoint.network), example, tmp_path / "policy.onnx")
     run = run_onnx(tmp_path / "policy.onnx")
     with pytest.raises(ParityError, match="of the sequences"):
         prove(
             checkpoint.recipe,
-            recorded,
+            references,
             {"onnx": lambda inputs: run({**inputs, "state_in.frames": inputs["state_in.frames"][..., ::-1].copy()})},
         )
 
@@ -291,20 +293,20 @@ def as_exported(outputs: Mapping[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("leaf", ["wheel", "gear"])
 def test_one_wrong_part_of_a_nested_action_is_caught(
-    load: Callable[[str], Checkpoint], tmp_path: Path, leaf: str
+    load: Callable[[str], RestoredPolicy], tmp_path: Path, leaf: str
 ) -> None:
     checkpoint = load("act_dict")
-    recorded = record(checkpoint.reference, draw_batches(checkpoint.recipe, seed=3), checkpoint.loop)
+    references = record(checkpoint.start_loop, draw_batches(checkpoint.recipe, seed=3))
 
     def answers(change: Callable[[Any], Any]) -> None:
-        remaining = iter(recorded)
+        remaining = iter(references)
         name = f"action.{leaf}"
 
         def run(_: Any) -> dict[str, Any]:
             outputs = next(remaining).outputs
             return {**as_exported(outputs), name: change(as_exported(outputs)[name])}
 
-        prove(checkpoint.recipe, recorded, {"onnx": run})
+        prove(checkpoint.recipe, references, {"onnx": run})
 
     answers(lambda action: action.copy())
     wrong = {"wheel": lambda action: action + np.float32(0.01), "gear": lambda action: (action + 1) % 3}
@@ -313,13 +315,13 @@ def test_one_wrong_part_of_a_nested_action_is_caught(
 
 
 def test_a_masked_score_does_not_widen_the_tolerance_of_the_others(
-    load: Callable[[str], Checkpoint], tmp_path: Path
+    load: Callable[[str], RestoredPolicy], tmp_path: Path
 ) -> None:
     checkpoint = load("masked")
-    recorded = record(checkpoint.reference, draw_batches(checkpoint.recipe, seed=3), checkpoint.loop)
-    scores = [one.outputs["action_dist_inputs"] for one in recorded]
+    references = record(checkpoint.start_loop, draw_batches(checkpoint.recipe, seed=3))
+    scores = [one.outputs["action_dist_inputs"] for one in references]
     assert any((values < -1e30).any() for values in scores)  # -3.4e38 stands for 'not allowed'
-    remaining = iter(recorded)
+    remaining = iter(references)
 
     def run(_: Any) -> dict[str, Any]:
         outputs = next(remaining).outputs
@@ -330,7 +332,7 @@ def test_a_masked_score_does_not_widen_the_tolerance_of_the_others(
         }
 
     with pytest.raises(ParityError, match="action_dist_inputs"):
-        prove(checkpoint.recipe, recorded, {"onnx": run})
+        prove(checkpoint.recipe, references, {"onnx": run})
 
 
 # The runtime.

@@ -31,12 +31,13 @@ from rlservo.export.contract.errors import CheckpointError, ParityError, Request
 from rlservo.export.graph.onnx_file import run_onnx, write_onnx
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.torchscript_file import run_torchscript
-from rlservo.export.proof.parity import GraphLoop, prove, record, record_moved
+from rlservo.export.proof.parity import GraphLoop, prove, record, record_perturbed
 from rlservo.export.recipe.recipe import ObservationFilter, Preprocess, Recipe, StateLeaf
-from rlservo.export.recipe.runners import Loop
+from rlservo.export.recipe.runners import Loop, first_step
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.rllib.old_models import Registration, find_registrations
-from rlservo.export.rllib.old_stack import OldStackCheckpoint, load_old_stack
+from rlservo.export.rllib.restore import restore
+from rlservo.export.rllib.restored_policy import RestoredPolicy
 from rlservo.serve_app.runtime.policy import Policy
 
 STATE = "policies/default_policy/policy_state.pkl"
@@ -51,13 +52,13 @@ SEVERAL = ["several_arm", "several_cart"]
 
 
 @pytest.fixture
-def load(old_zoo: Path, app: Path, notices: list[str]) -> Callable[..., OldStackCheckpoint]:
-    def load(name: str, folder: Path = old_zoo) -> OldStackCheckpoint:
+def load(old_zoo: Path, app: Path, notices: list[str]) -> Callable[..., RestoredPolicy]:
+    def load(name: str, folder: Path = old_zoo) -> RestoredPolicy:
         checkpoint, _, policy = name.partition("_") if name in SEVERAL else (name, "", None)
         files = locate_checkpoint(folder / checkpoint, policy)
         assert isinstance(files, OldStackFiles)
         with user_code(app):
-            return load_old_stack(files, app, notices.append)
+            return restore(files, app, notices.append)
 
     return load
 
@@ -135,20 +136,21 @@ def test_an_old_stack_export_acts_as_rllib_did_in_its_own_evaluation(
 
 @pytest.mark.parametrize("name", [*EXPORTED, *SEVERAL])
 def test_the_reference_is_what_the_environment_saw(
-    old_zoo: Path, load: Callable[..., OldStackCheckpoint], name: str
+    old_zoo: Path, load: Callable[..., RestoredPolicy], name: str
 ) -> None:
     seen = dict(np.load(old_zoo / f"{name}.npz"))
     restored = load(name)
     # One by one in the evaluation, together here where there is no memory: sums may come in another order.
-    assert_same_actions(drive(restored.loop(), seen, rows=45 if restored.recipe.state else None), seen)
+    assert_same_actions(drive(restored.start_loop(), seen, rows=45 if restored.recipe.state else None), seen)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "sac"])
 def test_compute_single_action_is_not_what_the_environment_sees(
-    old_zoo: Path, load: Callable[..., OldStackCheckpoint], name: str
+    old_zoo: Path, load: Callable[..., RestoredPolicy], name: str
 ) -> None:
     seen = np.load(old_zoo / f"{name}.npz")
-    policy = load(name)._policy
+    loop: Any = load(name).start_loop()
+    policy = loop.policy
     alone = np.stack([policy.compute_single_action(obs, explore=False)[0] for obs in seen["obs"]])
     assert np.abs(alone - seen["action"]).max() > 1e-3  # no filter, no unsquashing
 
@@ -168,7 +170,7 @@ def test_an_old_stack_bundle_says_what_went_in(export: Callable[..., ExportResul
     assert "run code when loaded" in " ".join(notices)
 
 
-def test_the_two_filters_of_the_old_stack_clip_differently(load: Callable[..., OldStackCheckpoint]) -> None:
+def test_the_two_filters_of_the_old_stack_clip_differently(load: Callable[..., RestoredPolicy]) -> None:
     frozen = {name: load(name).recipe.filter for name in ("pendulum", "concurrent")}
     assert all(one is not None for one in frozen.values())
     assert {name: one.clip for name, one in frozen.items() if one} == {"pendulum": None, "concurrent": 10.0}
@@ -193,7 +195,7 @@ def test_the_two_filters_of_the_old_stack_clip_differently(load: Callable[..., O
     ],
 )
 def test_the_action_rule_is_the_policys_own(
-    load: Callable[..., OldStackCheckpoint],
+    load: Callable[..., RestoredPolicy],
     name: str,
     distribution: str | None,
     mode: str,
@@ -217,14 +219,14 @@ def test_a_recurrent_models_state_goes_in_and_out_and_begins_as_the_model_says(
     assert [tensor.name for tensor in contract.inputs] == ["obs", *(f"state_in.{one}" for one in states)]
 
 
-def test_swapped_recurrent_states_are_caught(load: Callable[..., OldStackCheckpoint], tmp_path: Path) -> None:
+def test_swapped_recurrent_states_are_caught(load: Callable[..., RestoredPolicy], tmp_path: Path) -> None:
     restored = load("lstm")
     h, c = restored.recipe.network_state
     with pytest.raises(ParityError):
         prove_as(restored, dataclasses.replace(restored.recipe, network_state=(c, h)), tmp_path)
 
 
-def test_one_hot_codes_count_from_the_spaces_start(load: Callable[..., OldStackCheckpoint], tmp_path: Path) -> None:
+def test_one_hot_codes_count_from_the_spaces_start(load: Callable[..., RestoredPolicy], tmp_path: Path) -> None:
     restored = load("shifted")  # Discrete(4, start=3)
     told_wrong = (Preprocess(Discrete(4)), *restored.recipe.steps[1:])
     with pytest.raises(ParityError):
@@ -232,7 +234,7 @@ def test_one_hot_codes_count_from_the_spaces_start(load: Callable[..., OldStackC
 
 
 def test_a_value_head_that_nothing_trained_is_left_out_with_a_notice(
-    load: Callable[..., OldStackCheckpoint], notices: list[str]
+    load: Callable[..., RestoredPolicy], notices: list[str]
 ) -> None:
     load("cloned")
     load("no_critic")
@@ -241,7 +243,7 @@ def test_a_value_head_that_nothing_trained_is_left_out_with_a_notice(
 
 
 def test_a_scan_of_128_beams_is_rescaled_as_rllib_takes_it_for_an_ataris_memory(
-    load: Callable[..., OldStackCheckpoint], export: Callable[..., ExportResult], tmp_path: Path
+    load: Callable[..., RestoredPolicy], export: Callable[..., ExportResult], tmp_path: Path
 ) -> None:
     result = export("filtered_beams")
     assert [step.step for step in result.contract.baked_in][:2] == ["rescale", "mean_std_filter"]
@@ -251,21 +253,19 @@ def test_a_scan_of_128_beams_is_rescaled_as_rllib_takes_it_for_an_ataris_memory(
         prove_as(restored, dataclasses.replace(restored.recipe, steps=()), tmp_path)
 
 
-def prove_as(restored: OldStackCheckpoint, recipe: Recipe, tmp_path: Path) -> Parity:
+def prove_as(restored: RestoredPolicy, recipe: Recipe, tmp_path: Path) -> Parity:
     """Prove a graph built from `recipe` against RLlib's own pipeline of `restored`."""
     graph = PolicyGraph(recipe, restored.network)
-    recorded = record(restored.reference, draw_batches(restored.recipe, seed=3), restored.loop)
-    last = recorded[-1].batch
+    references = record(restored.start_loop, draw_batches(restored.recipe, seed=3))
+    last = references[-1].batch
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(last.inputs, np.ones(len(last), np.bool_))
     write_onnx(graph, example, tmp_path / "policy.onnx")
-    moved = functools.partial(record_moved, restored.reference, recorded, restored.loop)
-    return prove(restored.recipe, recorded, {"onnx": run_onnx(tmp_path / "policy.onnx")}, (), "old", moved)
+    perturb = functools.partial(record_perturbed, restored.start_loop, references)
+    return prove(restored.recipe, references, {"onnx": run_onnx(tmp_path / "policy.onnx")}, (), "old", perturb)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "unbounded", "offset", "grid", "double", "sac", "filtered_beams"])
-def test_a_dropped_old_stack_filter_is_caught(
-    load: Callable[..., OldStackCheckpoint], tmp_path: Path, name: str
-) -> None:
+def test_a_dropped_old_stack_filter_is_caught(load: Callable[..., RestoredPolicy], tmp_path: Path, name: str) -> None:
     restored = load(name)
     steps = tuple(step for step in restored.recipe.steps if not isinstance(step, ObservationFilter))
     assert steps != restored.recipe.steps
@@ -283,17 +283,18 @@ def test_a_dropped_old_stack_filter_is_caught(
     ],
 )
 def test_a_wrong_old_stack_action_rule_is_caught(
-    load: Callable[..., OldStackCheckpoint], tmp_path: Path, name: str, change: dict[str, str]
+    load: Callable[..., RestoredPolicy], tmp_path: Path, name: str, change: dict[str, str]
 ) -> None:
     restored = load(name)
     if name == "half_bounded":  # actions of a fresh network are small: move one below its bound
-        for model in (restored.network.module, restored._policy.model):
+        loop: Any = restored.start_loop()
+        for model in (restored.network.module, loop.policy.model):
             model._logits._model[0].bias[0] = -1.0
     with pytest.raises(ParityError, match="output 'action'"):
         prove_as(restored, dataclasses.replace(restored.recipe, **change), tmp_path)  # type: ignore[arg-type]
 
 
-def test_a_clip_the_filter_does_not_have_is_caught(load: Callable[..., OldStackCheckpoint], tmp_path: Path) -> None:
+def test_a_clip_the_filter_does_not_have_is_caught(load: Callable[..., RestoredPolicy], tmp_path: Path) -> None:
     restored = load("pendulum")
     frozen = restored.recipe.filter
     assert frozen is not None and frozen.clip is None
@@ -302,13 +303,13 @@ def test_a_clip_the_filter_does_not_have_is_caught(load: Callable[..., OldStackC
         prove_as(restored, clipped, tmp_path)
 
 
-def test_the_old_stack_reference_does_not_drift(load: Callable[..., OldStackCheckpoint]) -> None:
+def test_the_old_stack_reference_does_not_drift(load: Callable[..., RestoredPolicy]) -> None:
     restored = load("pendulum")
     inputs = {"obs": np.array([[0.1, 0.9, 3.0]], np.float32)}
-    before = restored.reference(inputs)
+    before = first_step(restored.start_loop(), inputs)
     for batch in draw_batches(restored.recipe, seed=5):  # some far outside the space
-        restored.reference(batch.inputs)
-    for name, values in restored.reference(inputs).items():
+        first_step(restored.start_loop(), batch.inputs)
+    for name, values in first_step(restored.start_loop(), inputs).items():
         np.testing.assert_array_equal(values, before[name])
 
 
@@ -454,7 +455,7 @@ def filter_of(state: dict[str, Any]) -> dict[str, Any]:
 )
 def test_a_state_that_cannot_be_trusted_is_refused(
     old_copy: Callable[[str], Path],
-    load: Callable[..., OldStackCheckpoint],
+    load: Callable[..., RestoredPolicy],
     change: Callable[[dict[str, Any]], object],
     error: type[RlservoError],
     words: str,
@@ -481,7 +482,7 @@ def test_a_policys_own_folder_tells_its_facts_without_the_algorithm(
 
 
 def test_what_a_users_constructor_lacks_is_not_called_a_damaged_file(
-    load: Callable[..., OldStackCheckpoint], app: Path, monkeypatch: pytest.MonkeyPatch
+    load: Callable[..., RestoredPolicy], app: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(app)
     import old_zoo_parts  # pyright: ignore[reportMissingImports]  # in app/
@@ -503,7 +504,7 @@ def test_an_operator_inside_a_model_is_named_with_its_place(
 
 
 def test_a_truncated_policy_state_is_named(
-    old_copy: Callable[[str], Path], load: Callable[..., OldStackCheckpoint]
+    old_copy: Callable[[str], Path], load: Callable[..., RestoredPolicy]
 ) -> None:
     damaged = old_copy("pendulum")
     whole = (damaged / STATE).read_bytes()
@@ -523,7 +524,7 @@ def test_a_damaged_algorithm_state_costs_only_the_facts(
 
 
 def test_settings_that_an_earlier_ray_did_not_know_take_their_defaults(
-    old_copy: Callable[[str], Path], load: Callable[..., OldStackCheckpoint], old_zoo: Path
+    old_copy: Callable[[str], Path], load: Callable[..., RestoredPolicy], old_zoo: Path
 ) -> None:
     newer = ("callbacks_on_", "offline_", "num_gpus_per_env_runner", "num_env_runners", "enable_rl_module", "torch_")
 
@@ -534,11 +535,11 @@ def test_settings_that_an_earlier_ray_did_not_know_take_their_defaults(
     damaged = old_copy("pendulum")
     rewrite(damaged / STATE, forget)
     seen = dict(np.load(old_zoo / "pendulum.npz"))
-    assert_same_actions(drive(load("pendulum", damaged.parent).loop(), seen), seen)
+    assert_same_actions(drive(load("pendulum", damaged.parent).start_loop(), seen), seen)
 
 
 def test_a_gpu_checkpoint_is_read_on_the_cpu(
-    old_copy: Callable[[str], Path], load: Callable[..., OldStackCheckpoint]
+    old_copy: Callable[[str], Path], load: Callable[..., RestoredPolicy]
 ) -> None:
     damaged = old_copy("pendulum")
     rewrite(damaged / STATE, lambda state: spec_of(state).update(num_gpus=1))

@@ -36,6 +36,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -132,18 +133,8 @@ class FaultyLine:
 
 
 @pytest.fixture(scope="module")
-def real_ur5(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The UR5 policy that ships with the project."""
-    from rlservo.export.commands.export import export_checkpoint
-
-    root = tmp_path_factory.mktemp("real")
-    export_checkpoint(ROOT / "examples" / "checkpoints" / "ur5_positioning", root, name="ur5", notify=lambda line: None)
-    return root
-
-
-@pytest.fixture(scope="module")
-def store(recurrent: Path, real_ur5: Path) -> PolicyStore:
-    return PolicyStore.load([recurrent, real_ur5])
+def store(recurrent: Path, shipped: Path) -> PolicyStore:
+    return load_store(recurrent, shipped / "ur5")
 
 
 @pytest.fixture(scope="module")
@@ -223,16 +214,16 @@ def test_a_late_reply_is_never_used_for_a_newer_observation(
 ) -> None:
     seen = ur5_observations(6)
     expected = [store.get("ur5").act(obs) for obs in seen]
-    with connected(kind, line, deadline_ms=150.0) as client:
+    with connected(kind, line, deadline_ms=300.0) as client:
         client.act(seen[0])
         for step in range(1, 6):
             if step % 2:
-                line.faults.append(("delay", 0.25))
+                line.faults.append(("delay", 0.5))
                 began = time.monotonic()
                 with pytest.raises(DeadlineError):
                     client.act(seen[step])
-                assert 0.1 < time.monotonic() - began < 0.24
-                time.sleep(0.15)  # it arrives now, before the next question
+                assert 0.2 < time.monotonic() - began < 0.49
+                time.sleep(0.3)  # it arrives now, before the next question
             else:
                 np.testing.assert_allclose(client.act(seen[step]), expected[step], rtol=1e-5, atol=1e-6)
         if isinstance(client, StreamClient):
@@ -349,7 +340,7 @@ def test_a_server_that_is_away_is_unavailable_and_found_again(
             began = time.monotonic()
             with pytest.raises(UnavailableError):
                 client.act(obs)
-            assert time.monotonic() - began < 0.45
+            assert time.monotonic() - began < 1.0  # the deadline, and a busy machine
         line.upstream = port
         np.testing.assert_allclose(client.act(obs), store.get("ur5").act(obs), rtol=1e-5, atol=1e-6)
 
@@ -409,7 +400,7 @@ def test_the_client_is_told_what_was_commanded_instead(line: FaultyLine) -> None
     for fallback in ("hold", "zero", [0.1, 0.2, 0.3, 0.4, 0.5]):
         inner = connected(StreamClient, line, deadline_ms=150.0)
         told: list[Any] = []
-        inner.commanded = told.append  # type: ignore[method-assign, assignment]
+        inner.set_last_action = told.append  # type: ignore[method-assign, assignment]
         with WithFallback(inner, fallback) as policy:  # type: ignore[arg-type]
             policy.act(seen[0])
             assert told == []

@@ -20,6 +20,7 @@ from rlservo.export.contract.errors import (
     ActionError,
     DeadlineError,
     ObservationError,
+    OverloadedError,
     RlservoError,
     UnavailableError,
     UnknownPolicyError,
@@ -121,7 +122,7 @@ def changed(**changes: Any) -> Answer:
 
 def busy(after: str | None = None) -> Answer:
     headers = {} if after is None else {"retry-after": after}
-    return says({"error": "the server is over capacity", "code": "unavailable"}, 503, headers)
+    return says({"error": "the server is over capacity", "code": "over-capacity"}, 503, headers)
 
 
 def hang(handler: Handler, _: dict[str, Any]) -> None:
@@ -221,7 +222,7 @@ def test_503_then_200_gives_the_action(client: PolicyClient, server: Scripted) -
 
 def test_retries_of_503_are_bounded(client: PolicyClient, server: Scripted) -> None:
     server.script = [busy()]
-    with pytest.raises(UnavailableError, match="the server is over capacity"):
+    with pytest.raises(OverloadedError, match="the server is over capacity"):
         client.act(OBS)
     assert len(server.requests) == 3  # the first and two retries
 
@@ -239,7 +240,7 @@ def test_a_retry_after_beyond_the_timeout_fails_at_once(client: PolicyClient, se
     with pytest.raises(UnavailableError) as caught:
         client.act(OBS)
     assert time.monotonic() - began < 3.0
-    assert caught.value.details["retry_after_s"] == 60.0
+    assert caught.value.retry_after_s == 60.0
     assert len(server.requests) == 1
 
 

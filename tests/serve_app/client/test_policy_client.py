@@ -30,6 +30,7 @@ from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 
 class ArmShaped(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -78,7 +79,7 @@ class Served:
 
 @pytest.fixture(scope="module")
 def served(policies: Path) -> Iterator[Served]:
-    store = PolicyStore.load([policies])
+    store = load_store(policies)
     with Served(store) as running:
         yield running
     store.close()
@@ -155,13 +156,13 @@ def test_the_newest_version_is_the_default_and_another_can_be_named(served: Serv
 
 def test_a_newer_version_loaded_meanwhile_does_not_change_a_running_loop(policies: Path) -> None:
     obs = observations(1)[0]
-    old = PolicyStore.load([policies / "ur5" / "1", policies / "ur5" / "2"])
+    old = load_store(policies / "ur5" / "1", policies / "ur5" / "2")
     with Served(old) as server, PolicyClient(server.url, "ur5") as client:
         before = client.act(obs)
-        server.store = PolicyStore.load([policies])
+        server.store = load_store(policies)
         assert np.array_equal(client.act(obs), before)
         assert client.contract.version == "2"
-        server.store = PolicyStore.load([policies / "ur5" / "10"])
+        server.store = load_store(policies / "ur5" / "10")
         with pytest.raises(UnknownVersionError, match="has no version '2'"):
             client.act(obs)
         server.store.close()
@@ -197,7 +198,7 @@ def test_a_name_may_be_left_out_where_the_server_has_one_policy(served: Served, 
         pytest.raises(UsageError, match="has 2 policies: name one of gridworld, ur5"),
     ):
         client.act(np.zeros(27))
-    with Served(PolicyStore.load([policies / "gridworld"])) as small, PolicyClient(small.url) as client:
+    with Served(load_store(policies / "gridworld")) as small, PolicyClient(small.url) as client:
         assert client.contract.name == "gridworld"
         assert client.act(2).shape == ()
 
@@ -208,7 +209,7 @@ def test_a_server_that_is_still_loading_is_waited_for(policies: Path) -> None:
             client.act(np.zeros(27))
         with pytest.raises(UnavailableError, match=r"was not ready within 0\.3 s: .*still being loaded"):
             client.wait_until_ready(timeout_s=0.3)
-        threading.Timer(0.3, lambda: setattr(loading, "store", PolicyStore.load([policies / "ur5" / "2"]))).start()
+        threading.Timer(0.3, lambda: setattr(loading, "store", load_store(policies / "ur5" / "2"))).start()
         client.wait_until_ready(timeout_s=20)
         assert client.act(np.zeros(27)).shape == (6,)
 
@@ -219,7 +220,7 @@ def test_a_wrong_address_path_says_where_things_are(served: Served) -> None:
 
 
 def test_a_connection_that_idled_out_is_reopened_without_a_word(policies: Path) -> None:
-    store = PolicyStore.load([policies / "ur5" / "2"])
+    store = load_store(policies / "ur5" / "2")
     with Served(store) as server, PolicyClient(server.url, "ur5") as client:
         server._server.config.timeout_keep_alive = 0  # uvicorn closes idle connections at once
         first = client.act(np.zeros(27))

@@ -23,11 +23,12 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_grpc import Grpc
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.runtime.recurrent_state import Memory
+from rlservo.serve_app.runtime.recurrent_state import StateTensors
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan import PolicyPlan
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+from stores import store_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -75,18 +76,18 @@ def everything(versions: dict[str, Policy], served: Serve) -> Iterator[Server]:
     held: list[Server] = []
     app = create_app(lambda: held[0].store, ServerSettings())
     with served(app) as port:
-        held.append(Server(f"http://127.0.0.1:{port}", app, PolicyStore([versions["1"]])))
+        held.append(Server(f"http://127.0.0.1:{port}", app, store_of(versions["1"])))
         yield held[0]
 
 
 @pytest.fixture
 def server(everything: Server, versions: dict[str, Policy]) -> Server:
-    everything.store = PolicyStore([versions["1"]])
+    everything.store = store_of(versions["1"])
     return everything
 
 
 def promoted(versions: dict[str, Policy]) -> PolicyStore:
-    return PolicyStore([versions["1"], versions["2"], versions["other"]])
+    return store_of(versions["1"], versions["2"], versions["other"])
 
 
 def in_process(policy: Policy, steps: int) -> list[list[float]]:
@@ -110,11 +111,11 @@ def test_a_state_stays_with_its_version_whatever_becomes_the_default(
     assert (status, reply["code"]) == (409, "session-conflict") and "is of version 1" in reply["error"]
     status, reply = server.act("other", state=first["state"])
     assert (status, reply["code"]) == (410, "session-lost") and "'leaky/1#" in reply["error"]
-    server.store = PolicyStore([versions["2"]])
+    server.store = store_of(versions["2"])
     status, reply = server.act("leaky", state=first["state"])
     assert (status, reply["code"]) == (410, "session-lost") and "begin an episode (state {})" in reply["error"]
     _, first = server.act("leaky", state={})
-    server.store = PolicyStore([versions["2 again"]])  # the same name and version, and another network
+    server.store = store_of(versions["2 again"])  # the same name and version, and another network
     assert server.act("leaky", state=first["state"])[0] == 410
 
 
@@ -130,7 +131,7 @@ def test_a_state_without_a_version_is_only_used_where_it_can_be_of_one_alone(
         assert status == 400 and "does not say of which version" in reply["error"], reply
         assert "('@policy' in 'state', or the parameter 'state_policy'), or name the version" in reply["error"]
     assert server.act("leaky/versions/2", state=bare)[1]["version"] == "2"
-    server.store = PolicyStore([versions["2"]], changed=["leaky"])  # version 1 was here until a moment ago
+    server.store = store_of(versions["2"], changed=["leaky"])  # version 1 was here until a moment ago
     assert server.act("leaky", state=bare)[0] == 400
 
 
@@ -243,7 +244,7 @@ def test_our_clients_go_on_with_their_version_and_learn_when_it_is_gone(
         first = client.act(OBS)
         server.store = promoted(versions)
         np.testing.assert_allclose([first, client.act(OBS)], expected, rtol=1e-6)
-        server.store = PolicyStore([versions["2"]])
+        server.store = store_of(versions["2"])
         with pytest.raises((SessionLostError, UnknownVersionError)):
             client.act(OBS)
 
@@ -255,7 +256,7 @@ def test_our_clients_go_on_with_their_version_and_learn_when_it_is_gone(
 def limited(server: Server, versions: dict[str, Policy], box_policy: Callable[..., Path], tmp_path: Path) -> Server:
     options = PolicyOptions(max_action_step=LIMIT)
     folders = [box_policy(tmp_path), versions["1"].path]
-    server.store = PolicyStore([Policy.load(folder, options=options) for folder in folders])
+    server.store = store_of(*(Policy.load(folder, options=options) for folder in folders))
     return server
 
 
@@ -271,7 +272,7 @@ def steps(policy: Any, size: int, count: int = 4) -> list[Any]:
 def test_clients_act_as_in_process_where_the_step_is_limited(
     limited: Server, name: str, kind: type[PolicyClient | StreamClient], server_state: bool
 ) -> None:
-    here = limited.store.get(name).twin()
+    here = limited.store.get(name).clone()
     size = here.contract.observation_space.shape[0]  # type: ignore[union-attr]
     with kind(limited.url, name, server_state=server_state) as client:
         for _ in range(2):  # an episode's first action is limited by nothing
@@ -309,8 +310,8 @@ def test_an_action_that_came_too_late_is_not_what_the_next_one_is_measured_from(
         with kind(limited.url, "ur5", server_state=True) as client:
             used = client.act(up)
             # What a late reply leaves behind: the server has gone on, the robot has not.
-            client._last, unseen = client._last, client.act(down)
-            client._last, client._unsure = used.tolist(), True
+            unseen = client.act(down)
+            client.set_last_action(used)
             assert np.abs(unseen - used).max() > 0
             np.testing.assert_allclose(client.act(down), unseen, rtol=1e-5, atol=1e-6)
 
@@ -328,14 +329,14 @@ def test_what_the_robot_was_commanded_instead_is_what_the_next_step_is_measured_
             client.reset()
             used = client.act(np.ones(size, np.float32))
             instead = np.where(used > 0, -1.0, 1.0).astype(np.float32)
-            client.commanded(instead)
+            client.set_last_action(instead)
             after = client.act(np.ones(size, np.float32))
             assert np.abs(after - instead).max() == pytest.approx(LIMIT, rel=1e-3)
             again = client.act(np.ones(size, np.float32))  # said once: from here the server knows
             assert np.abs(again - after).max() == pytest.approx(LIMIT, rel=1e-3)
             # Two observations have no last action of this shape: it is not sent, and nothing else is in its way.
             client.reset()
-            client.commanded(instead)
+            client.set_last_action(instead)
             assert client.act(np.ones((2, size), np.float32)).shape[0] == 2
             if server_state:
                 client.reset()
@@ -344,9 +345,9 @@ def test_what_the_robot_was_commanded_instead_is_what_the_next_step_is_measured_
 def test_a_reward_is_seen_where_nothing_else_is_remembered(versions: dict[str, Policy]) -> None:
     contract = versions["1"].contract
     reward = TensorSpec(name="reward", dtype="float32", shape=(-1,))
-    with_state = Memory(contract.model_copy(update={"inputs": (*contract.inputs, reward)}))
-    assert with_state.feed(None, 1, 2.5)["reward"] == 0  # an episode begins: nothing has been earned
-    alone = Memory(contract.model_copy(update={"inputs": (contract.inputs[0], reward), "state": ()}))
-    assert alone.feed(None, 1, 2.5)["reward"] == 2.5
+    with_state = StateTensors(contract.model_copy(update={"inputs": (*contract.inputs, reward)}))
+    assert with_state.inputs(None, 1, 2.5)["reward"] == 0  # an episode begins: nothing has been earned
+    alone = StateTensors(contract.model_copy(update={"inputs": (contract.inputs[0], reward), "state": ()}))
+    assert alone.inputs(None, 1, 2.5)["reward"] == 2.5
     with pytest.raises(RequestError, match="0 at an episode's start"):
-        alone.feed(None, 1, None)
+        alone.inputs(None, 1, None)

@@ -26,6 +26,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store, store_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -36,7 +37,7 @@ Serve = Callable[[Any], AbstractContextManager[int]]
 
 @pytest.fixture(scope="module")
 def store(recurrent: Path, ur5: Path) -> PolicyStore:
-    return PolicyStore.load([recurrent, ur5])
+    return load_store(recurrent, ur5)
 
 
 @pytest.fixture(scope="module")
@@ -289,7 +290,7 @@ def test_a_session_stays_with_its_version_until_that_is_gone(
     store: PolicyStore, served: Serve, box_policy: Callable[..., Path], tmp_path: Path
 ) -> None:
     one, two = (Policy.load(box_policy(tmp_path, version=version, seed=seed)) for seed, version in enumerate("12"))
-    stores = [PolicyStore([one]), PolicyStore([one, two]), PolicyStore([two])]
+    stores = [store_of(one), store_of(one, two), store_of(two)]
     now = 0
     obs = np.linspace(-1, 1, 27).tolist()
     with served(create_app(lambda: stores[now], ServerSettings())) as port:
@@ -314,7 +315,7 @@ def test_an_open_stream_goes_on_with_its_version_when_another_becomes_the_defaul
     served: Serve, box_policy: Callable[..., Path], tmp_path: Path
 ) -> None:
     one, two = (Policy.load(box_policy(tmp_path, version=version, seed=seed)) for seed, version in enumerate("12"))
-    stores = [PolicyStore([one]), PolicyStore([one, two])]
+    stores = [store_of(one), store_of(one, two)]
     now = 0
     obs = np.linspace(-1, 1, 27)
     with (
@@ -331,7 +332,7 @@ def test_a_stream_begins_its_next_episode_with_the_bundle_that_is_there_now(
     store: PolicyStore, recurrent: Path, served: Serve
 ) -> None:
     again = Policy.load(recurrent / "lstm_box")
-    stores = [store, PolicyStore([again])]
+    stores = [store, store_of(again)]
     now = 0
     obs = observations("lstm_box", 1)[0]
     with (

@@ -21,6 +21,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+from stores import load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -58,7 +59,7 @@ class Server:
 
 @pytest.fixture(scope="module")
 def store(leaky_policy: Callable[..., Path], ur5: Path, tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
-    return PolicyStore.load([leaky_policy(tmp_path_factory.mktemp("leaky")), ur5])
+    return load_store(leaky_policy(tmp_path_factory.mktemp("leaky")), ur5)
 
 
 Serve = Callable[[Any], AbstractContextManager[int]]
@@ -111,7 +112,7 @@ def test_a_stream_takes_places_too_and_gives_them_back(server: Server) -> None:
 def test_a_reset_that_is_refused_leaves_the_episode_as_it_was(
     server: Server, store: PolicyStore, refused: dict[str, Any], status: int
 ) -> None:
-    here = store.get("leaky").twin()
+    here = store.get("leaky").clone()
     expected = [here.act(OBS).tolist() for _ in range(2)]
     assert server.act("s", reset=True)[1]["action"] == pytest.approx(expected[0])
     assert server.act("s", reset=True, **refused)[0] == status
@@ -120,7 +121,7 @@ def test_a_reset_that_is_refused_leaves_the_episode_as_it_was(
 
 
 def test_a_stream_whose_reset_is_refused_goes_on(server: Server, store: PolicyStore) -> None:
-    here = store.get("leaky").twin()
+    here = store.get("leaky").clone()
     expected = [here.act(OBS).tolist() for _ in range(2)]
     with websockets.sync.client.connect(f"ws://127.0.0.1:{server.port}/v1/policies/leaky/stream?errors=keep") as socket:
         socket.recv()
@@ -194,5 +195,5 @@ def test_a_policy_alone_keeps_its_identity_wherever_it_is_loaded(
     one, same, other = (
         Policy.load(leaky_policy(tmp_path / str(number), seed=seed)) for number, seed in enumerate((1, 1, 2))
     )
-    assert one.identity == same.identity == one.twin().identity != other.identity
+    assert one.identity == same.identity == one.clone().identity != other.identity
     assert one.identity.startswith("leaky/1#")

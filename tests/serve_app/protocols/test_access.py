@@ -17,14 +17,15 @@ from typing import Any
 
 import pytest
 
-from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.server.api_keys import ACCESS, Access, access_of, grant, new_key
 from rlservo.serve_app.server.request_log import FIELDS
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 
 Serve = Callable[[Any], AbstractContextManager[int]]
-Controlled = Callable[..., AbstractContextManager[Control]]
+Controlled = Callable[..., AbstractContextManager[ReplicaVersions]]
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -124,7 +125,7 @@ class Wire:
 @dataclass(frozen=True)
 class Served:
     app: PolicyApp
-    control: Control
+    control: ReplicaVersions
     port: int
     kind: str
 
@@ -385,6 +386,8 @@ def test_a_header_that_is_not_utf8_is_refused_after_the_key_in_our_form(server: 
             assert wire.ask(method, path, name + ": café".encode(), *bearer(ADMIN), body=OBS)[0] in (200, 404, 422)
 
 
+@pytest.mark.serve
+@pytest.mark.slow
 def test_on_ray_serve_a_header_that_is_not_utf8_is_no_failure(live_server: Any) -> None:
     """Serve itself decodes these, before the application sees the request (ray 2.60)."""
     with Wire(live_server.port) as wire:
@@ -401,6 +404,8 @@ def test_on_ray_serve_a_header_that_is_not_utf8_is_no_failure(live_server: Any) 
             assert status == 200, (value, answer)
 
 
+@pytest.mark.serve
+@pytest.mark.slow
 def test_on_ray_serve_no_spelling_reaches_administration(live_server: Any) -> None:
     """Through HAProxy, uvicorn and Serve, of which each reads a path in its own way; the server has no admin key."""
     with Wire(live_server.port) as wire:

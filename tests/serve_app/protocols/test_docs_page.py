@@ -15,7 +15,7 @@ import pytest
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.docs_page import PAGE
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (
@@ -43,7 +43,7 @@ def test_the_documentation_is_drawn_without_the_internet(
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         pytest.skip("no Chromium or Chrome is installed: /docs was not drawn")
-    store = PolicyStore.load([policies])
+    store = load_store(policies)
     with served(create_app(lambda: store, ServerSettings())) as port:
         done = subprocess.run(
             [browser, *FLAGS, "--virtual-time-budget=20000", OFFLINE, f"--user-data-dir={tmp_path}", "--dump-dom", f"http://127.0.0.1:{port}/docs"],

@@ -18,6 +18,7 @@ import uvicorn
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 TIME_S = 0.3
 HEAD = (
@@ -56,7 +57,7 @@ class Server:
 
 @pytest.fixture(scope="module")
 def store(ur5: Path) -> PolicyStore:
-    return PolicyStore.load([ur5])
+    return load_store(ur5)
 
 
 @pytest.fixture(params=["asyncio", "uvloop"])

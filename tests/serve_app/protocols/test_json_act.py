@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import http.client
 import json
@@ -23,6 +24,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.docs_page import PAGE
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
 JSON = {"content-type": "application/json"}
@@ -37,7 +39,7 @@ Ask = Callable[..., tuple[int, dict[str, str], Any]]
 @pytest.fixture(scope="module")
 def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
     unsafe = box_policy(tmp_path_factory.mktemp("unsafe"), name="unsafe", action_scale=5.0)
-    return PolicyStore.load([policies, unsafe])
+    return load_store(policies, unsafe)
 
 
 class Loading:
@@ -71,23 +73,20 @@ def port(loading: Loading) -> Iterator[int]:
 
 
 @pytest.fixture(scope="module")
-def ask(port: int) -> Iterator[Ask]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-
+def ask(port: int) -> Ask:
     def call(
         method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
     ) -> tuple[int, dict[str, str], Any]:
         content = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
-        connection.request(method, path, content, JSON if headers is None and body is not None else headers or {})
-        reply = connection.getresponse()
-        received = reply.read()
-        if reply.status == 500:
-            connection.close()  # uvicorn does, after an exception that reached it
+        # A connection for each: uvicorn closes one that was silent for five seconds, between two tests say.
+        with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
+            connection.request(method, path, content, JSON if headers is None and body is not None else headers or {})
+            reply = connection.getresponse()
+            received = reply.read()
         is_json = reply.headers.get("content-type", "").startswith("application/json")
         return reply.status, dict(reply.headers), json.loads(received) if is_json else received
 
-    yield call
-    connection.close()
+    return call
 
 
 def act(ask: Ask, body: Any, name: str = "ur5") -> tuple[int, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import http.client
 import json
 import time
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_config import model_config, statistics
@@ -22,6 +24,7 @@ from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan import PolicyPlan
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 OPTIONS = {
     "gathered": PolicyOptions(micro_batch=16),
@@ -42,7 +45,7 @@ def store(
     for name in ("gathered", "careful"):
         box_policy(root, name=name)
     leaky_policy(root)
-    return PolicyStore.load([policies, root], options=OPTIONS)
+    return load_store(policies, root, options=OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -53,16 +56,16 @@ def app(store: PolicyStore) -> Any:
 @pytest.fixture(scope="module")
 def ask(app: Any, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[Ask]:
     with served(app) as port:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
 
         def call(path: str, body: Any = None) -> tuple[int, Any]:
-            method = "GET" if body is None else "POST"
-            connection.request(method, path, body and json.dumps(body), {"content-type": "application/json"})
-            reply = connection.getresponse()
-            return reply.status, json.loads(reply.read())
+            # A connection for each: uvicorn closes one that was silent for five seconds, as a busy machine may be.
+            with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
+                method = "GET" if body is None else "POST"
+                connection.request(method, path, body and json.dumps(body), {"content-type": "application/json"})
+                reply = connection.getresponse()
+                return reply.status, json.loads(reply.read())
 
         yield call
-        connection.close()
 
 
 def test_the_configuration_says_how_a_policy_is_run(ask: Ask) -> None:
@@ -168,11 +171,12 @@ def test_a_run_that_several_requests_share_is_one_execution(store: PolicyStore) 
     async def crowd() -> list[Any]:
         batcher._several = True  # as if several had come in the turn before
         obs = np.zeros(27, np.float32)
-        return await asyncio.gather(*(core.act("gathered", None, obs, received=time.perf_counter()) for _ in range(6)))
+        requests = [Request("oip", "gathered", None, time.perf_counter(), obs=obs) for _ in range(6)]
+        return await asyncio.gather(*map(core.request_path.decide, requests))
 
     ran = batcher.runs
     for decision in asyncio.run(crowd()):
-        core.metrics.answered("oip", decision, 1, 0.001)
+        core.metrics.record_answer("oip", decision, 0.001)
     assert batcher.runs - ran == 1
     (found,) = statistics(core, "gathered")
     assert (found["inference_count"], found["execution_count"]) == (6, 1)

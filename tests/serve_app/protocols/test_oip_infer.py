@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import http.client
 import json
@@ -19,6 +20,7 @@ import pytest
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 LENGTH = "Inference-Header-Content-Length"
 BATCH = np.random.default_rng(5).standard_normal((33, 27)).astype(np.float32)
@@ -30,7 +32,7 @@ Ask = Callable[..., tuple[int, dict[str, str], bytes]]
 @pytest.fixture(scope="module")
 def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
     unsafe = box_policy(tmp_path_factory.mktemp("unsafe"), name="unsafe", action_scale=5.0)
-    return PolicyStore.load([policies, unsafe])
+    return load_store(policies, unsafe)
 
 
 @pytest.fixture(scope="module")
@@ -41,16 +43,15 @@ def port(store: PolicyStore, served: Callable[[Any], AbstractContextManager[int]
 
 
 @pytest.fixture(scope="module")
-def ask(port: int) -> Iterator[Ask]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-
+def ask(port: int) -> Ask:
     def call(method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, dict[str, str], bytes]:
-        connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
-        reply = connection.getresponse()
-        return reply.status, {name.lower(): value for name, value in reply.headers.items()}, reply.read()
+        # A connection for each: uvicorn closes one that was silent for five seconds, between two tests say.
+        with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
+            connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
+            reply = connection.getresponse()
+            return reply.status, {name.lower(): value for name, value in reply.headers.items()}, reply.read()
 
-    yield call
-    connection.close()
+    return call
 
 
 def infer(ask: Ask, body: Any, model: str = "ur5", **headers: str) -> tuple[int, Any]:

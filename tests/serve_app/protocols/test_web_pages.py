@@ -24,10 +24,10 @@ import pytest
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 
 Serve = Callable[[Any], AbstractContextManager[int]]
-Controlled = Callable[..., AbstractContextManager[Control]]
+Controlled = Callable[..., AbstractContextManager[ReplicaVersions]]
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -166,7 +166,7 @@ def page_for(target: str) -> str:
 class Target:
     port: int
     pages: Pages
-    control: Control
+    control: ReplicaVersions
 
     def step(self, **more: Any) -> int:
         """Ask once, as the robot; return which step of its episode that was."""
@@ -237,6 +237,8 @@ def test_a_page_whose_name_leads_to_the_server_moves_and_reads_nothing(
     check_untouched(target, report, plan)
 
 
+@pytest.mark.serve
+@pytest.mark.slow
 def test_on_ray_serve_a_page_is_refused_for_where_it_comes_from(
     browser: str, live_server: Any, served: Serve, tmp_path: Path
 ) -> None:

@@ -24,6 +24,7 @@ from rlservo.export.contract.contract import Contract
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 OBS = (np.arange(27) * 0.01).astype(np.float32)
 ARRAY = b"__ndarray__"
@@ -89,7 +90,7 @@ class OpenpiClient:
 @pytest.fixture(scope="module")
 def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
     unsafe = box_policy(tmp_path_factory.mktemp("unsafe"), name="unsafe", action_scale=5.0)
-    return PolicyStore.load([policies, unsafe])
+    return load_store(policies, unsafe)
 
 
 Serve = Callable[[Any], AbstractContextManager[int]]

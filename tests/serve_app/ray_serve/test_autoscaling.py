@@ -38,8 +38,8 @@ def test_replicas_follow_the_load_and_do_not_go_to_and_fro(shares: list[float], 
 def test_a_thread_that_works_counts_as_busy_and_one_that_sleeps_does_not() -> None:
     load = Load()
     time.sleep(0.3)
-    idle = load.busy()
+    idle = load.measure()
     end = time.perf_counter() + 0.5
     while time.perf_counter() < end:
         pass
-    assert idle < 0.7 < load.busy() <= 1.0
+    assert idle < 0.7 < load.measure() <= 1.0

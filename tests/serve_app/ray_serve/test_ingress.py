@@ -1,4 +1,4 @@
-"""The door before Ray Serve's handling: what it lets the application answer, and what it leaves to Serve."""
+"""Middleware before Ray Serve's handling: what the application answers by itself, and what is left to Serve."""
 
 from __future__ import annotations
 
@@ -13,20 +13,22 @@ from starlette.types import Message, Receive, Scope, Send
 
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve import ingress as ingress_module
-from rlservo.serve_app.ray_serve.ingress import NO_WATCH, REQUEST_ID, Door, Ingress
+from rlservo.serve_app.ray_serve.ingress import NO_WATCH, Ingress, ServeBypass
 from rlservo.serve_app.server.api_keys import new_key
+from rlservo.serve_app.server.request_checks import REQUEST_ID
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore, load_policy
+from rlservo.serve_app.versions.policy_store import load_policy
+from stores import store_of
 
 ACT = "/v1/policies/ur5/act"
 OBS = json.dumps({"obs": [0.0] * 27}).encode()
 
 
 @pytest.fixture(autouse=True)
-def door(monkeypatch: pytest.MonkeyPatch) -> Door:
-    """The process's door, for one test."""
-    monkeypatch.setattr(ingress_module, "door", Door())
-    return ingress_module.door
+def bypass(monkeypatch: pytest.MonkeyPatch) -> ServeBypass:
+    """The process's bypass, for one test."""
+    monkeypatch.setattr(ingress_module, "bypass", ServeBypass())
+    return ingress_module.bypass
 
 
 class Serve:
@@ -45,7 +47,7 @@ class Serve:
 
 @pytest.fixture
 def app(ur5: Path) -> Any:
-    store = PolicyStore([load_policy(ur5)])
+    store = store_of(load_policy(ur5))
     return create_app(lambda: store, ServerSettings())
 
 
@@ -82,10 +84,10 @@ async def ask(
 
 
 async def opened(app: Any, *, prefix: str = "", root_path: str = "", **options: Any) -> tuple[Serve, Any]:
-    """Return (Serve, the ingress before it), with the door open and the prefix told."""
+    """Return (Serve, the ingress before it), with the bypass installed and the prefix known."""
     serve = Serve(app, prefix)
     ingress = Ingress(serve)
-    ingress_module.door.open(app, options.pop("has_room", lambda: True), **options)
+    ingress_module.bypass.install(app, **options)
     await ask(ingress, prefix + ACT, root_path=root_path)
     assert len(serve.seen) == 1
     serve.seen.clear()
@@ -98,7 +100,7 @@ def run(scenario: Callable[[], Any]) -> Any:
 
 @pytest.mark.parametrize("prefix", ["", "/robots"])
 @pytest.mark.parametrize("root_path", ["", "/behind/a/proxy"])
-def test_requests_for_actions_do_not_reach_serve_once_it_has_told_the_prefix(
+def test_requests_for_actions_do_not_reach_serve_once_the_prefix_is_known(
     app: Any, prefix: str, root_path: str
 ) -> None:
     async def scenario() -> None:
@@ -146,7 +148,7 @@ def test_an_answer_carries_the_clients_request_id_or_a_new_one(app: Any) -> None
     run(scenario)
 
 
-def test_a_stream_reaches_the_application_untouched_but_for_its_id(app: Any) -> None:
+def test_a_stream_reaches_the_application_without_serve(app: Any) -> None:
     async def scenario() -> None:
         serve, ingress = await opened(app)
         for path, directly in (("/v1/policies/ur5/stream", True), ("/", True), ("/elsewhere", False)):
@@ -162,7 +164,6 @@ def test_a_stream_reaches_the_application_untouched_but_for_its_id(app: Any) -> 
             scope = {"type": "websocket", "path": path, "headers": [], "query_string": b""}
             await ingress(scope, receive, send)
             assert bool(serve.seen) is not directly
-            assert [name for name, _ in scope["headers"]] == ([REQUEST_ID] if directly else [])
             assert sent[0]["type"] == "websocket.accept"
 
     run(scenario)
@@ -170,7 +171,7 @@ def test_a_stream_reaches_the_application_untouched_but_for_its_id(app: Any) -> 
 
 def test_keys_are_asked_for_without_serve_as_well(ur5: Path) -> None:
     key, line = new_key("robot")
-    store = PolicyStore([load_policy(ur5)])
+    store = store_of(load_policy(ur5))
     app = create_app(lambda: store, ServerSettings(api_keys=line))
 
     async def scenario() -> None:
@@ -195,34 +196,29 @@ def test_keys_are_asked_for_without_serve_as_well(ur5: Path) -> None:
 
 
 def test_a_bug_outside_what_the_application_guards_is_logged_with_the_requests_id(
-    app: Any, door: Door, caplog: pytest.LogCaptureFixture
+    app: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    class Broken:
-        def takes(self, scope: Scope) -> bool:
-            return True
-
-        async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-            raise ValueError("the application's own fault")
-
     async def scenario() -> None:
-        door.open(Broken(), lambda: True)
-        with pytest.raises(ValueError, match="own fault"):
-            await ask(Ingress(app), headers=((REQUEST_ID, b"mine"),))
+        _, ingress = await opened(app)
+        monkeypatch.setattr(app, "_checks", None)
+        with pytest.raises(AttributeError):
+            await ask(ingress, headers=((REQUEST_ID, b"mine"),))
 
     run(scenario)
-    (record,) = (record for record in caplog.records if record.name == "rlservo.serve_app.ray_serve.ingress")
+    (record,) = (record for record in caplog.records if record.name == "rlservo.serve_app.protocols.http_endpoint")
     assert record.exc_info and "mine" in str(vars(record))
 
 
-@pytest.mark.parametrize("ahead", [True, False])
-def test_actions_are_refused_while_there_is_no_room_and_the_operator_is_not(app: Any, ahead: bool) -> None:
+@pytest.mark.parametrize("answers", [True, False])
+def test_actions_are_refused_while_there_is_no_room_and_the_operator_is_not(app: Any, answers: bool) -> None:
     async def scenario() -> None:
-        room = [True]
-        serve, ingress = await opened(app, has_room=lambda: room[0], ahead=ahead)
-        room[0] = False
+        serve, ingress = await opened(app, answers=answers)
+        admission = app.state.core.admission
+        while admission._burst < admission._max_queued:  # in this very turn of the event loop
+            admission.enter()
         status, headers, body = await ask(ingress)
         assert (status, headers[b"retry-after"], json.loads(body)["code"]) == (503, b"1", "over-capacity")
-        assert not serve.seen
+        assert not serve.seen and admission.turned_away == 1
         assert (await ask(ingress, "/healthz", method="GET"))[0] == 200
         assert (await ask(ingress, "/v1/admin/alias"))[0] != 503
         assert len(serve.seen) == 2
@@ -231,9 +227,9 @@ def test_actions_are_refused_while_there_is_no_room_and_the_operator_is_not(app:
 
 
 @pytest.mark.parametrize("prefix", ["", "/robots"])
-def test_where_it_is_not_to_answer_ahead_serve_gets_the_request_as_it_came(app: Any, prefix: str) -> None:
+def test_where_the_application_is_not_to_answer_serve_gets_the_request_as_it_came(app: Any, prefix: str) -> None:
     async def scenario() -> None:
-        serve, ingress = await opened(app, prefix=prefix, ahead=False)
+        serve, ingress = await opened(app, prefix=prefix, answers=False)
         assert (await ask(ingress, prefix + ACT))[0] == 200
         (scope,) = serve.seen
         assert scope["root_path"] == "" and NO_WATCH in scope["headers"]
@@ -241,7 +237,7 @@ def test_where_it_is_not_to_answer_ahead_serve_gets_the_request_as_it_came(app: 
     run(scenario)
 
 
-def test_another_event_loop_and_a_prefix_not_yet_told_leave_it_to_serve(app: Any) -> None:
+def test_in_another_event_loop_everything_is_left_to_serve(app: Any) -> None:
     async def here() -> tuple[Serve, Any]:
         serve, ingress = await opened(app)
         assert (await ask(ingress))[0] == 200 and not serve.seen
@@ -256,7 +252,7 @@ def test_another_event_loop_and_a_prefix_not_yet_told_leave_it_to_serve(app: Any
     run(elsewhere)
 
 
-def test_a_proxys_door_lets_everybody_through(app: Any) -> None:
+def test_in_a_proxy_everything_is_left_to_serve(app: Any) -> None:
     async def scenario() -> None:
         serve = Serve(app)
         assert (await ask(Ingress(serve)))[0] == 200

@@ -1,21 +1,16 @@
-"""The writes of replies, on uvicorn's own protocols with a transport that records them."""
+"""The writes of replies, on our connections with a transport that records them."""
 
 from __future__ import annotations
 
 import asyncio
 from typing import Any
 
-import pytest
 import uvicorn
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.server import ServerState
 
-from rlservo.serve_app.ray_serve.ingress import Ingress
-
-PROTOCOLS = [HttpToolsProtocol, H11Protocol]
+from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 
 
 class Recorder(asyncio.Transport):
@@ -70,14 +65,14 @@ async def streams(scope: Scope, receive: Receive, send: Send) -> None:
     await StreamingResponse(parts())(scope, receive, send)
 
 
-def exchange(protocol: Any, app: Any, *pieces: bytes, before: Any = Ingress) -> Recorder:
+def exchange(app: Any, *pieces: bytes) -> Recorder:
     """Feed a request, piece by piece, to a connection; return what it wrote."""
 
     async def run() -> Recorder:
-        config = uvicorn.Config(before(app), lifespan="off", log_level="critical", access_log=False)
+        config = uvicorn.Config(app, lifespan="off", log_level="critical", access_log=False)
         config.load()
         state = ServerState()
-        connection = protocol(config=config, server_state=state, app_state={})
+        connection = TimedProtocol(config=config, server_state=state, app_state={})
         transport = Recorder()
         connection.connection_made(transport)
         for piece in pieces:
@@ -97,65 +92,40 @@ def post(body: bytes, *headers: bytes) -> bytes:
     return b"\r\n".join(lines)
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_reply_to_post_is_one_write(protocol: Any) -> None:
-    writes = exchange(protocol, echo, post(b"hello")).writes
+def test_a_reply_to_post_is_one_write() -> None:
+    writes = exchange(echo, post(b"hello")).writes
     assert b"".join(writes).startswith(b"HTTP/1.1 200") and b"".join(writes).endswith(b"\r\n\r\nhello")
     assert len([write for write in writes if write]) == 1
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_where_a_request_has_no_transport_replies_are_written_as_before(protocol: Any) -> None:
-    """Another uvicorn: what sends is no method of an object that has a transport."""
-
-    def as_it_is(app: Any) -> Any:
-        return app
-
-    async def of_another_uvicorn(scope: Scope, receive: Receive, send: Send) -> None:
-        async def send_message(message: Any) -> None:
-            await send(message)
-
-        await Ingress(echo)(scope, receive, send_message)
-
-    writes = [
-        write for write in exchange(protocol, of_another_uvicorn, post(b"hello"), before=as_it_is).writes if write
-    ]
-    assert len(writes) == 2 and b"".join(writes).endswith(b"\r\n\r\nhello")
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_every_reply_of_a_kept_connection_is_joined(protocol: Any) -> None:
-    writes = exchange(protocol, echo, post(b"first"), post(b"second")).writes
+def test_every_reply_of_a_kept_connection_is_joined() -> None:
+    writes = exchange(echo, post(b"first"), post(b"second")).writes
     assert [write.rpartition(b"\r\n\r\n")[2] for write in writes if write] == [b"first", b"second"]
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_client_that_waits_for_100_continue_gets_it_at_once(protocol: Any) -> None:
+def test_a_client_that_waits_for_100_continue_gets_it_at_once() -> None:
     request = post(b"hello", b"expect: 100-continue")
-    writes = exchange(protocol, echo, request[:-5], request[-5:]).writes
+    writes = exchange(echo, request[:-5], request[-5:]).writes
     assert writes[0].startswith(b"HTTP/1.1 100") and b"".join(writes[1:]).endswith(b"hello")
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_head_without_a_body_is_written_before_the_connection_closes(protocol: Any) -> None:
-    transport = exchange(protocol, fails_after_the_head, post(b"hello"))
+def test_a_head_without_a_body_is_written_before_the_connection_closes() -> None:
+    transport = exchange(fails_after_the_head, post(b"hello"))
     assert b"".join(transport.writes).startswith(b"HTTP/1.1 200") and transport.closed
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_an_empty_body_does_not_hold_the_head_back(protocol: Any) -> None:
-    assert b"".join(exchange(protocol, echo, post(b"")).writes).startswith(b"HTTP/1.1 200")
+def test_an_empty_body_does_not_hold_the_head_back() -> None:
+    assert b"".join(exchange(echo, post(b"")).writes).startswith(b"HTTP/1.1 200")
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_head_requests_and_streamed_replies_arrive_whole(protocol: Any) -> None:
-    head = exchange(protocol, echo, b"HEAD / HTTP/1.1\r\nhost: x\r\n\r\n").writes
+def test_head_requests_and_streamed_replies_arrive_whole() -> None:
+    head = exchange(echo, b"HEAD / HTTP/1.1\r\nhost: x\r\n\r\n").writes
     assert b"".join(head).startswith(b"HTTP/1.1 200")
-    streamed = b"".join(exchange(protocol, streams, post(b"x")).writes)
+    streamed = b"".join(exchange(streams, post(b"x")).writes)
     assert all(part in streamed for part in (b"HTTP/1.1 200", b"one", b"two", b"three", b"0\r\n\r\n"))
 
 
-def crowd(protocol: Any, app: Any, rounds: int, number: int = 4) -> tuple[list[str], list[Recorder]]:
+def crowd(app: Any, rounds: int, number: int = 4) -> tuple[list[str], list[Recorder]]:
     """Ask over so many connections at the same time, again and again; return what happened in the last round."""
 
     async def run() -> tuple[list[str], list[Recorder]]:
@@ -165,10 +135,10 @@ def crowd(protocol: Any, app: Any, rounds: int, number: int = 4) -> tuple[list[s
             events.append("asked")
             await app(scope, receive, send)
 
-        config = uvicorn.Config(Ingress(noted), lifespan="off", log_level="critical", access_log=False)
+        config = uvicorn.Config(noted, lifespan="off", log_level="critical", access_log=False)
         config.load()
         state = ServerState()
-        connections = [protocol(config=config, server_state=state, app_state={}) for _ in range(number)]
+        connections = [TimedProtocol(config=config, server_state=state, app_state={}) for _ in range(number)]
         recorders = [Recorder(events) for _ in connections]
         for connection, recorder in zip(connections, recorders, strict=True):
             connection.connection_made(recorder)
@@ -185,33 +155,29 @@ def crowd(protocol: Any, app: Any, rounds: int, number: int = 4) -> tuple[list[s
     return asyncio.run(run())
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_in_a_crowd_the_replies_of_a_turn_are_written_after_all_were_computed(protocol: Any) -> None:
-    events, _ = crowd(protocol, echo, rounds=1)
+def test_in_a_crowd_the_replies_of_a_turn_are_written_after_all_were_computed() -> None:
+    events, _ = crowd(echo, rounds=1)
     assert events == ["asked", "written"] * 4
-    events, recorders = crowd(protocol, echo, rounds=2)
+    events, recorders = crowd(echo, rounds=2)
     assert events == ["asked"] * 4 + ["written"] * 4
     for number, recorder in enumerate(recorders):
         bodies = [write.rpartition(b"\r\n\r\n")[2] for write in recorder.writes if write]
         assert bodies == [b"%d/0" % number, b"%d/1" % number]
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_no_more_than_sixteen_replies_are_held(protocol: Any) -> None:
-    events, _ = crowd(protocol, echo, rounds=2, number=20)
+def test_no_more_than_sixteen_replies_are_held() -> None:
+    events, _ = crowd(echo, rounds=2, number=20)
     assert events == ["asked"] * 16 + ["written"] * 16 + ["asked"] * 4 + ["written"] * 4
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_in_a_crowd_a_stream_keeps_its_order_and_a_failure_its_head(protocol: Any) -> None:
-    for recorder in crowd(protocol, streams, rounds=3)[1]:
+def test_in_a_crowd_a_stream_keeps_its_order_and_a_failure_its_head() -> None:
+    for recorder in crowd(streams, rounds=3)[1]:
         assert b"".join(recorder.writes).count(b"3\r\none\r\n3\r\ntwo\r\n5\r\nthree\r\n0\r\n\r\n") == 3
-    for recorder in crowd(protocol, fails_after_the_head, rounds=1)[1]:
+    for recorder in crowd(fails_after_the_head, rounds=1)[1]:
         assert b"".join(recorder.writes).startswith(b"HTTP/1.1 200") and recorder.closed
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_what_is_held_is_written_before_its_connection_closes(protocol: Any) -> None:
+def test_what_is_held_is_written_before_its_connection_closes() -> None:
     async def last(scope: Scope, receive: Receive, send: Send) -> None:
         body = (await receive())["body"]
         length = (b"content-length", b"%d" % len(body))
@@ -219,5 +185,5 @@ def test_what_is_held_is_written_before_its_connection_closes(protocol: Any) -> 
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": body})
 
-    for number, recorder in enumerate(crowd(protocol, last, rounds=2)[1]):
+    for number, recorder in enumerate(crowd(last, rounds=2)[1]):
         assert b"".join(recorder.writes).endswith(b"%d/1" % number) and recorder.closed

@@ -12,7 +12,7 @@ import time
 import pytest
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.ray_serve.processes import MARK, check_port, end_marked, free_ports, marked
+from rlservo.serve_app.ray_serve.processes import MARK, check_port, end_marked, find_marked, free_ports
 
 
 def test_a_port_in_use_names_its_holder() -> None:
@@ -52,11 +52,11 @@ def test_marked_processes_are_ended_with_their_children_and_others_are_left() ->
     bystander = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], env={**os.environ, MARK: other})
     try:
         deadline = time.monotonic() + 20
-        while len(marked(mark)) < 2 and time.monotonic() < deadline:
+        while len(find_marked(mark)) < 2 and time.monotonic() < deadline:
             time.sleep(0.05)
-        assert len(marked(mark)) == 2
+        assert len(find_marked(mark)) == 2
         assert end_marked(mark) == []
-        assert marked(mark) == []
+        assert find_marked(mark) == []
         assert bystander.poll() is None
     finally:
         parent.kill()
@@ -69,8 +69,8 @@ def test_a_process_that_lost_its_mark_is_found_by_its_session() -> None:
     """Ray's workers overwrite the memory of their environment with their title."""
     process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], env={}, start_new_session=True)
     try:
-        assert process.pid in marked("no such mark", process.pid)
-        assert marked("no such mark") == []
+        assert process.pid in find_marked("no such mark", process.pid)
+        assert find_marked("no such mark") == []
         assert end_marked("no such mark", process.pid) == []
         assert process.wait(5) == -9
     finally:

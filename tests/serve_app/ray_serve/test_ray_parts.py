@@ -63,14 +63,14 @@ def test_without_the_switches_of_what_nobody_uses_everything_starts(monkeypatch:
 def test_serve_handles_every_request_where_its_replicas_do_not_wait_for_their_http_servers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert app._can_be_left_out()
+    assert app._can_bypass_serve()
     take_away(SPARED[0], monkeypatch)
-    assert not app._can_be_left_out()
+    assert not app._can_bypass_serve()
 
 
 def test_serve_handles_every_request_where_it_traces(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ray.serve._private.tracing_utils.is_tracing_enabled", lambda: True)
-    assert not app._can_be_left_out()
+    assert not app._can_bypass_serve()
 
 
 def test_a_grpcio_that_keeps_methods_elsewhere_is_refused_by_version(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ PLACEHOLDERS = {"RAY_VERSION"}  # of RLSERVO_RAY_VERSION, our own
 def names_set(folder: Path) -> set[str]:
     """Return the variables that the launcher sets, the manifest tells operators to set, and the proxy looks at."""
     found = {name for name in ray_environment(folder, haproxy="/bin/true", mark="test") if name.startswith("RAY_")}
-    for file in ("deploy/serve.yaml", "serve_app/ray_serve/haproxy_wrapper.py"):
+    for file in ("deploy/serve.yaml", "serve_app/ray_serve/haproxy/configuration.py"):
         found |= set(NAME.findall((REPOSITORY / file).read_text()))
     return found - PLACEHOLDERS
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from rlservo.serve_app.ray_serve import haproxy_wrapper
-from rlservo.serve_app.server import request_age
+from rlservo.serve_app.ray_serve.haproxy import configuration
+from rlservo.serve_app.server import loop_clock
 
 
 def test_wrapper_and_replica_agree_on_the_stamp() -> None:
-    assert haproxy_wrapper.STAMP == request_age.STAMP
-    assert haproxy_wrapper.clock() == request_age.clock()
+    assert configuration.STAMP == loop_clock.STAMP
+    assert configuration.clock() == loop_clock.clock_id()

@@ -12,19 +12,21 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import register, registry
 
-from rlservo.export.contract.errors import UnavailableError
+from rlservo.export.contract.errors import UnavailableError, UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.recording.recorded_policy import WithRecording
 from rlservo.serve_app.recording.recorder import Recorder
 from rlservo.serve_app.replay.replay import replay
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.rollout.fallback import WithFallback
+from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 
 class Countdown(gym.Env[Any, Any]):
@@ -61,7 +63,7 @@ def environment() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def url(policies: Path, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[str]:
-    store = PolicyStore.load([policies])
+    store = load_store(policies)
     with served(create_app(lambda: store, ServerSettings())) as port:
         yield f"http://127.0.0.1:{port}"
     store.close()
@@ -130,7 +132,7 @@ class Failing:
         self._policy = policy
         self._calls = 0
         self.contract = policy.contract
-        self.told: list[Any] = []
+        self.commands: list[Any] = []
 
     def act(self, obs: Any, **more: Any) -> Any:
         self._calls += 1
@@ -138,8 +140,8 @@ class Failing:
             raise UnavailableError("away")
         return self._policy.act(obs)
 
-    def commanded(self, action: Any) -> None:
-        self.told.append(action)
+    def set_last_action(self, action: Any) -> None:
+        self.commands.append(action)
 
     def reset(self) -> None: ...
 
@@ -157,9 +159,54 @@ def test_fallbacks_are_recorded_as_what_the_robot_did(ur5: Path, tmp_path: Path)
     executed = episode.executed["action"]
     for row in missing:
         assert not episode.acted[row] and (executed[row] == executed[row - 1]).all()
-    assert len(failing.told) == 3  # it is still told
+    assert len(failing.commands) == 3  # a client still gets to know
     report = replay(Recording(tmp_path / "run.mcap"), ur5)
     assert (report.compared, report.identical, report.not_compared) == (7, 7, 3)
+
+
+def test_commands_reach_the_policy_through_a_recording(ur5: Path, tmp_path: Path) -> None:
+    failing: Any = Failing(Policy.load(ur5))
+    with WithFallback(WithRecording(failing, tmp_path / "run.mcap"), "zero") as policy:
+        for _ in range(3):
+            policy.act(np.zeros(27, np.float32))
+    assert len(failing.commands) == 1 and (failing.commands[0] == 0).all()
+    (episode,) = all_of(tmp_path / "run.mcap")
+    assert episode.fell_back.tolist() == [False, False, True]
+    assert (episode.executed["action"][2] == 0).all()
+
+
+@pytest.mark.parametrize("kind", [PolicyClient, StreamClient])
+@pytest.mark.parametrize("wraps", [False, True], ids=["records itself", "is wrapped"])
+def test_server_gets_the_commanded_action_of_a_recorded_client(
+    policies: Path,
+    served: Callable[[Any], AbstractContextManager[int]],
+    tmp_path: Path,
+    kind: type[PolicyClient | StreamClient],
+    wraps: bool,
+) -> None:
+    """The server limits the step from the last action: what comes next is at most that far from the commanded one."""
+    store = load_store(policies, options={"ur5": PolicyOptions(max_action_step=0.01)})
+    commanded = np.full(6, 0.9, np.float32)
+    with served(create_app(lambda: store, ServerSettings())) as port:
+        url = f"http://127.0.0.1:{port}"
+        record = tmp_path / "run.mcap"
+        with WithRecording(kind(url, "ur5"), record) if wraps else kind(url, "ur5", record=record) as policy:
+            policy.reset()
+            first = policy.act(np.zeros(27, np.float32))
+            assert (np.abs(first - commanded) > 0.02).all()
+            policy.set_last_action(commanded)
+            following = policy.act(np.zeros(27, np.float32))
+    store.close()
+    assert (np.abs(following - commanded) <= 0.011).all()
+    (episode,) = all_of(record)
+    assert (episode.executed["action"][0] == commanded).all()
+
+
+@pytest.mark.parametrize("kind", [PolicyClient, StreamClient])
+def test_client_that_cannot_be_made_leaves_no_file(tmp_path: Path, kind: type[PolicyClient | StreamClient]) -> None:
+    with pytest.raises(UsageError, match="ftp"):
+        kind("ftp://127.0.0.1", "ur5", record=tmp_path / "run.mcap")
+    assert not list(tmp_path.iterdir())
 
 
 def test_clients_share_a_recorder(url: str, tmp_path: Path) -> None:

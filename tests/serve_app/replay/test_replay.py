@@ -116,7 +116,7 @@ def test_fallback_actions_are_not_compared_and_limits_count_from_them(ur5: Path,
             if step == 4:
                 with pytest.raises(ObservationError):
                     policy.act(np.zeros(5))
-                policy.commanded(np.zeros(6, np.float32))
+                policy.set_last_action(np.zeros(6, np.float32))
             policy.act(obs)
     report = replay(Recording(tmp_path / "run.mcap"), ur5)
     assert (report.compared, report.identical) == (10, 10)

@@ -22,7 +22,8 @@ from typing_extensions import Self
 from rlservo.export.contract.contract import Contract, Parity, Provenance, TensorSpec
 from rlservo.export.contract.errors import UnavailableError, UsageError
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec
-from rlservo.serve_app.rollout.control_loop import rollout, success_of
+from rlservo.serve_app.rollout.control_loop import rollout
+from rlservo.serve_app.rollout.episode import success_of
 from rlservo.serve_app.rollout.report import latency_of, render_report, wilson_interval
 
 Decide = Callable[[NDArray[Any]], Any]

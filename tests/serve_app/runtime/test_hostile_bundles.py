@@ -43,11 +43,11 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
-from rlservo.serve_app.versions import plan
+from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.loaded_policies import Library
+from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
 from rlservo.serve_app.versions.plan import Plan, PolicyPlan, ServedConfig
-from rlservo.serve_app.versions.replica_versions import Control, Following
+from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 
 Serve = Callable[[Any], AbstractContextManager[int]]
@@ -68,7 +68,7 @@ class Shelf:
     def newest(self) -> int:
         return max(self.plans, default=0)
 
-    def read(self, generation: int) -> bytes | None:
+    def fetch(self, generation: int) -> bytes | None:
         return self.plans.get(generation)
 
     def append(self, generation: int, content: bytes) -> bool:
@@ -93,8 +93,8 @@ def patience_s(request: pytest.FixtureRequest) -> float:
 @pytest.fixture
 def url(root: Path, served: Serve, patience_s: float) -> Iterator[str]:
     """A server of ur5 in 1 and 2, and of gridworld."""
-    library = Library(Repository([root]))
-    control = Control(library, Shelf(), replica="r", scan_timeout_s=patience_s, load_timeout_s=patience_s)
+    library = LoadedPolicies(Repository([root]))
+    control = ReplicaVersions(library, Shelf(), replica="r", scan_timeout_s=patience_s, load_timeout_s=patience_s)
     asyncio.run(control.configure({}))
     app = create_app(lambda: control.store, ServerSettings(operator_key=DIGEST), replica="r", control=control)
     with served(app) as port:
@@ -262,7 +262,7 @@ def test_a_bundle_that_is_another_one_while_it_is_read_is_not_served_under_the_a
     def other(folder: Path) -> Policy:
         return Policy.load(folder.with_name("1"))
 
-    library = Library(Repository([root]), other)
+    library = LoadedPolicies(Repository([root]), other)
     version, digest = library.repository.find_digest("ur5", "2")
     with pytest.raises(BundleTamperedError, match="is not the bundle that was accepted"):
         library.load("ur5", version, digest)
@@ -360,34 +360,34 @@ def test_a_file_system_that_hangs_is_given_up_with_a_few_threads_at_most(
 def test_a_replica_whose_files_hang_does_not_hold_up_the_commands_of_others(
     root: Path, tmp_path: Path, stall: Callable[[Path], Stalled], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.WATCH_PERIOD_S", 0.05)
+    monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.LEDGER_POLL_S", 0.05)
     monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.RETRY_PERIOD_S", 0.3)
     elsewhere = Path(shutil.copytree(root, tmp_path / "elsewhere"))
 
     async def run() -> None:
         shelf = Shelf()
-        controls: list[Control] = []
+        controls: list[ReplicaVersions] = []
 
-        async def tell(generation: int) -> list[Following]:
+        async def tell(generation: int) -> list[ReplicaProgress]:
             return [await control.follow(generation) for control in controls]
 
         for folder in (root, elsewhere):
-            library = Library(Repository([folder]))
-            controls.append(Control(library, shelf, replica=folder.name, broadcast=tell, load_timeout_s=1))
+            library = LoadedPolicies(Repository([folder]))
+            controls.append(ReplicaVersions(library, shelf, replica=folder.name, broadcast=tell, load_timeout_s=1))
         config = {"policies": {"ur5": {"versions": ["1"]}, "gridworld": {}}, "unlisted": "ignore"}
         for control in controls:
             await control.configure(config)
         stalled = stall(elsewhere / "ur5" / "2" / "policy.onnx")
         with pytest.raises(UnavailableError, match="elsewhere: loading policy 'ur5' version 2 took longer than 1 s"):
             await controls[0].load("ur5", "2", what="load")
-        watching = asyncio.create_task(controls[1].watch())
+        watching = asyncio.create_task(controls[1].poll_ledger())
         for number in range(5):  # of the other policy, while the watching replica tries again and again
             began = time.monotonic()
             with pytest.raises(UnavailableError, match="elsewhere: loading policy 'ur5' version 2 took longer"):
                 await controls[0].change(lambda p, n=number: aliased(p, f"alias{n}"), what="alias")  # type: ignore[misc]
             assert time.monotonic() - began < 0.9  # not another second
-            arranged = controls[1].arranged("gridworld")
-            assert arranged is not None and f"alias{number}" in arranged.aliases
+            served = controls[1].store
+            assert served is not None and f"alias{number}" in served.plans["gridworld"].aliases
             await asyncio.sleep(0.1)
         stalled.go_on.set()
         for _ in range(200):
@@ -395,13 +395,13 @@ def test_a_replica_whose_files_hang_does_not_hold_up_the_commands_of_others(
                 break
             await asyncio.sleep(0.05)
         watching.cancel()
-        assert controls[1].following().behind == ()
+        assert controls[1].progress().behind == ()
 
     asyncio.run(run())
 
 
 def aliased(before: Plan, alias: str) -> dict[str, PolicyPlan]:
-    return plan.set_alias(before, "gridworld", alias, "1")
+    return plan_changes.set_alias(before, "gridworld", alias, "1")
 
 
 def test_a_start_does_not_wait_in_silence_for_a_file_system_that_hangs(

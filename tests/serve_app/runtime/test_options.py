@@ -19,7 +19,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 ZEROS = np.zeros(27, np.float32)
 OUTSIDE = np.where(np.arange(27) == 3, np.float32(1.5), ZEROS)
@@ -43,12 +43,11 @@ def test_an_observation_out_of_bounds_is_refused_clipped_or_used_as_the_options_
     accepting, warning, clipping, refusing = (
         bounded(out_of_bounds=choice) for choice in ("accept", "warn", "clip", "refuse")
     )
-    as_it_is = accepting.act(OUTSIDE)
-    assert list(accepting.notices) == []
-    np.testing.assert_array_equal(warning.act(OUTSIDE), as_it_is)
-    assert list(warning.notices) == [sentence]
-    np.testing.assert_array_equal(clipping.act(OUTSIDE), accepting.act(np.clip(OUTSIDE, -1, 1)))
-    assert list(clipping.notices) == [f"{sentence}: clipped"]
+    as_it_is, warned, clipped = (policy.step(OUTSIDE) for policy in (accepting, warning, clipping))
+    assert (as_it_is.notices, warned.notices, clipped.notices) == ((), (sentence,), (f"{sentence}: clipped",))
+    np.testing.assert_array_equal(warned.action, as_it_is.action)
+    np.testing.assert_array_equal(clipped.action, accepting.act(np.clip(OUTSIDE, -1, 1)))
+    assert clipping.step(ZEROS).notices == ()  # a step says what it noticed itself, whoever asked before
     with pytest.raises(ObservationError, match=r"element 3 \(element_3\) is 1\.5, outside the .* \[-1, 1\]"):
         refusing.act(OUTSIDE)
     assert [record.getMessage() for record in caplog.records] == [
@@ -63,7 +62,7 @@ def test_every_row_of_a_batch_is_looked_at_and_rounding_is_no_offence(bounded: C
         bounded(out_of_bounds="refuse").act(batch)
     clipping = bounded(out_of_bounds="clip")
     np.testing.assert_allclose(clipping.act(batch)[2], clipping.act(np.clip(batch, -1, 1))[2], atol=1e-6)
-    assert len(clipping.notices) == 1
+    assert len(clipping.step(batch).notices) == 1
     strict = bounded(out_of_bounds="refuse")
     strict.act(np.full(27, np.float32(1.000001)))
     with pytest.raises(ObservationError):
@@ -80,7 +79,6 @@ def test_a_warning_is_logged_once_a_minute_however_often_it_comes(
     for _ in range(50):
         policy.act(OUTSIDE)
     assert len(caplog.records) == 1 and caplog.records[0].levelno == logging.WARNING
-    assert len(policy.notices) < 50  # and nobody who does not read them is filled with them
 
 
 def test_actions_are_kept_within_a_step_of_the_last_one(bounded: Callable[..., Policy]) -> None:
@@ -89,10 +87,12 @@ def test_actions_are_kept_within_a_step_of_the_last_one(bounded: Callable[..., P
     first = limited.act(ZEROS + 0.5)
     np.testing.assert_array_equal(first, free.act(ZEROS + 0.5))  # nothing came before
     wanted = free.act(ZEROS - 0.5)
+    (notice,) = limited.step(ZEROS - 0.5, last={"action": first[None]}).notices
+    assert notice.endswith("is allowed: limited")
     second = limited.act(ZEROS - 0.5)
     steps = np.array([0.1, np.inf, 0.1, 0.1, 0.1, 0.1])
     np.testing.assert_allclose(second, first + np.clip(wanted - first, -steps, steps), atol=1e-6)
-    assert (np.abs(wanted - first) > steps).any() and limited.notices[-1].endswith("is allowed: limited")
+    assert (np.abs(wanted - first) > steps).any()
     for _ in range(30):
         third = limited.act(ZEROS - 0.5)
     np.testing.assert_allclose(third, wanted, atol=1e-6)  # it arrives
@@ -138,7 +138,7 @@ def test_a_served_policy_has_its_options_and_says_what_they_did(
 ) -> None:
     folder = bounded().path
     options = {"ur5": PolicyOptions(out_of_bounds="clip", max_action_step=0.1), "*": PolicyOptions()}
-    store = PolicyStore.load([folder], options=options)
+    store = load_store(folder, options=options)
     free = bounded(out_of_bounds="accept")
     with served(create_app(lambda: store, ServerSettings())) as port, httpx.Client() as client:
 
@@ -160,9 +160,9 @@ def test_a_served_policy_has_its_options_and_says_what_they_did(
 
 
 def test_integer_boxes_of_their_dtypes_own_range_need_no_look() -> None:
-    from rlservo.serve_app.runtime.observations import ObservationReader
+    from rlservo.serve_app.runtime.leaf_observations import LeafParser
 
-    image = ObservationReader("p", BoxSpec(shape=(4, 4), dtype="uint8", low=0, high=255))
+    image = LeafParser("p", BoxSpec(shape=(4, 4), dtype="uint8", low=0, high=255))
     assert not image._bounded
-    narrow = ObservationReader("p", BoxSpec(shape=(2,), dtype="int64", low=-5, high=200), options=PolicyOptions())
+    narrow = LeafParser("p", BoxSpec(shape=(2,), dtype="int64", low=-5, high=200), options=PolicyOptions())
     assert narrow._bounded

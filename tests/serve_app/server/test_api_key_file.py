@@ -22,13 +22,12 @@ from websockets.exceptions import ConnectionClosed
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.server import api_key_file
 from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -67,7 +66,7 @@ def file(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def store(ur5: Path) -> PolicyStore:
-    return PolicyStore.load([ur5])
+    return load_store(ur5)
 
 
 @pytest.fixture
@@ -248,59 +247,3 @@ def test_a_stream_opened_with_a_removed_key_gets_no_further_action(
         assert json.loads(stream.recv())["code"] == "unauthenticated"
         with pytest.raises(ConnectionClosed):
             stream.recv()
-
-
-@pytest.mark.serve
-@pytest.mark.slow
-def test_two_replicas_behind_the_proxy_follow_the_file_and_end_grpc_streams(policies: Path, file: Path) -> None:
-    import grpc
-
-    from rlservo.serve_app.protocols import oip_messages as messages
-
-    port, grpc_port = free_ports(2)
-    ready, stop = threading.Event(), threading.Event()
-
-    def serve() -> None:
-        try:
-            serve_policies(
-                [policies],
-                port=port,
-                grpc_port=grpc_port,
-                replicas=2,
-                settings={"api_keys_file": str(file)},
-                on_ready=lambda _: ready.set(),
-                stop=stop,
-            )
-        finally:
-            ready.set()
-
-    server = threading.Thread(target=serve)
-    server.start()
-    try:
-        assert ready.wait(120) and server.is_alive()
-        request = messages.ModelInferRequest(model_name="ur5")
-        tensor = request.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
-        tensor.contents.fp32_contents.extend(OBS)
-        go_on = threading.Semaphore(1)
-
-        def requests() -> Iterator[bytes]:
-            while not stop.is_set():
-                if go_on.acquire(timeout=1):
-                    yield request.SerializeToString()
-
-        with grpc.insecure_channel(f"127.0.0.1:{grpc_port}") as channel:
-            stream = channel.stream_stream("/inference.GRPCInferenceService/ModelStreamInfer")(
-                requests(), metadata=[("application", "rlservo"), ("authorization", f"Bearer {OLD}")]
-            )
-            assert not messages.ModelStreamInferResponse.FromString(next(stream)).error_message
-            file.write_text(NEW_LINE)
-            for expected, key in ((401, OLD), (200, NEW)):  # by either replica
-                wait_for(lambda key=key, expected=expected: {status(port, key) for _ in range(20)} == {expected})  # type: ignore[misc]
-            go_on.release()
-            with pytest.raises(grpc.RpcError) as caught:
-                next(stream)
-            assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
-    finally:
-        stop.set()
-        server.join(60)
-    assert not server.is_alive()

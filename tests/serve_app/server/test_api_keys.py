@@ -16,14 +16,16 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import InvalidStatus
 
-from rlservo.export.contract.errors import ForbiddenError, UsageError
+from rlservo.export.contract.errors import ForbiddenError, RequestError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.api_keys import Keys, Role, check_exposure, new_key
-from rlservo.serve_app.server.request_checks import Hosts, RequestChecks
+from rlservo.serve_app.server.api_key_file import CurrentKeys
+from rlservo.serve_app.server.api_keys import Access, Keys, Role, check_exposure, new_key
+from rlservo.serve_app.server.request_checks import Authorizer, Hosts, RequestChecks, fold_headers
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.replica_versions import Control
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.wire.loopback import is_loopback
+from stores import load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -67,7 +69,7 @@ def stream(port: int, **headers: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def store(ur5: Path) -> PolicyStore:
-    return PolicyStore.load([ur5])
+    return load_store(ur5)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +144,7 @@ def test_without_a_known_key_every_protocol_answers_401_in_our_form(port: int, h
         assert f'{{code="unauthenticated",policy="",protocol="{protocol}"' in counted
 
 
-@pytest.mark.parametrize("key", [CELL, OTHER, ADMIN])
+@pytest.mark.parametrize("key", [CELL, OTHER, ADMIN], ids=["cell", "other", "admin"])
 def test_a_known_key_gets_through_however_it_is_sent(port: int, key: str) -> None:
     for headers in ({"authorization": f"Bearer {key}"}, {"authorization": f"api-key {key}"}, {"x_api_key": key}):
         for request in (ACT, INFER, LIST, ("GET", "/metrics", None)):
@@ -163,7 +165,7 @@ def test_probes_and_documentation_need_no_key(port: int) -> None:
 
 
 def test_administration_wants_an_admin_key_even_where_no_key_is_asked_for(
-    ur5: Path, controlled: Callable[..., AbstractContextManager[Control]], served: Serve
+    ur5: Path, controlled: Callable[..., AbstractContextManager[ReplicaVersions]], served: Serve
 ) -> None:
     with controlled(ur5) as control:
         lines = f"{CELL_LINE},{ADMIN_LINE}"
@@ -187,6 +189,13 @@ def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served
             assert caught.value.response.status_code == 403
 
 
+def check(headers: list[tuple[bytes, bytes]], **settings: Any) -> None:
+    """Check a request with these headers against a server on loopback that wants no key."""
+    chosen = ServerSettings(**settings)
+    checks = RequestChecks(Hosts("127.0.0.1", chosen, keyed=False), Authorizer(CurrentKeys(chosen)))
+    checks.check({"type": "http", "method": "POST"}, fold_headers(headers), Access.act)
+
+
 @pytest.mark.parametrize(
     "page",
     [
@@ -196,16 +205,29 @@ def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served
     ],
 )
 def test_a_page_that_says_twice_where_it_is_from_is_refused(page: dict[bytes, list[bytes]]) -> None:
-    checks = RequestChecks(Hosts("127.0.0.1", ServerSettings(allowed_hosts="x"), keyed=False))
-    said = [(name, value) for name, values in page.items() for value in values]
+    headers = [(b"host", b"x"), *((name, value) for name, values in page.items() for value in values)]
     with pytest.raises(ForbiddenError):
-        checks.read({"type": "http", "method": "POST", "headers": [(b"host", b"x"), *said]})
+        check(headers, allowed_hosts="x")
 
 
 def test_a_page_has_no_origin_where_the_request_has_no_host() -> None:
-    checks = RequestChecks(Hosts("127.0.0.1", ServerSettings(), keyed=False))
     with pytest.raises(ForbiddenError):
-        checks.read({"type": "http", "method": "POST", "headers": [(b"origin", b"http://")]})
+        check([(b"origin", b"http://")])
+
+
+@pytest.mark.parametrize("hosts", [(b"127.0.0.1", b"127.0.0.1"), (b"127.0.0.1", b"evil.example")])
+@pytest.mark.parametrize("allowed", ["", "*"])
+def test_a_request_that_names_two_hosts_is_refused(hosts: tuple[bytes, bytes], allowed: str) -> None:
+    with pytest.raises(RequestError, match="two Host headers"):
+        check([(b"host", host) for host in hosts], allowed_hosts=allowed)
+
+
+def test_a_header_that_is_not_utf8_is_refused_also_where_another_of_its_name_comes_first() -> None:
+    with pytest.raises(RequestError, match="the header 'x-note' is not UTF-8"):
+        check([(b"x-note", b"fine"), (b"x-note", b"\xff")])
+    with pytest.raises(RequestError, match="the header 'x-note' is not UTF-8"):
+        check([(b"x-note", b"\xff")])
+    check([(b"x-note", "é".encode()), (b"x-note", b"fine")])
 
 
 def asked_as(host: str, listening_on: str, *, keyed: bool = False, allowed: str = "") -> bool:

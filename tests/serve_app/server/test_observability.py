@@ -25,8 +25,8 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.drift import EVERY, Drift
 from rlservo.serve_app.server.request_log import LOGGER, configure
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack
+from stores import load_store
 
 MEAN, STD = np.linspace(-2, 2, 27), np.linspace(0.5, 3, 27)
 DASHBOARD = Path(__file__).resolve().parents[3] / "deploy" / "grafana.json"
@@ -80,14 +80,12 @@ def test_observations_at_home_show_no_drift_and_those_that_moved_show_which_elem
     assert drift is not None and drift.elements[:2] == ("element_0", "element_1")
     rng = np.random.default_rng(0)
     for _ in range(200):
-        for _ in range(EVERY):
-            drift.see((MEAN + STD * rng.standard_normal((32, 27))).astype(np.float32))
+        drift.add((MEAN + STD * rng.standard_normal((32, 27))).astype(np.float32))
     assert drift.looks == 200
     assert np.abs(drift.shift).max() < 0.1 and np.abs(drift.spread - 1).max() < 0.1
     moved = MEAN + 3 * STD * (np.arange(27) == 4)
     for _ in range(3000):
-        for _ in range(EVERY):
-            drift.see((moved + STD * 2 * rng.standard_normal((4, 27))).astype(np.float32))
+        drift.add((moved + STD * 2 * rng.standard_normal((4, 27))).astype(np.float32))
     assert drift.shift[4] == pytest.approx(3, abs=0.3)
     assert np.abs(np.delete(drift.shift, 4)).max() < 0.3
     assert drift.spread == pytest.approx(2, abs=0.3)
@@ -99,7 +97,7 @@ def test_an_element_that_never_moved_in_training_gives_a_finite_drift(filtered: 
     still = step.model_copy(update={"values": {**step.values, "std": [0.0] * 27}})
     drift = Drift.of(contract.model_copy(update={"baked_in": (still,)}))
     assert drift is not None
-    drift.see(np.full((1, 27), 1e30, np.float32))
+    drift.add(np.full((1, 27), 1e30, np.float32))
     assert np.isfinite(drift.shift).all() and np.isfinite(drift.spread).all()
 
 
@@ -113,7 +111,7 @@ def test_a_policy_without_a_filter_has_no_drift(ur5: Path, filtered: Path) -> No
 def test_drift_of_served_requests_is_a_metric_per_element(
     filtered: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
-    store = PolicyStore.load([filtered])
+    store = load_store(filtered)
     with served(create_app(lambda: store, ServerSettings(), replica="r")) as port:
         obs = MEAN + 2 * STD * (np.arange(27) == 7)
         for _ in range(3 * EVERY):
@@ -132,7 +130,7 @@ def test_the_log_says_what_happened_and_values_only_when_asked(
 ) -> None:
     settings = ServerSettings(log_file=str(log_file), log_requests=True, log_values=values)
     configure(settings, replica="r9")
-    store = PolicyStore.load([ur5])
+    store = load_store(ur5)
     with served(create_app(lambda: store, settings)) as port:
         obs = [SECRET] * 27
         assert post(port, "/v1/policies/ur5/act", {"obs": obs}, x_request_id="cell-7/1")[0] == 200
@@ -161,7 +159,7 @@ def test_requests_on_streams_are_logged_like_others(
 ) -> None:
     settings = ServerSettings(log_file=str(log_file), log_requests=True)
     configure(settings)
-    store = PolicyStore.load([ur5])
+    store = load_store(ur5)
     with served(create_app(lambda: store, settings)) as port:
         address = f"ws://127.0.0.1:{port}/v1/policies/ur5"
 
@@ -200,7 +198,7 @@ def test_requests_on_streams_are_logged_like_others(
 def test_the_dashboard_asks_for_metrics_that_exist(
     filtered: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
-    store = PolicyStore.load([filtered])
+    store = load_store(filtered)
     with served(create_app(lambda: store, ServerSettings(), replica="r")) as port:
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27})[0] == 200
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0]})[0] == 422

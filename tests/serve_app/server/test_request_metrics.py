@@ -17,7 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.request_metrics import Histogram
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -28,7 +28,7 @@ OBS = [0.1] * 27
 def test_requests_are_counted_by_policy_version_protocol_and_outcome(
     policies: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
-    store = PolicyStore.load([policies])
+    store = load_store(policies)
     app = create_app(lambda: store, ServerSettings(default_policy="ur5"), replica="r1")
     with served(app) as port:
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)

@@ -25,15 +25,17 @@ from numpy.typing import NDArray
 from rlservo.export.contract.bundle import load_bundle, write_contract, write_golden
 from rlservo.export.contract.errors import ActionError, BundleError, DeadlineError, UsageError
 from rlservo.export.contract.spaces import BoxSpec
+from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.oip_grpc import Grpc
+from rlservo.serve_app.protocols.oip_grpc import OipGrpcCodec
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.micro_batching import Batcher, Tensors
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, load_policy
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+from stores import load_store, store_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -99,7 +101,7 @@ def test_who_has_gone_is_left_out_and_a_failed_run_fails_for_all_in_it() -> None
 def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
     unsafe = tmp_path_factory.mktemp("unsafe")
     box_policy(unsafe, name="unsafe", action_scale=2.0)  # its actions can leave the space
-    return PolicyStore.load([policies, unsafe], options=TOGETHER)
+    return load_store(policies, unsafe, options=TOGETHER)
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +223,8 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
             return [unpack(await one.recv())["actions"] for one in opened]
 
     async def calls() -> list[Any]:
-        service = Grpc(create_app(lambda: store, ServerSettings()).state.core)
+        core = create_app(lambda: store, ServerSettings()).state.core
+        codec, answer = OipGrpcCodec(core), core.request_path.answer
         asked = messages.ModelInferRequest(model_name="ur5")
         asked.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
         requests = []
@@ -229,7 +232,8 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
             del asked.raw_input_contents[:]
             asked.raw_input_contents.append(row.tobytes())
             requests.append((asked.SerializeToString(), None))
-        return await asyncio.gather(*(service._infer(request, None, None) for request in requests))
+        now = time.perf_counter()
+        return await asyncio.gather(*(answer(codec, Request("grpc", "", None, now), one) for one in requests))
 
     with Policy.load(ur5) as alone, watched(store, store.get("ur5")) as sizes:
         expected = [alone.act(row) for row in OBS[:8]]
@@ -270,7 +274,7 @@ def test_exploring_requests_draw_for_themselves(port: int, store: PolicyStore) -
 
 def test_a_warning_is_in_the_reply_to_what_it_is_about(bounded: Path) -> None:
     async def main() -> list[Decision]:
-        store = PolicyStore.load([bounded], options=TOGETHER)
+        store = load_store(bounded, options=TOGETHER)
         in_a_crowd(store)
         rows = OBS[:4].copy()
         rows[1, 5], rows[3, 6] = 9.0, -10.0
@@ -289,9 +293,10 @@ def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(s
 
     async def main() -> list[Any]:
         now = time.perf_counter()
-        hurried = core.act("ur5", None, OBS[0], received=now, deadline_ms=30.0)
-        patient = core.act("ur5", None, OBS[1], received=now, deadline_ms=30_000.0)
-        return await asyncio.gather(hurried, patient, slow(), return_exceptions=True)
+        hurried = Request("json", "ur5", None, now, obs=OBS[0], deadline_ms=30.0)
+        patient = Request("json", "ur5", None, now, obs=OBS[1], deadline_ms=30_000.0)
+        decide = core.request_path.decide
+        return await asyncio.gather(decide(hurried), decide(patient), slow(), return_exceptions=True)
 
     with watched(store, store.get("ur5")) as sizes:
         in_a_crowd(store)
@@ -301,7 +306,7 @@ def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(s
 
 
 def test_a_closed_policy_computes_what_was_waiting_and_nothing_else(policies: Path) -> None:
-    store = PolicyStore.load([policies], options=TOGETHER)
+    store = load_store(policies, options=TOGETHER)
 
     async def main() -> list[Any]:
         async def close() -> None:
@@ -334,22 +339,22 @@ def test_a_graph_that_takes_one_observation_at_a_time_is_refused(bounded: Path, 
 
 
 def test_policies_with_a_memory_or_a_limit_are_computed_one_by_one(recurrent: Path, policies: Path) -> None:
-    store = PolicyStore.load([recurrent], options=TOGETHER)
+    store = load_store(recurrent, options=TOGETHER)
     assert not store.batches
     limited = PolicyOptions(micro_batch=16, max_action_step=0.1)
-    assert not PolicyStore.load([policies], options={"ur5": limited}).batches
+    assert not load_store(policies, options={"ur5": limited}).batches
 
 
 def test_the_next_store_goes_on_with_the_batchers_of_the_policies_it_keeps(policies: Path) -> None:
-    first = PolicyStore.load([policies], options=TOGETHER)
+    first = load_store(policies, options=TOGETHER)
     kept = first.get("ur5")
     batcher = first.batcher_of(kept)
     assert batcher is not None
     assert asyncio.run(batcher.compute({"obs": OBS[:1]})).outputs["action"].shape == (1, 6)
-    after = PolicyStore([kept], replaces=first).batcher_of(kept)
+    after = store_of(kept, replaces=first).batcher_of(kept)
     assert after is batcher and after.observations == 1  # the counts are Prometheus counters: they do not start again
-    other = kept.twin()
-    assert PolicyStore([other], replaces=first).batcher_of(other) is not batcher
+    other = kept.clone()
+    assert store_of(other, replaces=first).batcher_of(other) is not batcher
 
 
 def test_the_in_process_runtime_imports_no_event_loop() -> None:

@@ -7,14 +7,15 @@ from typing import Any
 import pytest
 
 from rlservo.export.contract.errors import ConflictError, UnknownPolicyError, UnknownVersionError, UsageError
-from rlservo.serve_app.versions import plan
-from rlservo.serve_app.versions.plan import Canary, Plan, PolicyPlan, ServedConfig, config_hash, plan_of
+from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions.plan import Canary, Plan, PolicyPlan, ServedConfig, config_hash
+from rlservo.serve_app.versions.plan_changes import plan_of
 
 AVAILABLE = {"ur5": {"1": "a", "2": "b", "10": "c"}, "mir": {"1": "d"}}
 
 
 def planned(config: dict[str, Any], before: Plan | None = None) -> dict[str, PolicyPlan]:
-    return plan_of(ServedConfig.read(config), AVAILABLE, before)
+    return plan_of(ServedConfig.parse(config), AVAILABLE, before)
 
 
 def made(policies: dict[str, PolicyPlan], generation: int = 1) -> Plan:
@@ -55,7 +56,7 @@ def test_a_configuration_chooses_versions_and_production_is_the_default() -> Non
 )
 def test_a_configuration_that_is_none_is_refused_by_field(config: Any, sentence: str) -> None:
     with pytest.raises(UsageError) as caught:
-        ServedConfig.read(config)
+        ServedConfig.parse(config)
     assert sentence in caught.value.message
 
 
@@ -81,19 +82,19 @@ def test_versions_that_compare_equal_are_refused() -> None:
 def test_rollbacks_go_back_through_what_an_alias_was_and_load_what_is_gone() -> None:
     now = made(planned({"policies": {"ur5": {"aliases": {"production": "1"}}}}))
     for version in ("2", "10", "10"):
-        now = now.after(plan.set_alias(now, "ur5", "production", version), "alias")
+        now = now.after(plan_changes.set_alias(now, "ur5", "production", version), "alias")
     assert now.policies["ur5"].history == {"production": ("1", "2")}
-    now = now.after(plan.unload(now, "ur5", "2"), "unload")
+    now = now.after(plan_changes.unload(now, "ur5", "2"), "unload")
     assert now.policies["ur5"].unloaded == {"2": "b"}
-    now = now.after(plan.roll_back(now, "ur5", "production"), "rollback")
+    now = now.after(plan_changes.roll_back(now, "ur5", "production"), "rollback")
     assert now.policies["ur5"].default == "2"
     assert now.policies["ur5"].versions == {"1": "a", "2": "b", "10": "c"}  # the same bundle as before
     with pytest.raises(ConflictError, match="leads to 2 and was expected at 10"):
-        plan.roll_back(now, "ur5", "production", expected="10")
-    now = now.after(plan.roll_back(now, "ur5", "production", expected="2"), "rollback")
+        plan_changes.roll_back(now, "ur5", "production", expected="10")
+    now = now.after(plan_changes.roll_back(now, "ur5", "production", expected="2"), "rollback")
     assert now.policies["ur5"].default == "1"
     with pytest.raises(ConflictError, match="has led nowhere else"):
-        plan.roll_back(now, "ur5", "production")
+        plan_changes.roll_back(now, "ur5", "production")
 
 
 @pytest.mark.parametrize("config", [{}, {"policies": {"ur5": {"versions": ["1", "2"]}}},
@@ -102,43 +103,43 @@ def test_what_is_in_use_at_the_start_is_written_down_and_a_load_never_changes_it
     now = made(planned(config))
     first = now.policies["ur5"].default
     assert first is not None and now.policies["ur5"].aliases["production"] == first
-    now = now.after(plan.load(now, "ur5", "11", "e"), "load")
+    now = now.after(plan_changes.load(now, "ur5", "11", "e"), "load")
     assert now.policies["ur5"].default == first
-    now = now.after(plan.set_alias(now, "ur5", "production", "11"), "alias")
-    now = now.after(plan.roll_back(now, "ur5", "production"), "rollback")
+    now = now.after(plan_changes.set_alias(now, "ur5", "production", "11"), "alias")
+    now = now.after(plan_changes.roll_back(now, "ur5", "production"), "rollback")
     assert now.policies["ur5"].default == first
 
 
 def test_production_is_moved_but_neither_removed_nor_unloaded_nor_exchanged() -> None:
     now = made(planned({}))
     with pytest.raises(ConflictError, match=r"says what clients get .* point it elsewhere, or unload the policy"):
-        plan.set_alias(now, "ur5", "production", None)
+        plan_changes.set_alias(now, "ur5", "production", None)
     with pytest.raises(ConflictError, match="version 10 is in use by the alias 'production'"):
-        plan.unload(now, "ur5", "10")
+        plan_changes.unload(now, "ur5", "10")
     with pytest.raises(ConflictError, match="in use by the alias 'production', and its folder holds another bundle"):
-        plan.load(now, "ur5", "10", "exchanged")
-    assert plan.load(now, "ur5", "10", "c")["ur5"] == now.policies["ur5"]
-    assert plan.load(now, "ur5", "2", "exchanged")["ur5"].versions["2"] == "exchanged"  # nothing leads there
+        plan_changes.load(now, "ur5", "10", "exchanged")
+    assert plan_changes.load(now, "ur5", "10", "c")["ur5"] == now.policies["ur5"]
+    assert plan_changes.load(now, "ur5", "2", "exchanged")["ur5"].versions["2"] == "exchanged"  # nothing leads there
 
 
 def test_a_policy_that_was_not_served_is_in_use_as_what_was_loaded_first() -> None:
     now = made(planned({"policies": {"mir": {}}, "unlisted": "ignore"}))
-    now = now.after(plan.load(now, "ur5", "2", "b"), "load")
+    now = now.after(plan_changes.load(now, "ur5", "2", "b"), "load")
     assert now.policies["ur5"].default == "2"
-    now = now.after(plan.load(now, "ur5", "10", "c"), "load")
+    now = now.after(plan_changes.load(now, "ur5", "10", "c"), "load")
     assert now.policies["ur5"].default == "2"
 
 
 def test_unloading_a_policy_and_loading_another_version_leaves_the_way_back() -> None:
     now = made(planned({"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}}}}))
-    now = now.after(plan.set_alias(now, "ur5", "production", "2"), "alias")
-    now = now.after(plan.unload(now, "ur5", None), "unload")
+    now = now.after(plan_changes.set_alias(now, "ur5", "production", "2"), "alias")
+    now = now.after(plan_changes.unload(now, "ur5", None), "unload")
     with pytest.raises(UnknownPolicyError, match=r"no policy 'ur5' is loaded: this server has mir$"):
         now.policy("ur5")
-    again = now.after(plan.load(now, "ur5", "2", "b"), "load")
+    again = now.after(plan_changes.load(now, "ur5", "2", "b"), "load")
     assert again.policies["ur5"].history == {"production": ("1",)}  # what is in use is not its own way back
-    now = now.after(plan.load(now, "ur5", "10", "c"), "load")
-    now = now.after(plan.roll_back(now, "ur5", "production"), "rollback")
+    now = now.after(plan_changes.load(now, "ur5", "10", "c"), "load")
+    now = now.after(plan_changes.roll_back(now, "ur5", "production"), "rollback")
     assert now.policies["ur5"].default == "2" and now.policies["ur5"].versions == {"2": "b", "10": "c"}
 
 
@@ -164,18 +165,18 @@ def test_what_is_in_use_is_not_unloaded() -> None:
     ur5 = {"aliases": {"production": "1", "candidate": "2"}, "canary": canary, "shadow": "10"}
     now = made(planned({"policies": {"ur5": ur5}}))
     with pytest.raises(ConflictError, match="alias 'candidate' and the canary"):
-        plan.unload(now, "ur5", "2")
+        plan_changes.unload(now, "ur5", "2")
     with pytest.raises(ConflictError, match="in use by the shadow"):
-        plan.unload(now, "ur5", "10")
+        plan_changes.unload(now, "ur5", "10")
     with pytest.raises(ConflictError, match="in use by the canary: end that first"):
-        plan.set_alias(now, "ur5", "candidate", None)
+        plan_changes.set_alias(now, "ur5", "candidate", None)
     with pytest.raises(ConflictError, match="the last of policy 'mir'"):
-        plan.unload(now, "mir", "1")
+        plan_changes.unload(now, "mir", "1")
     with pytest.raises(ConflictError, match="no alias 'old': it has production, candidate"):
-        plan.set_alias(now, "ur5", "old", None)
-    assert {name for name, policy in plan.unload(now, "mir", None).items() if policy.versions} == {"ur5"}
+        plan_changes.set_alias(now, "ur5", "old", None)
+    assert {name for name, policy in plan_changes.unload(now, "mir", None).items() if policy.versions} == {"ur5"}
     with pytest.raises(UnknownVersionError, match="no version '3'"):
-        plan.set_canary(now, "ur5", Canary(version="3", share=0.5))
+        plan_changes.set_canary(now, "ur5", Canary(version="3", share=0.5))
 
 
 def test_a_configuration_is_known_again_whatever_the_order_of_its_keys() -> None:

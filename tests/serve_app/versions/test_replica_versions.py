@@ -20,10 +20,10 @@ from rlservo.export.contract.errors import (
     UnavailableError,
 )
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.versions import plan
-from rlservo.serve_app.versions.loaded_policies import Library
+from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
 from rlservo.serve_app.versions.plan import Canary
-from rlservo.serve_app.versions.replica_versions import Change, Control, Following
+from rlservo.serve_app.versions.replica_versions import Change, ReplicaProgress, ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 
 OBS = np.zeros(27, np.float32) + 0.1
@@ -38,7 +38,7 @@ class Shelf:
     def newest(self) -> int:
         return max(self.plans, default=0)
 
-    def read(self, generation: int) -> bytes | None:
+    def fetch(self, generation: int) -> bytes | None:
         return self.plans.get(generation)
 
     def append(self, generation: int, content: bytes) -> bool:
@@ -53,11 +53,11 @@ class Fleet:
         self.current: Any = None
         self.controls = [self.start(folder, f"r{n}") for n, folder in enumerate(folders)]
 
-    def start(self, folder: Path, name: str) -> Control:
-        library = Library(Repository([folder]))
-        return Control(library, self.shelf, replica=name, broadcast=self.tell, is_current=self.is_current)
+    def start(self, folder: Path, name: str) -> ReplicaVersions:
+        library = LoadedPolicies(Repository([folder]))
+        return ReplicaVersions(library, self.shelf, replica=name, broadcast=self.tell, is_current=self.is_current)
 
-    async def tell(self, generation: int) -> Sequence[Following]:
+    async def tell(self, generation: int) -> Sequence[ReplicaProgress]:
         return [await control.follow(generation) for control in self.controls]
 
     async def is_current(self, document: Any) -> bool:
@@ -80,7 +80,7 @@ def config(*versions: str, production: str, **more: Any) -> dict[str, Any]:
 
 
 def aliasing(version: str) -> Change:
-    return lambda before: plan.set_alias(before, "ur5", "production", version)
+    return lambda before: plan_changes.set_alias(before, "ur5", "production", version)
 
 
 @pytest.fixture
@@ -113,13 +113,12 @@ def test_changes_at_the_same_time_all_happen_one_after_the_other(folder: Path) -
         fleet = Fleet(folder, folder, folder)
         await fleet.deploy(config("1", "2", production="1"))
         changes = [
-            control.change(lambda p, n=n: plan.set_alias(p, "ur5", f"alias{n}", "2"), what=f"alias{n}")  # type: ignore[misc]
+            control.change(lambda p, n=n: plan_changes.set_alias(p, "ur5", f"alias{n}", "2"), what=f"alias{n}")  # type: ignore[misc]
             for n, control in enumerate(fleet.controls * 3)
         ]
         await asyncio.gather(*changes)
         for control in fleet.controls:
-            arranged = control.arranged("ur5")
-            assert arranged is not None and len(arranged.aliases) == 1 + 9
+            assert control.store is not None and len(control.store.plans["ur5"].aliases) == 1 + 9
         assert fleet.shelf.newest() == 10
 
     asyncio.run(run())
@@ -140,7 +139,7 @@ def test_a_version_that_fails_is_refused_and_every_replica_says_why(folder: Path
             assert (states["1"].state, states["2"].state) == ("ready", "failed")
             assert "is not the file" in states["2"].reason and states["1"].loaded_at is not None
         assert fleet.defaults() == ["1", "1"]
-        await fleet.controls[1].change(lambda p: plan.set_shadow(p, "ur5", None), what="shadow off")
+        await fleet.controls[1].change(lambda p: plan_changes.set_shadow(p, "ur5", None), what="shadow off")
         assert (
             fleet.controls[0].plan is not None and fleet.controls[0].plan.refused is None
         )  # the last change went well
@@ -226,7 +225,7 @@ def test_a_replica_that_cannot_follow_keeps_what_it_had_and_the_command_names_it
         with pytest.raises(PartlyAppliedError, match="r1"):
             await fleet.controls[0].change(aliasing("2"), what="alias")
         assert fleet.defaults() == ["2", "1"]
-        assert fleet.controls[1].following().behind and fleet.controls[1].states()["ur5"]["2"].state == "failed"
+        assert fleet.controls[1].progress().behind and fleet.controls[1].states()["ur5"]["2"].state == "failed"
         shutil.copytree(folder / "ur5" / "2", elsewhere / "ur5" / "2")
         assert (await fleet.controls[1].follow()).behind == ()
         assert fleet.defaults() == ["2", "2"]
@@ -277,9 +276,11 @@ def test_canary_and_shadow_have_to_read_and_give_the_same(
         await fleet.deploy(config("1", "12", production="1"))
         control = fleet.controls[0]
         with pytest.raises(RefusedError, match=r"version 12 cannot be the canary of version 1"):
-            await control.change(lambda p: plan.set_canary(p, "ur5", Canary(version="12", share=0.5)), what="canary")
+            await control.change(
+                lambda p: plan_changes.set_canary(p, "ur5", Canary(version="12", share=0.5)), what="canary"
+            )
         with pytest.raises(RefusedError, match=r"version 12 cannot be the shadow of version 1"):
-            await control.change(lambda p: plan.set_shadow(p, "ur5", "12"), what="shadow")
+            await control.change(lambda p: plan_changes.set_shadow(p, "ur5", "12"), what="shadow")
 
     asyncio.run(run())
 
@@ -294,7 +295,7 @@ def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folde
         return Policy.load(bundle)
 
     async def run() -> None:
-        control = Control(Library(Repository([folder]), slowly), Shelf(), replica="slow")
+        control = ReplicaVersions(LoadedPolicies(Repository([folder]), slowly), Shelf(), replica="slow")
         await control.configure(config("1", production="1"))
         change = asyncio.create_task(control.load("ur5", "2", what="load"))
         while not began.is_set():
@@ -309,14 +310,14 @@ def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folde
 
 
 def test_a_replica_that_nobody_told_sees_the_ledger_by_itself(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.WATCH_PERIOD_S", 0.02)
+    monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.LEDGER_POLL_S", 0.02)
 
     async def run() -> None:
         fleet = Fleet(folder)
         await fleet.deploy(config("1", "2", production="1"))
         deaf = fleet.start(folder, "deaf")
         await deaf.configure(fleet.current)
-        watching = asyncio.create_task(deaf.watch())
+        watching = asyncio.create_task(deaf.poll_ledger())
         await fleet.controls[0].change(aliasing("2"), what="alias")
         for _ in range(200):
             if deaf.store is not None and deaf.store.default("ur5") == "2":
@@ -349,7 +350,7 @@ def test_a_change_that_contradicts_writes_nothing(folder: Path) -> None:
         fleet = Fleet(folder)
         await fleet.deploy(config("1", production="1"))
         with pytest.raises(ConflictError):
-            await fleet.controls[0].change(lambda p: plan.unload(p, "ur5", "1"), what="unload")
+            await fleet.controls[0].change(lambda p: plan_changes.unload(p, "ur5", "1"), what="unload")
         assert fleet.shelf.newest() == 1
 
     asyncio.run(run())

@@ -8,36 +8,40 @@ import time
 import pytest
 
 from rlservo.export.contract.errors import LateError
-from rlservo.serve_app.ray_serve.haproxy_wrapper import clock
-from rlservo.serve_app.server.admission import Admission
-from rlservo.serve_app.server.request_age import SETTLE_S, STAMP_HEADER, Age
+from rlservo.serve_app.ray_serve.haproxy.configuration import clock
+from rlservo.serve_app.server.loop_clock import SETTLE_S
+from rlservo.serve_app.server.request_path import Admission
 
 
-def stamp(ago_s: float, whose: str | None = None) -> list[tuple[bytes, bytes]]:
-    return [(STAMP_HEADER, f"{(time.time() - ago_s) * 1e3:.0f}-{whose or clock()}".encode())]
+def stamp(ago_s: float, whose: str | None = None) -> bytes:
+    return f"{(time.time() - ago_s) * 1e3:.0f}-{whose or clock()}".encode()
+
+
+def admission_of(max_queue_ms: float) -> Admission:
+    return Admission(max_queued=8, max_queue_ms=max_queue_ms, max_incoming=8, max_streams=8)
 
 
 def test_a_stamp_of_this_machines_clock_tells_how_long_a_request_waited() -> None:
-    age = Age(1.0)
-    assert age.waited(stamp(2.0)) == pytest.approx(2.0, abs=0.2)
-    assert age.waited(stamp(-5.0)) == 0.0
+    admission = admission_of(1000.0)
+    assert admission.waited(stamp(2.0)) == pytest.approx(2.0, abs=0.2)
+    assert admission.waited(stamp(-5.0)) == 0.0
     with pytest.raises(LateError, match=r"waited 2\.\d s on its way here, longer than 1000 ms"):
-        age.check(age.waited(stamp(2.0)))
-    age.check(age.waited(stamp(0.5)))
+        admission.check_age(admission.waited(stamp(2.0)))
+    admission.check_age(admission.waited(stamp(0.5)))
 
 
 @pytest.mark.parametrize("value", [b"", b"-", b"x-y", b"1e3-" + clock().encode(), b"9" * 400 + b"-" + clock().encode()])
 def test_a_stamp_of_another_clock_or_of_nobodys_says_nothing(value: bytes) -> None:
-    age = Age(1.0)
-    assert age.waited([(STAMP_HEADER, value)]) is None
-    assert age.waited(stamp(9.0, "another-machine")) is None
-    assert age.waited([]) is None
+    admission = admission_of(1000.0)
+    assert admission.waited(value) is None
+    assert admission.waited(stamp(9.0, "another-machine")) is None
+    assert admission.waited(None) is None
 
 
 def test_what_is_read_after_a_loop_stood_still_is_refused_and_what_comes_later_is_not() -> None:
     async def run() -> None:
-        admission = Admission(max_queued=8, max_queue_ms=300.0, max_incoming=8, max_streams=8)
-        admission.age.watch()
+        admission = admission_of(300.0)
+        admission.loop_clock.start()
         await asyncio.sleep(0.1)
         admission.enter()
         time.sleep(0.5)
@@ -63,11 +67,11 @@ def test_what_is_read_after_a_loop_stood_still_is_refused_and_what_comes_later_i
 
 def test_a_loop_that_turns_refuses_nobody() -> None:
     async def run() -> None:
-        age = Age(5.0)
-        age.check()  # nor one that nobody watches
-        age.watch()
+        admission = admission_of(5000.0)
+        admission.check_age(None)  # nor one whose clock does not run
+        admission.loop_clock.start()
         for _ in range(10):
             await asyncio.sleep(0.03)
-            age.check()
+            admission.check_age(None)
 
     asyncio.run(run())

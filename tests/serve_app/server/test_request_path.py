@@ -22,9 +22,9 @@ from rlservo.export.contract.errors import OverloadedError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve.environment import ray_environment
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.admission import Admission
+from rlservo.serve_app.server.request_path import Admission
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -35,7 +35,7 @@ Serve = Callable[..., AbstractContextManager[int]]
 
 @pytest.fixture(scope="module")
 def serve(policies: Path, served: Callable[[Any], AbstractContextManager[int]]) -> Serve:
-    store = PolicyStore.load([policies])
+    store = load_store(policies)
     return lambda **settings: served(create_app(lambda: store, ServerSettings(**settings)))
 
 
@@ -179,7 +179,7 @@ def test_a_wait_in_the_queue_counts_from_the_beginning_of_the_burst() -> None:
 
 
 def test_the_proxy_says_in_json_that_no_replica_is_there(tmp_path: Path) -> None:
-    """What else is mended in its configuration, and in Ray's own: test_haproxy_wrapper.py."""
+    """What else is changed in its configuration, and in Ray's own: test_haproxy_wrapper.py."""
     ray_environment(tmp_path, haproxy="/bin/true", mark="test")
     answer_file = tmp_path / "503.http"
     head, _, body = answer_file.read_bytes().partition(b"\r\n\r\n")

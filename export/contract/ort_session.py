@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import onnxruntime
 
 
-def open_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSession:
+def open_ort_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSession:
     """Return a session on the CPU with so many threads; one is fastest for networks of a policy's size.
 
     The file is not needed afterwards. A graph can make onnxruntime read further files from the file's folder: one of
@@ -32,6 +32,6 @@ def open_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSession:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     # From the path: from bytes onnxruntime 1.31 parses with the interpreter's lock held (0.3 s for 200 MB, in which
     # nobody acts), keeps them for ever, and takes twice the memory.
-    session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    session.disable_fallback()  # it would open the file again
-    return session
+    ort_session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    ort_session.disable_fallback()  # it would open the file again
+    return ort_session

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ActionError
 from rlservo.export.contract.spaces import LeafSpec, iter_elements
+from rlservo.serve_app.runtime.rounding import rounding_slack
 
-OVERSHOOT = 1e-5  # relative to the bound: what float32 rounding in unsquash may leave outside the space; clipped
 SMALL_ACTION = 32  # elements up to which a Python loop checks bounds faster than numpy does
 
 
-class ActionGuard:
+class ActionCheck:
     """Checks the actions of one leaf, `action` or `action.<path>`."""
 
     def __init__(self, policy: str, name: str, space: LeafSpec) -> None:
@@ -45,7 +45,7 @@ class ActionGuard:
         self._clip_or_refuse(action)
 
     def _clip_or_refuse(self, action: NDArray[Any]) -> None:
-        slack = OVERSHOOT * np.maximum(1.0, np.minimum(np.abs(self._low), np.abs(self._high)))
+        slack = rounding_slack(self._low, self._high)  # what unsquash may leave outside the space is clipped
         bad = ~((action >= self._low - slack) & (action <= self._high + slack))
         if bad.any():
             index = tuple(int(i) for i in np.argwhere(bad)[0])

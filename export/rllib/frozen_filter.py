@@ -1,0 +1,20 @@
+"""Statistics of RLlib's running MeanStdFilter, which both API stacks' connectors hold, as the recipe's frozen one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rlservo.export.contract.errors import CheckpointError
+from rlservo.export.recipe.recipe import ObservationFilter
+
+
+def frozen_filter(running: Any) -> ObservationFilter:
+    """Return what a `ray.rllib.utils.filter.MeanStdFilter` does as it stands. Raises CheckpointError if it diverged."""
+    stats = running.running_stats
+    mean, std = np.asarray(stats.mean, np.float64), np.asarray(stats.std, np.float32)
+    if not (np.isfinite(mean).all() and np.isfinite(std).all()):
+        raise CheckpointError("the observation filter's mean or standard deviation is not finite: training diverged")
+    clip = float(running.clip) if running.clip else None  # RLlib tests for truth: 0 means no clipping, too
+    return ObservationFilter(int(stats.n), mean, std, clip, bool(running.demean), bool(running.destd))

@@ -1,0 +1,37 @@
+"""Observation and action spaces that are exported; others are refused by the name of the leaf."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
+
+from rlservo.export.contract.errors import UnsupportedError
+from rlservo.export.recipe.trees import space_leaves
+
+DTYPES = ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
+
+
+def check_spaces(observation_space: Any, action_space: Any, *, integer_actions: bool = False) -> None:
+    """Raise UnsupportedError unless every leaf of both spaces is of a kind that is exported.
+
+    `integer_actions` allows Boxes of integers as actions, for which only RLlib's old stack has a distribution.
+    """
+    for name, space in space_leaves(observation_space, "obs").items():
+        if not isinstance(space, Box | Discrete | MultiDiscrete | MultiBinary):
+            raise UnsupportedError(f"{name}: the observation space {space} is not exported: it has no fixed shape")
+        if isinstance(space, Box) and str(space.dtype) not in DTYPES:
+            raise UnsupportedError(
+                f"{name}: {space} is not exported: torch has no {space.dtype} tensors to compute with"
+            )
+    for name, space in space_leaves(action_space, "action").items():
+        if not isinstance(space, Box | Discrete | MultiDiscrete):
+            raise UnsupportedError(
+                f"{name}: the action space {space} is not exported: RLlib has no action distribution for it"
+            )
+        whole = integer_actions and np.dtype(space.dtype).kind in "iu"
+        if isinstance(space, Box) and space.dtype not in (np.float32, np.float64) and not whole:
+            raise UnsupportedError(f"{name}: the action space {space} is not exported: only float Boxes are")
+        if isinstance(space, MultiDiscrete) and space.nvec.ndim != 1:
+            raise UnsupportedError(f"{name}: the action space {space} is not exported: only one-dimensional ones are")

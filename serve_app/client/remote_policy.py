@@ -1,0 +1,177 @@
+"""What the HTTP and the WebSocket client of a policy have in common: contract, episode, arguments of a request."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import ValidationError
+
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import DeadlineError, UnavailableError, UsageError
+from rlservo.serve_app.client.episode_state import EpisodeState
+from rlservo.serve_app.client.observations import encode_observation
+from rlservo.serve_app.interface import ActingPolicy, Observation
+from rlservo.serve_app.recording.start import record_policy
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.recording.recorder import Recorder
+
+POLL_S = 0.1  # between two looks at a server that is starting
+LONGEST_TRY_S = 5.0  # of one such look
+
+
+class RemotePolicy(ActingPolicy):
+    """A policy on a server. A transport adds `_act`, `_close` and `_fetch_contract`."""
+
+    url: str
+
+    def __init__(
+        self,
+        policy: str | None,
+        *,
+        version: str | None,
+        timeout_s: float,
+        deadline_ms: float | None,
+        episode: EpisodeState,
+        record: str | Path | Recorder | None,
+    ) -> None:
+        """Check the arguments, then open the recording: a client that cannot be made leaves no file behind."""
+        if not timeout_s > 0:
+            raise UsageError(f"timeout_s must be above 0 seconds, got {timeout_s}")
+        if deadline_ms is not None and not deadline_ms > 0:
+            raise UsageError(f"deadline_ms must be above 0, got {deadline_ms}")
+        if policy == "":
+            raise UsageError("the policy's name is empty: give a name, or None where the server has only one policy")
+        if version is not None and policy is None:
+            raise UsageError(f"version {version!r} was given without the policy's name")
+        self._name = policy
+        self._version = version
+        self._timeout_s = timeout_s
+        self._deadline_ms = 1e3 * timeout_s if deadline_ms is None else deadline_ms
+        self._episode = episode
+        self._contract: Contract | None = None
+        self._numbers = itertools.count(1)  # next() is atomic: no two requests share a number
+        self.last_reply: dict[str, Any] = {}
+        """The server's reply to the last request that got an action."""
+        self._recording = None if record is None else record_policy(self, record, act=self._act)
+
+    @property
+    def contract(self) -> Contract:
+        """The policy's contract, fetched once.
+
+        Raises UnavailableError, DeadlineError, UnknownPolicyError, or UsageError when no policy was named and the
+        server has several.
+        """
+        if self._contract is None:
+            self._contract = self._fetch_contract(None)
+        return self._contract
+
+    def act(
+        self, obs: Observation, *, explore: bool = False, seed: int | None = None, reward: ArrayLike | None = None
+    ) -> Any:
+        """Return the action for `obs`, as `ActingPolicy.act` describes; `reward` as `Policy.act` does.
+
+        Raises ObservationError (non-finite numbers are refused here, the rest by the server), ActionError when the
+        answer is not an action of this policy, DeadlineError after `deadline_ms`, UnavailableError when the server
+        cannot be reached, is not ready, or answers another request than this one, and SessionLostError when it kept the
+        episode's state and has lost it.
+        """
+        act = self._act if self._recording is None else self._recording.act
+        return act(obs, explore=explore, seed=seed, reward=reward)
+
+    def outcome(
+        self,
+        reward: float | None = None,
+        *,
+        terminated: bool = False,
+        truncated: bool = False,
+        final_status: str | None = None,
+        final_obs: Observation | None = None,
+    ) -> None:
+        """Record what the last action brought (`WithRecording.outcome`). Nothing to do where nothing is recorded."""
+        if self._recording is not None:
+            self._recording.outcome(
+                reward, terminated=terminated, truncated=truncated, final_status=final_status, final_obs=final_obs
+            )
+
+    def set_last_action(self, action: Any) -> None:
+        """Take note of what the robot was commanded instead of an answer that did not come. Sends nothing.
+
+        The next request says so, and a limit on the step from one action to the next (`max_action_step`) counts from
+        there. `action` is as `act` returns it.
+        """
+        self._episode.set_last_action(action)
+        if self._recording is not None:
+            self._recording.record_command(action)
+
+    def reset(self) -> None:
+        """Start an episode: the next request says so. Sends nothing."""
+        self._episode.reset()
+        if self._recording is not None:
+            self._recording.begin()
+
+    def close(self) -> None:
+        """End the recording and close what is open to the server; later calls raise UsageError."""
+        if self._recording is not None:
+            self._recording.end()
+        self._close()
+
+    def wait_until_ready(self, timeout_s: float = 60.0) -> None:
+        """Return as soon as the server offers the policy.
+
+        Raises UnavailableError with the last reason after `timeout_s`, and at once what waiting cannot cure, such as
+        UnknownPolicyError.
+        """
+        deadline = time.monotonic() + timeout_s
+        while self._contract is None:
+            remaining = deadline - time.monotonic()
+            try:
+                self._contract = self._fetch_contract(max(min(remaining, LONGEST_TRY_S), 0.01))
+            except (UnavailableError, DeadlineError) as error:
+                if time.monotonic() + POLL_S >= deadline:
+                    raise UnavailableError(
+                        f"{self.url} was not ready within {timeout_s:g} s: {error.message}", error.details
+                    ) from error
+                time.sleep(POLL_S)
+
+    def _act(self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None = None) -> Any:
+        """Ask the server for the action, and keep its reply as `last_reply`."""
+        raise NotImplementedError
+
+    def _close(self) -> None:
+        raise NotImplementedError
+
+    def _fetch_contract(self, timeout_s: float | None) -> Contract:
+        """Ask the server for the contract: with a time-out once, else as often as the client asks anything."""
+        raise NotImplementedError
+
+    def _encode_request(
+        self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None
+    ) -> tuple[dict[str, Any], tuple[int, ...]]:
+        """Return (the arguments of `act` as a request has them, the batch axis as () or (B,))."""
+        encoded, batch = encode_observation(obs, self.contract)
+        request: dict[str, Any] = {"obs": encoded}
+        if explore:
+            request["explore"] = True
+        if seed is not None:
+            request["seed"] = seed
+        if reward is not None:
+            request["reward"] = np.asarray(reward)
+        return request, batch
+
+    def _parse_contract(self, document: Any) -> Contract:
+        """Return the contract that the server sent; raise UnavailableError where it cannot be one."""
+        try:
+            return Contract.model_validate(document)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(str(part) for part in first["loc"]) or "the document"
+            raise UnavailableError(
+                f"{self.url} sent a contract that this client cannot read: {where}: {first['msg']} "
+                "(is the server another version of rlservo?)"
+            ) from error

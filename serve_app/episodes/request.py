@@ -1,0 +1,68 @@
+"""Request for an action: one object that every protocol fills, and what it says of its episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rlservo.serve_app.episodes.sessions import Session, SessionId
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """What a request says of the episode it belongs to."""
+
+    state: Mapping[str, Any] | None = None
+    """The recurrent state that the client carries (see `carried_state.py`); empty at an episode's start. None: it
+    carries none."""
+
+    session_id: SessionId | None = None
+    reset: bool = False  # begin the session, or the stream's episode
+    end: bool = False  # forget the session after this request
+    reward: Any = None
+    last_action: Any = None  # what the robot was last commanded, where a limit is set on the step from it
+
+
+@dataclass(slots=True)
+class Request:
+    """A request for an action, or for a batch of them.
+
+    A transport (HTTP, WebSocket, gRPC) makes it from the address and the headers, before it reads the content; the
+    protocol's codec fills in the rest from the content.
+    """
+
+    protocol: str
+    """As metrics and log name it."""
+    policy: str
+    version: str | None
+    """A version or an alias; None is the default version."""
+    received: float
+    """When its first byte was here, by `time.perf_counter`."""
+
+    label: str | None = None
+    """Whose request it is, in the client's words: where a canary runs, all of a label get the same version."""
+    request_id: str | None = None
+    headers: Mapping[bytes, bytes] = field(default_factory=dict)
+    """Of an HTTP message."""
+    waited: float | None = None
+    """[s] How long it had waited before it was received; None where nobody knows."""
+    stream: Session | None = None
+    """The episode of the stream that it came on."""
+    on_websocket: bool = False
+    """Whether it is one of many that share a request id, told apart by `seq`."""
+
+    obs: Any = None
+    explore: bool = False
+    seed: int | None = None
+    seq: int | None = None
+    """The client's number, echoed in the reply."""
+    deadline_ms: float | None = None
+    """[ms] After `received`; what cannot be answered by then is not computed."""
+    timestamp: float | None = None
+    """[s] The client's clock, echoed in the reply."""
+    episode: Episode | None = None
+    non_finite: bool = False
+    """Whether its JSON held NaN or Infinity, which JSON does not have."""
+    reply_options: Any = None
+    """How the reply is to be written: the codec's own affair, from its `parse` to its `encode`."""

@@ -1,0 +1,101 @@
+"""MessagePack as openpi's policy server speaks it: frame to `Request`, decision to a frame.
+
+A request is `{"obs": ...}` with the JSON protocol's options, or the observation map itself, from element name to value.
+`actions` in the reply is a chunk of one action, `(1, ...)`, as openpi's clients expect; a batch of observations gets
+one chunk each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from starlette.types import Message
+
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import RequestError, TooLargeError
+from rlservo.export.contract.spaces import DictSpec
+from rlservo.serve_app.episodes.request import Episode, Request
+from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.reply import reply_fields
+from rlservo.serve_app.server.request_fields import REQUEST_FIELDS, parse_episode, parse_options
+from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+
+
+class MsgpackCodec:
+    """The stream's bytes (`Codec`)."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._max_bytes = core.settings.max_body_bytes
+
+    async def receive(self, request: Request, source: Message) -> Mapping[Any, Any]:
+        """Return the map in a frame; its `seq` is known from then on, for an error's frame. Raises RequestError."""
+        content = source.get("bytes")
+        if content is None:
+            raise RequestError("the message is a text frame: send msgpack in a binary one")
+        if len(content) > self._max_bytes:
+            raise TooLargeError(f"the message is larger than {self._max_bytes} bytes", {"max_bytes": self._max_bytes})
+        document = unpack(content)
+        if type(document) is not dict:
+            raise RequestError(f"the message must be a map such as {{'obs': ...}}, got {type(document).__name__}")
+        if "obs" in document and type(document.get("seq")) is int:
+            request.seq = document["seq"]
+        return document
+
+    def parse(self, request: Request, content: Mapping[Any, Any]) -> None:
+        """Fill the request. Raises RequestError."""
+        if "obs" not in content:  # element names and values
+            request.obs = content
+            if type(content.get("reset")) is bool and not self._names(request, "reset"):
+                request.obs = {name: value for name, value in content.items() if name != "reset"}
+                request.episode = Episode(reset=content["reset"])
+        else:
+            request.obs = content["obs"]
+            if len(content) > 1:
+                unknown = sorted(str(key)[:64] for key in content.keys() - REQUEST_FIELDS)
+                if unknown:
+                    raise RequestError(f"unknown field '{unknown[0]}': known are {', '.join(sorted(REQUEST_FIELDS))}")
+                parse_options(request, content)
+                request.episode = parse_episode(content)
+        episode = request.episode
+        if episode is not None and episode.reset and episode.session_id is None and request.stream is None:
+            request.episode = replace(episode, reset=False)  # nothing is remembered here
+
+    def encode(self, request: Request, decision: Decision) -> bytes:
+        """Return the reply's frame; `reply_options` are further timings."""
+        fields = reply_fields(request, decision)
+        fields["actions"] = _chunks(decision.action, batch=decision.batch is not None)
+        fields["server_timing"] = {"infer_ms": fields.pop("infer_ms"), **(request.reply_options or {})}
+        return pack(fields)
+
+    def _names(self, request: Request, name: str) -> bool:
+        """Whether an observation of the request's policy has a part or an element of that name."""
+        stream = request.stream
+        policy = self._core.store().get(request.policy, request.version) if stream is None else stream.policy
+        space = policy.contract.observation_space
+        return name in (space.spaces if isinstance(space, DictSpec) else {element.name for element in space.elements})
+
+
+def encode_metadata(contract: Contract) -> bytes:
+    """Return the frame that a client gets on connecting: who decides, and the whole contract."""
+    return pack(
+        {
+            "server": "rlservo",
+            "policy": contract.name,
+            "version": contract.version,
+            "control_rate_hz": contract.control_rate_hz,
+            "contract": contract.model_dump(mode="json"),
+        }
+    )
+
+
+def _chunks(action: Any, *, batch: bool) -> Any:
+    """Return the action as chunks of one; each leaf of a nested one is a chunk."""
+    if isinstance(action, dict):
+        return {key: _chunks(part, batch=batch) for key, part in action.items()}
+    if isinstance(action, tuple):
+        return [_chunks(part, batch=batch) for part in action]
+    return action[:, None, ...] if batch else action[None, ...]

@@ -1,0 +1,109 @@
+"""One episode of a policy in a Gymnasium environment: the loop of `rollout` and of `rlservo verify`.
+
+```python
+for index in range(20):
+    episode = run_episode(env, policy, index=index, seed=index)  # episode.episode_return, .success, .steps
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from rlservo.export.contract.contract import REWARD, Contract
+from rlservo.export.contract.errors import RlservoError, UsageError
+
+
+class EpisodeEnv(Protocol):
+    """The part of `gymnasium.Env` that an episode needs."""
+
+    def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]: ...
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]: ...
+
+
+class EpisodePolicy(Protocol):
+    """The part of `ActingPolicy` that an episode needs; one whose contract has a reward input also takes `reward`."""
+
+    @property
+    def contract(self) -> Contract: ...
+
+    def act(self, obs: Any, *, explore: bool = False, seed: int | None = None) -> Any: ...
+
+    def reset(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One finished episode."""
+
+    index: int
+    seed: int | None
+    steps: int
+    episode_return: float
+    success: bool | None  # None: the environment does not say
+    final_status: str | None
+
+
+def run_episode(
+    env: EpisodeEnv, policy: EpisodePolicy, *, index: int, seed: int | None, explore: bool = False
+) -> Episode:
+    """Run one episode: reset both, then observe, act and step until the environment ends it.
+
+    The environment is reset with `seed`; with `explore` the draws of the actions follow from it as well. `index` only
+    names the episode, in the result and in errors.
+
+    Raises UsageError when the environment fails, and whatever `policy.act` raises with the episode and step in front.
+    """
+    has_reward = any(tensor.name == REWARD for tensor in policy.contract.inputs)
+    draws = np.random.default_rng(seed)  # one seed per exploring action; unused otherwise
+    policy.reset()
+    obs, _ = _call(env.reset, index, 0, seed=seed)
+    steps, total, reward, is_over = 0, 0.0, 0.0, False
+    info: Mapping[str, Any] = {}
+    while not is_over:
+        action_seed = int(draws.integers(2**31)) if explore else None
+        reward_input = {REWARD: reward} if has_reward else {}
+        try:
+            action = policy.act(obs, explore=explore, seed=action_seed, **reward_input)
+        except RlservoError as error:
+            error.prefix(f"episode {index}, step {steps}")
+            raise
+        obs, gain, terminated, truncated, info = _call(env.step, index, steps, _command(action))
+        reward, is_over, steps = float(gain), terminated or truncated, steps + 1
+        total += reward
+    status = info.get("final_status")
+    return Episode(index, seed, steps, total, success_of(info), None if status is None else str(status))
+
+
+def success_of(info: Mapping[str, Any]) -> bool | None:
+    """Return what an episode's last `info` says of success: `is_success`, else `final_status`, else None."""
+    if info.get("is_success") is not None:
+        return bool(info["is_success"])
+    status = info.get("final_status")
+    return None if status is None else status == "success"
+
+
+def _call(method: Callable[..., Any], index: int, step: int, *arguments: Any, **options: Any) -> Any:
+    try:
+        return method(*arguments, **options)
+    except UsageError as error:
+        error.prefix(f"episode {index}, step {step}")
+        raise
+    except Exception as error:  # an environment is anyone's code
+        raise UsageError(
+            f"episode {index}, step {step}: the environment failed with {type(error).__name__}: {error}"
+        ) from error
+
+
+def _command(action: Any) -> Any:
+    """Return the action with plain numbers for choices, which is what most environments take; also in nested parts."""
+    if isinstance(action, dict):
+        return {key: _command(part) for key, part in action.items()}
+    if isinstance(action, tuple):
+        return tuple(_command(part) for part in action)
+    return int(action) if action.ndim == 0 and action.dtype.kind in "iu" else action

@@ -1,0 +1,333 @@
+"""Path of every request, whatever its protocol: received, admitted, parsed, decided, encoded; counted, logged, timed.
+
+A protocol is a `Codec` and a transport. The transport (`http_endpoint.py`, `websocket_stream.py`, `oip_grpc.py`) makes
+a `Request` and calls `RequestPath.answer`, which calls the codec; what it raises the transport encodes as an error.
+
+A decision runs in the event loop from its first line to its last (or pauses for the rest of its turn:
+`micro_batching.py`). So requests do not wait for each other in a queue of ours: they wait as tasks that the loop has
+made and not yet run. All that arrived while the loop was busy run in one turn of it, a *burst*. Its length is the
+queue, its beginning when each of them had arrived at the latest. That is known for the price of one callback per burst.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol, TypeVar
+
+from rlservo.export.contract.errors import (
+    DeadlineError,
+    InternalError,
+    LateError,
+    ObservationError,
+    OverloadedError,
+    RequestError,
+    RlservoError,
+    TooLargeError,
+    UnavailableError,
+)
+from rlservo.serve_app.episodes.episodes import Episodes
+from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.server.batch_limit import count_rows, most_rows
+from rlservo.serve_app.server.loop_clock import LoopClock, clock_id
+from rlservo.serve_app.server.request_log import FIELDS, RequestLog
+from rlservo.serve_app.server.request_metrics import Metrics
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
+from rlservo.serve_app.versions.shadow import Shadows
+
+logger = logging.getLogger(__name__)
+
+HURRY_S = 0.05  # [s] for a body when too many are half sent
+LEAST_WAIT_S = 0.01  # that counts against a deadline: stamps are milliseconds, and so is the way from the proxy
+BUG = "the server failed on this request; its log says how"
+
+StoreProvider = Callable[[], PolicyStore | None]
+Source = TypeVar("Source", contravariant=True)
+Reply = TypeVar("Reply", covariant=True)
+
+
+class ClientGoneError(Exception):
+    """The client hung up before its request was here: there is nobody to answer, and nothing to count."""
+
+
+class Codec(Protocol[Source, Reply]):
+    """Bytes of one protocol: from what a transport reads from, and to what it writes."""
+
+    async def receive(self, request: Request, source: Source) -> Any:
+        """Return the content, read within its limits. Raises RlservoError, and ClientGoneError."""
+        ...
+
+    def parse(self, request: Request, content: Any) -> None:
+        """Fill the request from its content. Raises RlservoError."""
+        ...
+
+    def encode(self, request: Request, decision: Decision) -> Reply:
+        """Return the reply."""
+        ...
+
+
+class Admission:
+    """Refuses what came too late, or what is too much for one event loop."""
+
+    def __init__(self, *, max_queued: int, max_queue_ms: float, max_incoming: int, max_streams: int) -> None:
+        """Set the limits: of a burst, of the wait before and in it, of bodies half sent, of streams."""
+        self._max_queued = max_queued
+        self.max_wait_s = max_queue_ms / 1e3
+        self._max_incoming = max_incoming
+        self._max_streams = max_streams
+        self.loop_clock = LoopClock(self.max_wait_s)
+        self._clock_id = clock_id().encode()
+        self._burst = 0
+        self._burst_began = 0.0
+        self.incoming = 0
+        self.streams = 0
+        self.longest = 0  # the longest burst so far
+        self.turned_away = 0  # before anything was read of them
+
+    def admit_unread(self) -> bool:
+        """Return whether one more request may be read; if not, count it as turned away."""
+        if self._burst < self._max_queued:
+            return True
+        self.turned_away += 1
+        return False
+
+    def waited(self, stamp: bytes | None) -> float | None:
+        """Return how long [s] ago HAProxy had a request with this stamp, if it has one, and by our clock."""
+        if stamp is None:
+            return None
+        since, _, whose = stamp.partition(b"-")
+        if whose != self._clock_id or not since.isdigit() or len(since) > 15:
+            return None
+        return max(0.0, time.time() - int(since) / 1e3)
+
+    def check_age(self, waited: float | None) -> None:
+        """Raise LateError for a request that had `waited` too long; or, where that is unknown, may have."""
+        limit_s = self.max_wait_s
+        if waited is not None:
+            if waited > limit_s:
+                raise LateError(
+                    f"the observation waited {waited:.1f} s on its way here, longer than {limit_s * 1e3:g} ms: "
+                    "send a newer one"
+                )
+            return
+        now = time.perf_counter()
+        if now < self.loop_clock.unknown_until or now - self.loop_clock.next_tick > limit_s:
+            raise LateError(
+                f"this replica stood still for longer than {limit_s * 1e3:g} ms, and the observation may be as old: "
+                "send a newer one"
+            )
+
+    def enter(self, waited: float | None = None) -> float:
+        """Return when this request had arrived at the latest (`time.perf_counter`).
+
+        `waited` is how long it did before, where that is known. Raises OverloadedError or LateError.
+        """
+        self.check_age(waited)
+        now = time.perf_counter()
+        if self._burst == 0:
+            self._burst_began = now
+            asyncio.get_running_loop().call_soon(self._end_burst)
+        self._burst += 1
+        if self._burst > self._max_queued:
+            raise OverloadedError(f"more than {self._max_queued} requests are waiting in this replica: try again")
+        if now - self._burst_began > self.max_wait_s:
+            raise OverloadedError(
+                f"requests wait longer than {self.max_wait_s * 1e3:g} ms in this replica: try again shortly"
+            )
+        return self._burst_began
+
+    def _end_burst(self) -> None:
+        self.longest = max(self.longest, self._burst)
+        self._burst = 0
+
+    def begin_body(self, timeout_s: float) -> float:
+        """Count a body that may still be on its way; return the seconds it has: few, where too many are."""
+        self.incoming += 1
+        return min(timeout_s, HURRY_S) if self.incoming > self._max_incoming else timeout_s
+
+    def end_body(self) -> None:
+        """Count it no longer."""
+        self.incoming -= 1
+
+    def late_body(self, timeout_s: float, given_s: float) -> RlservoError:
+        """Return the error of a body that did not come in the time it was given, of the time it is usually given."""
+        if given_s < timeout_s:
+            return OverloadedError(
+                f"{self._max_incoming} requests are still being sent to this replica: try again shortly"
+            )
+        return DeadlineError(f"the request body did not arrive within {timeout_s:g} s")
+
+    def open_stream(self) -> None:
+        """Count an open stream. Raises OverloadedError."""
+        if self.streams >= self._max_streams:
+            raise OverloadedError(f"{self.streams} streams are open in this replica: close one, or try again shortly")
+        self.streams += 1
+
+    def close_stream(self) -> None:
+        """Count it no longer."""
+        self.streams -= 1
+
+
+class RequestPath:
+    """Answers requests, and is the one place that admits, counts, logs and times them."""
+
+    def __init__(
+        self,
+        store_provider: StoreProvider,
+        settings: ServerSettings,
+        *,
+        admission: Admission,
+        episodes: Episodes,
+        metrics: Metrics,
+        log: RequestLog,
+        shadows: Shadows,
+    ) -> None:
+        self._store_provider = store_provider
+        self._max_batch = settings.max_batch
+        self._admission = admission
+        self._episodes = episodes
+        self._metrics = metrics
+        self._log = log
+        self._shadows = shadows
+
+    def store(self) -> PolicyStore:
+        """Return the policies. Raises UnavailableError while they are being loaded."""
+        store = self._store_provider()
+        if store is None:
+            raise UnavailableError("the policies are still being loaded: try again shortly")
+        return store
+
+    async def answer(self, codec: Codec[Source, Reply], request: Request, source: Source) -> Reply:
+        """Return the reply. What the codec reads it reads from `source`.
+
+        Raises RlservoError, which has been counted and logged, and ClientGoneError.
+        """
+        try:
+            content = await codec.receive(request, source)
+            self._admit(request)
+            self.store()  # not ready comes before any fault of the request
+            codec.parse(request, content)
+            if request.non_finite:
+                decision = await self._decide_non_finite(request)
+            else:
+                decision = await self.decide(request)
+            reply = codec.encode(request, decision)
+        except ClientGoneError:
+            raise
+        except RlservoError as error:
+            self.record_failure(request, error.code, error.message)
+            raise
+        except Exception as error:
+            self.record_bug(request)
+            raise InternalError(BUG) from error
+        taken = time.perf_counter() - request.received
+        self._metrics.record_answer(request.protocol, decision, taken)
+        if self._log.every:
+            self._log.write_answer(request, decision, taken)
+        return reply
+
+    async def decide(self, request: Request) -> Decision:
+        """Decide, unless its deadline has passed.
+
+        Raises DeadlineError, LateError, TooLargeError, UnavailableError and what `PolicyStore.act` and `Episodes.act`
+        raise.
+        """
+        store, name, obs = self.store(), request.policy, request.obs
+        if request.deadline_ms is not None:
+            _check_deadline(request)
+        single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
+        if (len(obs) if single else most_rows(obs)) > self._max_batch:
+            self._check_batch(store, request)
+        if request.episode is not None or request.stream is not None:
+            decision = self._episodes.act(store, request)
+        elif store.batches and not request.explore:
+            check = partial(_check_again, request, time.perf_counter(), self._admission.max_wait_s)
+            decision = await store.act_together(name, request.version, obs, label=request.label, check=check)
+        else:
+            decision = store.act(
+                name, request.version, obs, explore=request.explore, seed=request.seed, label=request.label
+            )
+        shadow = store.shadow(name)
+        if shadow is not None and decision.version == shadow.of and not request.explore:
+            self._shadows.offer(shadow, obs, decision)
+        return decision
+
+    def record_failure(self, request: Request, code: str, sentence: str) -> None:
+        """Count and log a request that got no action; names that are not loaded are not told apart."""
+        name, version = request.policy, request.version
+        store = self._store_provider()
+        if store is None or name not in store.names:
+            name = version = ""
+        else:  # an alias is counted as the version it leads to, no version as the default
+            version = store.default(name) if version is None else store.version_of(name, version)
+        self._metrics.count_failure(request.protocol, name, version, code)
+        self._log.write_failure(request, code, sentence)
+
+    def record_bug(self, request: Request) -> None:
+        """Count a request that failed by the exception that is being handled, and log that with its traceback."""
+        logger.exception("a request failed", extra={FIELDS: {"request_id": request.request_id}})
+        self._metrics.count_failure(request.protocol, "", "", InternalError.code)  # what failed may be the policies
+
+    def record_refusal(self, protocol: str, error: RlservoError, request_id: str | None, *, peer: str | None) -> None:
+        """Count and log a request that was refused before it was routed, and the address it came from."""
+        self._metrics.count_failure(protocol, "", "", error.code)
+        self._log.write_unread(protocol, error.code, error.message, request_id=request_id, peer=peer)
+
+    def open_stream(self, request: Request) -> None:
+        """Count a stream that opens, from whose opening `request` is. Raises OverloadedError."""
+        try:
+            self._admission.open_stream()
+        except OverloadedError as error:
+            self.record_failure(request, error.code, error.message)
+            raise
+        self._metrics.count_stream(request.policy, 1)
+
+    def close_stream(self, request: Request) -> None:
+        """Count it no longer."""
+        self._admission.close_stream()
+        self._metrics.count_stream(request.policy, -1)
+
+    def _admit(self, request: Request) -> None:
+        """Raise OverloadedError or LateError; a wait before `received` begins to count."""
+        if request.on_websocket:  # request and reply alternate there, so that the streams' number is the bound
+            self._admission.check_age(request.waited)
+            return
+        # Only now, when the body is here: one that is slow to come waits for itself.
+        request.received = min(request.received, self._admission.enter(request.waited))
+        if request.waited is not None and request.waited > LEAST_WAIT_S:
+            request.received -= request.waited
+
+    async def _decide_non_finite(self, request: Request) -> Decision:
+        """Refuse what JSON does not have, by the sentence of the element where it is one of the observation's."""
+        if request.episode is None:  # else a session would move on
+            try:
+                await self.decide(request)
+            except ObservationError as error:
+                raise ObservationError(f"{error.message}; JSON has no NaN or Infinity", error.details) from error
+        raise RequestError("the request body holds NaN or Infinity, which JSON does not have: send finite numbers")
+
+    def _check_batch(self, store: PolicyStore, request: Request) -> None:
+        rows = count_rows(store.get(request.policy, request.version).contract.observation_space, request.obs)
+        if rows > self._max_batch:
+            raise TooLargeError(f"a batch of {rows} observations is too large: at most {self._max_batch}")
+
+
+def _check_again(request: Request, since: float, limit_s: float) -> None:
+    """Check an observation that was gathered for a batch, and waited for those before it."""
+    if time.perf_counter() - since > limit_s:
+        raise LateError(f"the observation waited longer than {limit_s * 1e3:g} ms for its batch: send a newer one")
+    if request.deadline_ms is not None:
+        _check_deadline(request)
+
+
+def _check_deadline(request: Request) -> None:
+    late_ms = (time.perf_counter() - request.received) * 1e3
+    if request.deadline_ms is not None and late_ms >= request.deadline_ms:
+        raise DeadlineError(
+            f"the deadline of {request.deadline_ms:g} ms passed before the policy was asked: nothing computed",
+            {"deadline_ms": request.deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": request.seq},
+        )

@@ -1,0 +1,70 @@
+"""Protobuf message classes built at run time from a short description: no generated code.
+
+Generated code is tied to the protobuf it was made with, and claims its names in the process-wide descriptor pool, where
+others register theirs (KServe's and Triton's packages, robo-gym's). These live in a pool of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+_Field = descriptor_pb2.FieldDescriptorProto
+_TYPES = {
+    "bool": _Field.TYPE_BOOL,
+    "int32": _Field.TYPE_INT32,
+    "int64": _Field.TYPE_INT64,
+    "uint32": _Field.TYPE_UINT32,
+    "uint64": _Field.TYPE_UINT64,
+    "float": _Field.TYPE_FLOAT,
+    "double": _Field.TYPE_DOUBLE,
+    "string": _Field.TYPE_STRING,
+    "bytes": _Field.TYPE_BYTES,
+}
+
+
+def build_messages(package: str, messages: Mapping[str, Sequence[str]], *, oneof: str = "choice") -> dict[str, Any]:
+    """Return the classes of a proto3 package by name.
+
+    `messages` gives each one's fields in the order of their numbers, or with a number of their own: `int64 ns`,
+    `repeated float action`, `map float limits` (from string), `bool ready = 17`. A type is one of protobuf's own or a
+    message. A nested message is written Outer.Inner, after its outer one. `oneof` fields share the one oneof of their
+    message, which gets the name `oneof`.
+    """
+    file = descriptor_pb2.FileDescriptorProto(name=f"rlservo/{package}.proto", package=package, syntax="proto3")
+    made: dict[str, Any] = {}
+    for name, fields in messages.items():
+        outer, _, inner = name.rpartition(".")
+        message = made[outer].nested_type.add(name=inner) if outer else file.message_type.add(name=inner)
+        made[name] = message
+        for position, declaration in enumerate(fields, start=1):
+            field, _, number = declaration.partition(" = ")
+            if field.startswith("oneof ") and not message.oneof_decl:
+                message.oneof_decl.add(name=oneof)
+            _add_field(message, package, name, int(number or position), field)
+    pool = descriptor_pool.DescriptorPool()
+    pool.AddSerializedFile(file.SerializeToString())
+    # Classes made at run time have no static type: Any is all a type checker can be told.
+    return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{package}.{name}")) for name in messages}
+
+
+def _add_field(message: Any, package: str, path: str, number: int, declaration: str) -> None:
+    kind, name = declaration.rsplit(" ", 1)
+    modifier, _, kind = kind.rpartition(" ")
+    field = message.field.add(name=name, number=number, label=_Field.LABEL_OPTIONAL)
+    if modifier == "map":  # on the wire a repeated message of key and value
+        entry = message.nested_type.add(name="".join(part.capitalize() for part in name.split("_")) + "Entry")
+        entry.options.map_entry = True
+        _add_field(entry, package, path, 1, "string key")
+        _add_field(entry, package, path, 2, f"{kind} value")
+        modifier, kind = "repeated", f"{path}.{entry.name}"
+    if modifier == "repeated":
+        field.label = _Field.LABEL_REPEATED
+    elif modifier == "oneof":
+        field.oneof_index = 0
+    if kind in _TYPES:
+        field.type = _TYPES[kind]
+    else:
+        field.type, field.type_name = _Field.TYPE_MESSAGE, f".{package}.{kind}"

@@ -1,0 +1,65 @@
+"""Folders that cost much to make, kept in the user's cache between runs and shared by the processes of one run.
+
+Each is named after what makes it, so that a change there makes it anew.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterable
+from importlib.metadata import version
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+KEPT_S = 14 * 86400.0  # since a folder was last used
+PYTHON = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+
+
+def cached(name: str, made_of: Iterable[Path | str], make: Callable[[Path], None]) -> Path:
+    """Return a folder that `make` has filled, in this run or an earlier one. Whoever changes files in it copies first.
+
+    `made_of` tells one content from another: files and folders (by what is in them) and words such as versions.
+    """
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rlservo-tests"
+    root.mkdir(parents=True, exist_ok=True)
+    folder = root / f"{name}-{_digest(made_of)}"
+    complete = folder.with_name(f"{folder.name}.complete")  # beside it: the folder holds what `make` wrote, only
+    with (root / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # another process of this run, or another run, may be making it
+        if not complete.exists():
+            _remove_unused(root, name)
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            make(folder)
+        complete.touch()
+    return folder
+
+
+def versions(*packages: str) -> str:
+    """Return a word for `made_of`: this Python and the installed versions of these packages."""
+    return " ".join([PYTHON, *(f"{package}=={version(package)}" for package in packages)])
+
+
+def _digest(made_of: Iterable[Path | str]) -> str:
+    found = hashlib.sha256()
+    for part in made_of:
+        if isinstance(part, str):
+            found.update(f"{part}\0".encode())
+            continue
+        files = [part] if part.is_file() else sorted(file for file in part.rglob("*") if file.is_file())
+        for file in files:
+            if "__pycache__" not in file.parts:
+                found.update(f"{file.relative_to(part.parent)}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
+    return found.hexdigest()[:16]
+
+
+def _remove_unused(root: Path, name: str) -> None:
+    for complete in root.glob(f"{name}-*.complete"):
+        if time.time() - complete.stat().st_mtime > KEPT_S:
+            complete.unlink(missing_ok=True)
+            shutil.rmtree(complete.with_suffix(""), ignore_errors=True)

@@ -1,0 +1,59 @@
+"""Checkpoints that RLlib trains for the tests, in a process and a Ray cluster of their own: made once and kept.
+
+`tests/zoo` has the training scripts.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cache import cached, versions
+
+ZOO = Path(__file__).resolve().with_name("zoo")
+APP = ZOO / "app"  # the user's own code that some of the checkpoints need
+TRAINED_WITH = [ZOO, str(ZOO), versions("ray", "torch", "gymnasium", "numpy")]  # pickles name the code's own folder
+
+
+def trained(script: str) -> Path:
+    """Return the folder that a training script fills."""
+
+    def train(folder: Path) -> None:
+        # With the token in its environment Ray writes none to the user's home.
+        environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
+        command = [sys.executable, "-W", "ignore", str(ZOO / script), str(folder)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=580)
+        assert done.returncode == 0, done.stderr[-3000:]
+
+    return cached(script.removesuffix(".py"), TRAINED_WITH, train)
+
+
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that need these checkpoints."""
+    for item in items:
+        if {"zoo", "wide_zoo", "old_zoo"} & set(getattr(item, "fixturenames", ())):
+            item.add_marker("trained")
+
+
+@pytest.fixture(scope="session")
+def zoo() -> Path:
+    """A folder of checkpoints `<name>/` and what the environment saw, `<name>.npz`. Not to be written to."""
+    return trained("train_zoo.py")
+
+
+@pytest.fixture(scope="session")
+def wide_zoo() -> Path:
+    """The same for spaces, recurrent policies, connectors and algorithms of every kind."""
+    return trained("train_wide_zoo.py")
+
+
+@pytest.fixture(scope="session")
+def old_zoo() -> Path:
+    """The same for RLlib's old API stack."""
+    return trained("train_old_zoo.py")

@@ -1,0 +1,65 @@
+"""Pythons with packages that cannot share our environment: other servers' clients, robo-gym."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import venv
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cache import PYTHON, cached
+
+ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")
+# What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and
+# pip would settle that with an old robo-gym-server-modules that has no pin and does not work.
+CLIENT = ("httpcore>=1.0.6", "pydantic>=2.6")
+
+
+def virtual_environment(*packages: str) -> Path:
+    """Return the Python of an environment with these packages, which cannot share ours; made once and kept.
+
+    Raises RuntimeError where pip cannot install them.
+    """
+
+    def make(folder: Path) -> None:
+        venv.create(folder, with_pip=True)
+        install = [str(folder / "bin" / "python"), "-m", "pip", "install", "-q", *packages]
+        done = subprocess.run(install, capture_output=True, text=True, timeout=500)
+        if done.returncode != 0:
+            raise RuntimeError(f"{', '.join(packages)} cannot be installed here: {done.stderr.strip()[-500:]}")
+
+    name = re.match(r"[\w-]+", packages[0])
+    assert name is not None
+    return cached(f"{name[0]}-environment", [*packages, PYTHON], make) / "bin" / "python"
+
+
+@pytest.fixture(scope="session")
+def client_environment() -> Callable[..., Path]:
+    """`virtual_environment`, or skip."""
+
+    def install(*packages: str) -> Path:
+        try:
+            return virtual_environment(*packages)
+        except RuntimeError as error:
+            pytest.skip(str(error))
+
+    return install
+
+
+@pytest.fixture(scope="session")
+def robo_gym_python() -> Path:
+    """Return the Python of an environment with robo-gym, and without Ray, MuJoCo and rlservo.
+
+    robo-gym pins a protobuf that Ray cannot use. Where the environment cannot be built (no network, say) these tests
+    skip with the reason, unless RLSERVO_REQUIRE_ROBO_GYM is set, as it is in CI.
+    """
+    try:
+        return virtual_environment(*ROBO_GYM, *CLIENT)
+    except RuntimeError as error:
+        if os.environ.get("RLSERVO_REQUIRE_ROBO_GYM"):
+            pytest.fail(str(error))
+        pytest.skip(str(error))

@@ -1,0 +1,55 @@
+"""Run training scripts one after the other in one process and one Ray, where starting a Ray is not what is tested.
+
+A request is a line on standard input, ["FOLDER", "SCRIPT", "ARGUMENT", ...]: the folder is made, and the script runs
+in it. The reply is a line on standard output: how it ended, and what it left in the home folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import runpy
+import sys
+import traceback
+from pathlib import Path
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+sys.path.insert(0, str(EXAMPLES))
+
+import shared.training_run as training_run  # noqa: E402
+
+
+def main() -> None:
+    with training_run.ray_session(num_cpus=1):
+        training_run.ray_session = lambda **_: contextlib.nullcontext()  # the scripts' own
+        for line in sys.stdin:
+            folder, *words = json.loads(line)
+            Path(folder).mkdir()
+            os.chdir(folder)
+            before = in_home()
+            code, out, err = run(*words)
+            print(json.dumps({"code": code, "out": out, "err": err, "home": list(in_home() - before)}), flush=True)
+
+
+def in_home() -> set[str]:
+    return {path.name for path in Path.home().iterdir()}
+
+
+def run(script: str, *arguments: str) -> tuple[int, str, str]:
+    sys.argv = [str(EXAMPLES / script), *arguments]
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            runpy.run_path(sys.argv[0], run_name="__main__")
+        except SystemExit as end:
+            code = int(end.code or 0)
+        except Exception:
+            code = 1
+            traceback.print_exc()
+    return code, out.getvalue(), err.getvalue()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Servers that are started here because starting and ending them is what is tested, and what they leave behind."""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from rlservo.export.contract.errors import BundleError, UsageError
+from rlservo.serve_app.ray_serve.environment import cluster_environment
+from rlservo.serve_app.ray_serve.launcher import serve_policies
+from rlservo.serve_app.ray_serve.processes import free_ports
+from servers import ask, launched, running, wait_until_served
+
+pytestmark = [pytest.mark.serve, pytest.mark.slow]
+
+ROOT = Path(__file__).resolve().parents[2]
+OBS = [round(0.01 * i, 2) for i in range(27)]
+
+
+def test_importing_the_application_pulls_in_no_training_code() -> None:
+    heavy = ["torch", "ray.rllib", "ray.tune", "gymnasium", "mujoco", "onnx"]
+    code = f"import sys, rlservo.serve_app.ray_serve.app; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().splitlines()[-1] == "[]"
+
+
+def test_arguments_and_bundles_are_checked_before_anything_starts(policies: Path, tmp_path: Path) -> None:
+    (port,) = free_ports(1)
+    with pytest.raises(BundleError, match="does not exist"):
+        serve_policies([tmp_path / "nowhere"], port=port)
+    with pytest.raises(UsageError, match="replicas must be 1 or more"):
+        serve_policies([policies], port=port, replicas=0)
+    with pytest.raises(UsageError, match="threads"):
+        serve_policies([policies], port=port, settings={"threads": -1})
+
+
+@pytest.mark.parametrize(
+    ("number", "after_s"),
+    [(signal.SIGINT, 2.0), (signal.SIGTERM, 4.5), (signal.SIGKILL, 3.5)],
+    ids=["SIGINT", "SIGTERM", "SIGKILL"],
+)
+def test_a_server_ended_while_it_starts_leaves_nothing(policies: Path, number: signal.Signals, after_s: float) -> None:
+    with launched(policies, with_admin_key=True) as run:
+        deadline = time.monotonic() + 60
+        while not run.left() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        time.sleep(after_s)
+        code = run.end(number)
+        if number == signal.SIGKILL:  # it could not remove its folder; the cluster's process must
+            assert code == -signal.SIGKILL
+
+
+def test_a_second_ctrl_c_ends_a_running_server_at_once_and_leaves_nothing(policies: Path) -> None:
+    """The other ways to end a running one are those of the servers that other tests share (servers.py)."""
+    with launched(policies, with_admin_key=True) as run:
+        run.wait_until_ready()
+        assert ask(run.port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[0] == 200
+        assert run.key_file is not None and run.key_file.exists()
+        run.end(signal.SIGINT, signal.SIGINT)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
+    policies: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    import grpc
+    import yaml
+
+    (port, stats, metrics, fallback, grpc_port, grpc_fallback) = free_ports(6)
+    configuration = yaml.safe_load((ROOT / "deploy" / "serve.yaml").read_text())
+    configuration["http_options"]["port"] = port
+    configuration["grpc_options"]["port"] = grpc_port
+    configuration["applications"][0]["args"]["policies"] = [str(policies)]
+    file = tmp_path / "serve.yaml"
+    file.write_text(yaml.safe_dump(configuration))
+    ray_folder = Path(tempfile.mkdtemp(prefix="r"))
+    environment = {
+        **cluster_environment(ray_folder),
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+        "RAY_TMPDIR": str(ray_folder),
+        "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
+        "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
+        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
+        "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(grpc_fallback),
+        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(ray_folder / "haproxy.cfg"),
+        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(ray_folder / "a.sock"),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(ray_folder),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(ray_folder / "state"),
+    }
+    try:
+        program = str(Path(sys.executable).with_name("serve"))
+        with running([program, "run", str(file)], port, **environment) as run:
+            output: list[str] = []
+            assert run.process.stdout is not None
+            # Read on, so that the pipe never fills.
+            drain = threading.Thread(target=output.extend, args=(run.process.stdout,), daemon=True)
+            drain.start()
+            wait_until_served(run)
+            status, reply = ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})
+            assert status == 200, "".join(output)
+            assert len(reply["action"]) == 6
+            with grpc.insecure_channel(f"127.0.0.1:{grpc_port}") as channel:
+                live = channel.unary_unary("/inference.GRPCInferenceService/ServerLive")
+                assert live(b"", timeout=20, wait_for_ready=True) == b"\x08\x01"  # field 1, true
+            run.end(number, folders=False)  # Ray's dashboard leaves an empty one
+            drain.join()
+    finally:
+        shutil.rmtree(ray_folder, ignore_errors=True)
