@@ -3,7 +3,7 @@
 Each repetition records so many episodes with one policy and estimates the return of others, whose true returns come
 from many episodes of their own. `--world linear` is a point pulled to 0, for fitted Q evaluation alone. Repetition i
 has the seed FIRST_SEED + i: seeds below 1000 were used when the limits of the estimates were chosen.
-Run: python benchmarks/estimates.py; python benchmarks/estimates.py --world linear --episodes 100
+Run: python benchmarks/estimates.py --importance-only; python benchmarks/estimates.py --world linear --episodes 100
 """
 
 from __future__ import annotations
@@ -40,12 +40,14 @@ class Candidate:
     claimed: dict[str, int] = field(default_factory=dict)
     covered: dict[str, int] = field(default_factory=dict)
     widths: dict[str, list[float]] = field(default_factory=dict)
+    effective: dict[str, list[float]] = field(default_factory=dict)
     covered_unclaimed: dict[str, int] = field(default_factory=dict)
 
     def count(self, estimate: Estimate) -> None:
         low, high = estimate.interval
         covers = low <= self.truth <= high
         method = estimate.method
+        self.effective.setdefault(method, []).append(estimate.effective_samples)
         if estimate.supported:
             self.claimed[method] = self.claimed.get(method, 0) + 1
             self.covered[method] = self.covered.get(method, 0) + covers
@@ -189,6 +191,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--repetitions", type=int, default=100)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
+    parser.add_argument("--importance-only", action="store_true", help="leave out fitted Q evaluation, which is slow")
     parser.add_argument("--world", choices=["cartpole", "linear"], default="cartpole")
     arguments = parser.parse_args()
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.repetitions)
@@ -196,6 +199,8 @@ def main() -> None:
         candidates = linear_study(arguments.episodes, seeds)
     else:
         candidates = candidates_of_the_study()
+        if arguments.importance_only:
+            candidates = [candidate for candidate in candidates if not candidate.deterministic]
         study(candidates, linear(BEHAVIOUR), arguments.episodes, seeds)
     print(f"{arguments.repetitions} repetitions of {arguments.episodes} episodes; 95% intervals")
     for candidate in candidates:
@@ -206,7 +211,8 @@ def main() -> None:
             outside = candidate.covered_unclaimed.get(method, 0)
             print(
                 f"  {method}: claimed {claimed}, covered {covered} of them, mean width {width:.1f}; "
-                f"covered {outside} of {arguments.repetitions - claimed} not claimed"
+                f"covered {outside} of {arguments.repetitions - claimed} not claimed; "
+                f"mean of effective episodes {np.mean(candidate.effective[method]):.0f}"
             )
 
 

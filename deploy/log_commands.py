@@ -141,7 +141,10 @@ def estimate(
 ) -> None:
     """Estimate the return a bundle would have earned, from recordings of another version.
 
-    Exit code 0: an estimate holds; 1: the recordings cannot support one.
+    Recordings that did not explore have fitted Q evaluation alone. It is experimental: how often its interval holds
+    was counted in a one-dimensional simulation only. Drive nothing because of it.
+
+    Exit code 0: an estimate holds by its method's own checks; 1: the recordings cannot support one.
 
     Example: `rlservo estimate recordings --bundle policies/ur5/2`
     """

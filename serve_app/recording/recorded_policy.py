@@ -120,8 +120,9 @@ class WithRecording(ActingPolicy):
     def set_last_action(self, action: Any) -> None:
         """Record what the robot was commanded instead of the last action, and pass it on to a client."""
         self.record_command(action)
-        if hasattr(self._policy, "set_last_action"):
-            self._policy.set_last_action(action)
+        pass_on = getattr(self._policy, "set_last_action", None)
+        if pass_on is not None:
+            pass_on(action)
 
     def record_command(self, action: Any) -> None:
         """Record what the robot was commanded instead of the last action, and tell nobody."""

@@ -201,7 +201,7 @@ def fitted_estimate(trajectories: list[Trajectory], gamma: float, rng: np.random
     if len(trajectories) < FEWEST_EPISODES:
         reason = f"{len(trajectories)} episodes are too few: at least {FEWEST_EPISODES} are needed"
     return Estimate(
-        "fitted Q evaluation",
+        "fitted Q evaluation (experimental)",
         fit.value,
         _interval(fit.resampled),
         len(trajectories) * fit.inside,

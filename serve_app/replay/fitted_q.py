@@ -25,7 +25,7 @@ MOST_ROWS = 6_000
 FARTHEST = 0.05  # the share of the bundle's actions that may be unlike recorded ones
 FARTHEST_MODELS = 0.25  # of the recorded returns' deviation, between two models' estimates
 FARTHEST_RETURN = 2.0  # of the recorded returns' deviation, from their mean to the estimate
-WIDER = 1.5  # than the bootstrap's spread, which knows of no model's error: so measured (docs/recording.md)
+WIDER = 1.5  # than the bootstrap's spread, which knows of no model's error: chosen in one small world
 LARGEST_ERROR = 4.0  # of the recorded policy's fitted return, in its standard errors
 
 Episode = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]

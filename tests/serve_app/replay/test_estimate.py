@@ -122,6 +122,7 @@ def test_fitted_q_finds_the_return_of_a_policy_inside_the_data() -> None:
     made, truth = linear_world(200, rng, noise=0.5, shift=0.2)
     one = fitted_estimate(made, 1.0, rng)
     assert one.supported, one.reason
+    assert "experimental" in one.method
     assert one.interval[0] <= truth <= one.interval[1]
     assert abs(one.value - truth) < 0.15 * abs(truth)
 
