@@ -80,14 +80,14 @@ def rollout(
                 "contract states one"
             )
         pacer = _Pacer(control_rate_hz if rate == "real" else None)
+        video_file = None
+        if video is not None and control_rate_hz is not None:
+            video_file = cleanup.enter_context(VideoFile(video, fps=control_rate_hz))
         recording = None
         if record is not None:
             recording = record_policy(policy, record, wait=rate == "max")
             cleanup.callback(recording.end)
         paced = _PacedPolicy(recording or policy, pacer)
-        video_file = None
-        if video is not None and control_rate_hz is not None:
-            video_file = cleanup.enter_context(VideoFile(video, fps=control_rate_hz))
         rows: list[EpisodeRow] = []
         interrupted, stopped = False, None
         began = time.perf_counter()
