@@ -8,8 +8,9 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -102,6 +103,7 @@ class Policy:
         self._run: Run = ort_session.run
         self._rng = np.random.default_rng()
         self.options = options
+        self.loaded_at = datetime.now(timezone.utc)
         self._unlogged = 0
         self._logged_at = -NOTICE_EVERY_S
         self.drift = Drift.of(contract)
