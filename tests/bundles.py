@@ -390,10 +390,7 @@ def controlled() -> Callable[..., AbstractContextManager[ReplicaVersions]]:
     @contextlib.contextmanager
     def control_of(*folders: Path, config: Any = None) -> Iterator[ReplicaVersions]:
         control = ReplicaVersions(VersionLoader(Repository(list(folders))), MemoryLedger(), replica="only")
-        try:
-            asyncio.run(control.configure({} if config is None else config))
-            yield control
-        finally:
-            control.close()
+        asyncio.run(control.configure({} if config is None else config))
+        yield control
 
     return control_of

@@ -101,8 +101,7 @@ class ReplicaVersions:
         self._is_current = is_current
         self._served: dict[str, set[str]] = {}  # every identity that was ever served here, by name
         self._proposed: list[set[Loadable]] = []  # what changes that are under way have loaded, and no plan has yet
-        self._failed: dict[Key, str] = {}
-        self._behind: tuple[str, ...] = ()
+        self._failed: dict[Key, str] = {}  # why this replica serves something older than the plan says
         self._tried_at = 0.0
         self._writing = asyncio.Lock()  # held while a change that has been proven is written down
 
@@ -195,16 +194,20 @@ class ReplicaVersions:
 
     async def follow(self, generation: int = 0, *, again: bool = False) -> ReplicaProgress:
         """Serve the newest plan; return whether this replica could. `again`: try also what was given up before."""
-        reached = self.plan.generation if self.plan is not None else 0
-        if self._behind or reached < generation or reached < await self._ledger.newest_generation():
+        if self._failed or self._generation < generation or self._generation < await self._ledger.newest_generation():
             plan = await self._ledger.newest()
             if plan is not None:
                 await self._apply(plan, again=again)
         return self.progress()
 
+    @property
+    def _generation(self) -> int:
+        return self.plan.generation if self.plan is not None else 0
+
     def progress(self) -> ReplicaProgress:
         """Return where this replica stands."""
-        return ReplicaProgress(self.replica, self.plan.generation if self.plan is not None else 0, self._behind)
+        behind = tuple(self._failed.values())
+        return ReplicaProgress(self.replica, self._generation, behind)
 
     async def poll_ledger(self) -> None:
         """Follow plans that this replica was not told of (it was starting, or cut off), until cancelled."""
@@ -212,8 +215,8 @@ class ReplicaVersions:
             await asyncio.sleep(LEDGER_POLL_S)
             try:
                 newest = await self._ledger.newest_generation()
-                late = bool(self._behind) and time.monotonic() - self._tried_at > RETRY_PERIOD_S
-                if late or newest > (self.plan.generation if self.plan is not None else 0):
+                late = bool(self._failed) and time.monotonic() - self._tried_at > RETRY_PERIOD_S
+                if late or newest > self._generation:
                     await self.follow(again=late)
             except Exception as error:  # the ledger may be out of reach for a while; what is served goes on
                 logger.warning("the ledger of policies could not be followed: %s", error)
@@ -236,10 +239,6 @@ class ReplicaVersions:
         for (name, version), state in sorted(states.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
             by_name.setdefault(name, {})[version] = state
         return by_name
-
-    def close(self) -> None:
-        """End the ledger's thread."""
-        self._ledger.close()
 
     async def _configured(self, document: Any, digest: str, before: Plan | None) -> Plan:
         """Return the plan that a configuration means, or the one that refuses it."""
@@ -279,7 +278,6 @@ class ReplicaVersions:
         serving: dict[str, PolicyPlan] = {}
         kept: dict[Loadable, Policy] = {}
         failed: dict[Key, str] = {}
-        behind: list[str] = []
         for name, wanted in plan.policies.items():
             loaded: dict[Loadable, Policy] = {}
             errors: dict[str, RlservoError] = {}
@@ -290,7 +288,6 @@ class ReplicaVersions:
                     failed[name, version] = one.message
                 else:
                     loaded[name, version, digest] = one
-            behind += [error.message for error in errors.values()]
             was = None if self.store is None else self.store.plans.get(name)
             if errors and was is not None:
                 wanted = was
@@ -298,7 +295,7 @@ class ReplicaVersions:
                 loaded = {key: each for key in keys if (each := self._loader.get(*key)) is not None}
             elif errors and wanted.default in errors:
                 if self.store is not None:
-                    continue  # not served here rather than as another version; `behind` says so
+                    continue  # not served here rather than as another version; `failed` says so
                 raise BundleError(
                     f"policy '{name}' cannot be served as version {wanted.default}, its default: "
                     f"{errors[wanted.default].message}"
@@ -310,9 +307,9 @@ class ReplicaVersions:
             self._served.setdefault(policy.contract.name, set()).add(policy.identity)
         changed = [name for name, identities in self._served.items() if len(identities) > 1]
         self.store = PolicyStore(kept.values(), serving, changed=changed, replaces=self.store)
-        self.plan, self._failed, self._behind = plan, failed, tuple(behind)
-        if behind:
-            logger.error("generation %d cannot be served as it should: %s", plan.generation, "; ".join(behind))
+        self.plan, self._failed = plan, failed
+        if failed:
+            logger.error("generation %d cannot be served as it should: %s", plan.generation, "; ".join(failed.values()))
         else:
             logger.info("serving generation %d (%s)", plan.generation, plan.changed_by)
 

@@ -90,7 +90,6 @@ def port(folder: Path, key_path: Path, served: Serve) -> Iterator[int]:
         create_app(lambda: control.store, ServerSettings(operator_key=digest), replica="only", control=control)
     ) as port:
         yield port
-    control.close()
 
 
 @pytest.fixture
@@ -184,7 +183,6 @@ def started(policies: Path, key_path: Path, served: Serve, tmp_path: Path) -> It
     app = create_app(lambda: control.store, ServerSettings(operator_key=digest), replica="only", control=control)
     with served(app) as port, AdminClient(f"http://127.0.0.1:{port}", api_key=read_key(key_path)) as client:
         yield client, port, root
-    control.close()
 
 
 def test_from_the_default_start_on_a_load_changes_no_reply_and_a_rollback_leads_back(

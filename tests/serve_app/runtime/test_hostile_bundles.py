@@ -99,7 +99,6 @@ def url(root: Path, served: Serve, patience_s: float) -> Iterator[str]:
     app = create_app(lambda: control.store, ServerSettings(operator_key=DIGEST), replica="r", control=control)
     with served(app) as port:
         yield f"http://127.0.0.1:{port}"
-    control.close()
 
 
 @pytest.fixture
