@@ -127,7 +127,6 @@ class Policy:
         self._action_check = next(iter(self._action_checks.values()))
         self._input = contract.inputs[0].name
         self._action_only = ["action"]
-        self._dist_only = ["action_dist_inputs"]
 
     @classmethod
     def load(
@@ -186,8 +185,8 @@ class Policy:
         the reward, or remembers another number of episodes, and ActionError when what came out is not finite or not in
         the action space.
         """
-        if self._simple:
-            computed, _, batch, _ = self._compute(obs, explore, seed)
+        if self._simple and not explore:
+            computed, _, batch, _ = self._compute(obs)
             return computed if batch else computed[0, ...]
         step = self.step(obs, before=self._state, last=self._last, explore=explore, seed=seed, reward=reward)
         self._state = step.state or None
@@ -231,8 +230,8 @@ class Policy:
         sends them, which is checked. None of a pair begins an episode. Raises RequestError when they do not fit, and
         what `act` raises.
         """
-        if self._simple and before is None and state is None and last is None and last_action is None:
-            computed, feed, batch, notices = self._compute(obs, explore, seed)
+        if self._simple and not explore and before is None and state is None and last is None and last_action is None:
+            computed, feed, batch, notices = self._compute(obs)
             leaves = {"action": computed}
             if batch:
                 return Step(computed, leaves, {}, len(computed), feed, notices)
@@ -320,17 +319,11 @@ class Policy:
             _refuse_closed([], {})
         return self._ort_session
 
-    def _compute(
-        self, obs: Observation, explore: bool, seed: int | None
-    ) -> tuple[NDArray[Any], dict[str, NDArray[Any]], bool, tuple[str, ...]]:
+    def _compute(self, obs: Observation) -> tuple[NDArray[Any], dict[str, NDArray[Any]], bool, tuple[str, ...]]:
         """Return (action `[batch, ...]`, feed, whether `obs` is a batch, notices) of a simple policy."""
         array, batch, notice = self._leaf.parse(obs)
         feed = {self._input: array}
-        if explore:
-            self._check_explores()
-            action = self._sample(self._run(self._dist_only, feed)[0], seed)["action"]
-        else:
-            action = self._run(self._action_only, feed)[0]
+        action = self._run(self._action_only, feed)[0]
         self._action_check.check(action)
         notices: tuple[str, ...] = ()
         if notice:
