@@ -74,6 +74,11 @@ class Step:
         """How many episodes it was a step of."""
         return self.batch or 1
 
+    @property
+    def own_state(self) -> State:
+        """The state in the observation's own form: without a batch axis where that came alone."""
+        return self.state if self.batch is not None else {name: leaf[0, ...] for name, leaf in self.state.items()}
+
 
 class Policy:
     """An exported policy, loaded and proven on this machine.
@@ -208,9 +213,7 @@ class Policy:
         None begins an episode. Raises RequestError when it does not fit the contract, and what `act` raises.
         """
         step = self.step(obs, state=state, explore=explore, seed=seed, reward=reward)
-        if step.batch is not None:
-            return step.action, step.state
-        return step.action, {name: leaf[0, ...] for name, leaf in step.state.items()}
+        return step.action, step.own_state
 
     def step(
         self,
