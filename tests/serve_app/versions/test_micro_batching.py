@@ -273,8 +273,9 @@ def test_exploring_requests_draw_for_themselves(port: int, store: PolicyStore) -
 
 
 def test_a_warning_is_in_the_reply_to_what_it_is_about(bounded: Path) -> None:
+    store = load_store(bounded, options=TOGETHER)
+
     async def main() -> list[Decision]:
-        store = load_store(bounded, options=TOGETHER)
         in_a_crowd(store)
         rows = OBS[:4].copy()
         rows[1, 5], rows[3, 6] = 9.0, -10.0
