@@ -13,7 +13,7 @@ import logging
 import math
 import secrets
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from typing import Any
 from urllib.parse import unquote
 
@@ -34,9 +34,9 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
-from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.http_errors import RETRY_AFTER_S, status_of
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of, from_bytes, is_shape
+from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, check_form, check_size, datatype_of, from_bytes
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.loop_clock import STAMP
@@ -64,6 +64,17 @@ CODES = {
     422: grpc.StatusCode.INVALID_ARGUMENT,
     503: grpc.StatusCode.UNAVAILABLE,
 }
+UNARY = (
+    "ServerLive",
+    "ServerReady",
+    "ServerMetadata",
+    "ModelReady",
+    "ModelMetadata",
+    "ModelConfig",
+    "ModelStatistics",
+    "ModelInfer",
+    "RepositoryIndex",
+)
 OPEN = frozenset({"ServerLive", "ServerReady"})  # what orchestrators probe; every other method wants the keys' `act`
 # The field of InferTensorContents that holds a datatype; FP16 has none and comes raw.
 FIELDS = {
@@ -86,36 +97,20 @@ class InferenceService:
         """Answer from `core`; with `local_only`, only callers on this machine."""
         self._grpc = Grpc(core, local_only=local_only)
 
-    async def ServerLive(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ServerLive", request, grpc_context)
-
-    async def ServerReady(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ServerReady", request, grpc_context)
-
-    async def ServerMetadata(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ServerMetadata", request, grpc_context)
-
-    async def ModelReady(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ModelReady", request, grpc_context)
-
-    async def ModelMetadata(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ModelMetadata", request, grpc_context)
-
-    async def ModelConfig(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ModelConfig", request, grpc_context)
-
-    async def ModelStatistics(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ModelStatistics", request, grpc_context)
-
-    async def ModelInfer(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ModelInfer", request, grpc_context)
-
-    async def RepositoryIndex(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("RepositoryIndex", request, grpc_context)
-
     async def ModelStreamInfer(self, requests: AsyncIterator[bytes], grpc_context: Any) -> AsyncIterator[Any]:
         async for reply in self._grpc.stream(requests, grpc_context):
             yield reply
+
+
+def _method(name: str) -> Callable[[InferenceService, Incoming, Any], Awaitable[Any]]:
+    async def answer(self: InferenceService, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer(name, request, grpc_context)
+
+    return answer
+
+
+for _name in UNARY:
+    setattr(InferenceService, _name, _method(_name))
 
 
 class Grpc:
@@ -302,10 +297,7 @@ class OipGrpcCodec:
 def _numbered(document: Any) -> Any:
     """Return a configuration with the names of its data types as the numbers that stand for them in a message."""
     if isinstance(document, dict):
-        return {
-            key: messages.DATA_TYPES[value] if key == "data_type" else _numbered(value)
-            for key, value in document.items()
-        }
+        return {key: DATA_TYPES[value] if key == "data_type" else _numbered(value) for key, value in document.items()}
     return [_numbered(each) for each in document] if isinstance(document, list) else document
 
 
@@ -329,32 +321,14 @@ def _inputs(message: Any) -> dict[str, NDArray[Any]]:
         raise RequestError(
             f"there are {len(message.inputs)} inputs and {len(raw)} raw_input_contents: one for each, or none"
         )
-    seen: set[str] = set()
-    for tensor in message.inputs:
-        if tensor.name in seen:
-            raise RequestError(f"input '{tensor.name[:64]}' is there twice")
-        seen.add(tensor.name)
     inputs: dict[str, NDArray[Any]] = {}
     for index, tensor in enumerate(message.inputs):
         label, shape = tensor.name[:64], tuple(tensor.shape)
-        if tensor.datatype == "BYTES":
-            raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")
-        dtype = DTYPES.get(tensor.datatype)
-        if dtype is None:
-            raise RequestError(
-                f"input '{label}': datatype must be one of {', '.join(DTYPES)}, got '{tensor.datatype[:64]}'"
-            )
-        if not is_shape(shape):
-            raise RequestError(f"input '{label}': 'shape' must be sizes such as [1, 27]")
-        if tensor.parameters and "shared_memory_region" in tensor.parameters:
-            raise RequestError(f"input '{label}' is in shared memory, which this server does not read: send the data")
+        if tensor.name in inputs:
+            raise RequestError(f"input '{label}' is there twice")
+        dtype = check_form(label, shape, tensor.datatype, tensor.parameters)
         if raw:
-            expected = math.prod(shape) * dtype.itemsize
-            if len(raw[index]) != expected:
-                raise RequestError(
-                    f"input '{label}' of shape {list(shape)} and datatype {tensor.datatype} is {expected} bytes, "
-                    f"but its raw_input_contents are {len(raw[index])}"
-                )
+            check_size(label, shape, dtype, len(raw[index]), "raw_input_contents are")
             inputs[tensor.name] = from_bytes(memoryview(raw[index]), shape, dtype)
         else:
             inputs[tensor.name] = _typed(label, tensor, shape, dtype)

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_config import model_config, statistics
 from rlservo.serve_app.protocols.oip_grpc import _numbered
+from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan import PolicyPlan

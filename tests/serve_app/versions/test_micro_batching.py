@@ -26,9 +26,9 @@ from rlservo.export.contract.bundle import load_bundle, write_contract, write_go
 from rlservo.export.contract.errors import ActionError, BundleError, DeadlineError, UsageError
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_grpc import OipGrpcCodec
+from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
