@@ -18,7 +18,7 @@ from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.gauges import gauges_of
+from rlservo.serve_app.server.gauges import exposition
 from rlservo.serve_app.server.request_checks import Hosts, RequestChecks
 from rlservo.serve_app.server.request_path import StoreProvider
 from rlservo.serve_app.server.settings import ServerSettings
@@ -43,7 +43,6 @@ def create_app(
     `settings` name cannot be read.
     """
     core = Core(store_provider, settings, replica=replica, control=control, alone=alone)
-    core.metrics.sources += gauges_of(core)
     checks = RequestChecks(Hosts(host, settings, keyed=core.authorizer.needs_keys), core.authorizer)
     # A redirect would be an answer to a path that no route has: there is none.
     app = PolicyApp(
@@ -89,7 +88,7 @@ def _add_health(app: FastAPI, core: Core) -> None:
     )
     @grant(Access.act)
     async def metrics() -> Response:
-        return Response(core.exposition(), media_type=CONTENT_TYPE_LATEST)
+        return Response(exposition(core), media_type=CONTENT_TYPE_LATEST)
 
 
 # Errors of the routes that FastAPI runs; `http_errors.py` has the table.

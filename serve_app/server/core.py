@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 from rlservo.export.contract.errors import UnknownPolicyError
@@ -49,8 +48,7 @@ class Core:
         self.settings = settings
         self.keys = CurrentKeys(settings)
         self.authorizer = Authorizer(self.keys)
-        self.metrics = Metrics(replica)
-        self.metrics.sources.append(partial(self.shadows.families, replica))
+        self.metrics = Metrics()
         self.log = RequestLog(settings)
         self.admission = Admission(
             max_queued=settings.max_ongoing_requests,
@@ -102,13 +100,3 @@ class Core:
             for name in store.names:
                 for version in store.versions(name):
                     yield name, version, store.get(name, version)
-
-    def exposition(self) -> bytes:
-        """Return the metrics as Prometheus reads them."""
-        store = self._store_provider()
-        versions: dict[str, tuple[str, ...]] = {}
-        for name in store.names if store is not None else ():
-            assert store is not None
-            default = store.default(name)
-            versions[name] = (*(version for version in store.versions(name) if version != default), default)
-        return self.metrics.exposition(versions)
