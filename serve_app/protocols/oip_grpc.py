@@ -39,10 +39,10 @@ from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
 from rlservo.serve_app.protocols.oip_tensors import DTYPES, check_form, check_size, datatype_of, from_bytes
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.loop_clock import STAMP
-from rlservo.serve_app.server.request_checks import presented_key
+from rlservo.serve_app.server.request_checks import authorize, presented_key
 from rlservo.serve_app.server.request_path import BUG
 from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.request_stamp import STAMP
 
 Incoming = tuple[bytes, float | None]
 """A request's bytes, and how many seconds its caller still waits for the answer (None: for ever)."""
@@ -64,17 +64,6 @@ CODES = {
     422: grpc.StatusCode.INVALID_ARGUMENT,
     503: grpc.StatusCode.UNAVAILABLE,
 }
-UNARY = (
-    "ServerLive",
-    "ServerReady",
-    "ServerMetadata",
-    "ModelReady",
-    "ModelMetadata",
-    "ModelConfig",
-    "ModelStatistics",
-    "ModelInfer",
-    "RepositoryIndex",
-)
 OPEN = frozenset({"ServerLive", "ServerReady"})  # what orchestrators probe; every other method wants the keys' `act`
 # The field of InferTensorContents that holds a datatype; FP16 has none and comes raw.
 FIELDS = {
@@ -102,17 +91,6 @@ class InferenceService:
             yield reply
 
 
-def _method(name: str) -> Callable[[InferenceService, Incoming, Any], Awaitable[Any]]:
-    async def answer(self: InferenceService, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer(name, request, grpc_context)
-
-    return answer
-
-
-for _name in UNARY:
-    setattr(InferenceService, _name, _method(_name))
-
-
 class Grpc:
     """Answers gRPC calls from the core."""
 
@@ -121,16 +99,6 @@ class Grpc:
         self._core = core
         self._codec = OipGrpcCodec(core)
         self._local_only = local_only
-        self._methods: dict[str, Callable[[Incoming], Any]] = {
-            "ServerLive": lambda _request: messages.ServerLiveResponse(live=True),
-            "ServerReady": lambda _request: messages.ServerReadyResponse(ready=core.ready),
-            "ServerMetadata": lambda _request: messages.ServerMetadataResponse(**oip_models.server_metadata()),
-            "ModelReady": self._model_ready,
-            "ModelMetadata": self._model_metadata,
-            "ModelConfig": self._model_config,
-            "ModelStatistics": self._model_statistics,
-            "RepositoryIndex": self._index,
-        }
 
     async def answer(self, method: str, incoming: Incoming, context: Any) -> Any:
         """Return the reply to one call. An error sets the status, and the empty reply is not looked at."""
@@ -139,8 +107,8 @@ class Grpc:
             if request.request_id is not None:
                 context.set_trailing_metadata([(REQUEST_ID, request.request_id)])  # in addition to Serve's own
             if method == "ModelInfer":
-                return await self._core.request_path.answer(self._codec, request, incoming)
-            return self._methods[method](incoming)
+                return await self._core.answer(self._codec, request, incoming)
+            return METHODS[method](self._core, incoming)
         except Exception as error:
             _fail(context, error)
             return messages.ServerLiveResponse()
@@ -156,7 +124,7 @@ class Grpc:
         try:
             opening = self._begin("ModelStreamInfer", context)
             opening.label = opening.label or secrets.token_hex(8)  # one version for all where a canary runs
-            core.request_path.open_stream(opening)
+            core.open_stream(opening)
         except Exception as error:
             _fail(context, error)
             return
@@ -180,7 +148,7 @@ class Grpc:
                     PROTOCOL, "", None, time.perf_counter(), label=opening.label, request_id=opening.request_id
                 )
                 try:
-                    reply = await core.request_path.answer(self._codec, request, (content, None))
+                    reply = await core.answer(self._codec, request, (content, None))
                     yield messages.ModelStreamInferResponse(infer_response=reply)
                 except RlservoError as error:
                     sentence = _explain(error)[1]
@@ -188,7 +156,7 @@ class Grpc:
                         error_message=sentence, infer_response=messages.ModelInferResponse(id=_id_of(content))
                     )
         finally:
-            core.request_path.close_stream(opening)
+            core.close_stream(opening)
 
     def _begin(self, method: str, context: Any) -> Request:
         """Return a call's request, whose content is still to be read. Raises ForbiddenError, UnauthenticatedError."""
@@ -201,46 +169,72 @@ class Grpc:
         for name, value in metadata:
             headers.setdefault(name.encode(), _bytes(value))
         texts = {name: value for name, value in metadata if type(value) is str}
-        request_id = texts.get(REQUEST_ID)
-        try:
-            self._core.authorizer.authorize(presented_key(headers), Access.open if method in OPEN else Access.act)
-        except RlservoError as error:
-            peer = _peer(context.peer(), metadata)
-            self._core.request_path.record_refusal(PROTOCOL, error, request_id, peer=peer)
-            raise
-        return Request(
+        request = Request(
             PROTOCOL,
             "",
             None,
             time.perf_counter(),
             label=texts.get(LABEL),
-            request_id=request_id,
+            request_id=texts.get(REQUEST_ID),
             waited=self._core.admission.waited(headers.get(STAMP.encode())),
         )
+        try:
+            authorize(self._core.keys, presented_key(headers), Access.open if method in OPEN else Access.act)
+        except RlservoError as error:
+            peer = _peer(context.peer(), metadata)
+            self._core.record_failure(request, error.code, error.message, peer=peer)
+            raise
+        return request
 
-    def _model_ready(self, incoming: Incoming) -> Any:
-        message = _parse(messages.ModelReadyRequest, incoming[0])
-        return messages.ModelReadyResponse(ready=self._core.has(message.name, message.version or None))
 
-    def _model_metadata(self, incoming: Incoming) -> Any:
-        message = _parse(messages.ModelMetadataRequest, incoming[0])
-        return messages.ModelMetadataResponse(
-            **oip_models.model_metadata(self._core, message.name, message.version or None)
-        )
+def _model_ready(core: Core, incoming: Incoming) -> Any:
+    message = _parse(messages.ModelReadyRequest, incoming[0])
+    return messages.ModelReadyResponse(ready=core.has(message.name, message.version or None))
 
-    def _model_config(self, incoming: Incoming) -> Any:
-        message = _parse(messages.ModelConfigRequest, incoming[0])
-        config = oip_config.model_config(self._core, message.name, message.version or None)
-        return messages.ModelConfigResponse(config=_numbered(config))
 
-    def _model_statistics(self, incoming: Incoming) -> Any:
-        message = _parse(messages.ModelStatisticsRequest, incoming[0])
-        found = oip_config.statistics(self._core, message.name or None, message.version or None)
-        return messages.ModelStatisticsResponse(model_stats=found)
+def _model_metadata(core: Core, incoming: Incoming) -> Any:
+    message = _parse(messages.ModelMetadataRequest, incoming[0])
+    return messages.ModelMetadataResponse(**oip_models.model_metadata(core, message.name, message.version or None))
 
-    def _index(self, incoming: Incoming) -> Any:
-        message = _parse(messages.RepositoryIndexRequest, incoming[0])
-        return messages.RepositoryIndexResponse(models=oip_models.repository_index(self._core, ready=message.ready))
+
+def _model_config(core: Core, incoming: Incoming) -> Any:
+    message = _parse(messages.ModelConfigRequest, incoming[0])
+    config = oip_config.model_config(core, message.name, message.version or None)
+    return messages.ModelConfigResponse(config=_numbered(config))
+
+
+def _model_statistics(core: Core, incoming: Incoming) -> Any:
+    message = _parse(messages.ModelStatisticsRequest, incoming[0])
+    found = oip_config.statistics(core, message.name or None, message.version or None)
+    return messages.ModelStatisticsResponse(model_stats=found)
+
+
+def _index(core: Core, incoming: Incoming) -> Any:
+    message = _parse(messages.RepositoryIndexRequest, incoming[0])
+    return messages.RepositoryIndexResponse(models=oip_models.repository_index(core, ready=message.ready))
+
+
+METHODS: dict[str, Callable[[Core, Incoming], Any]] = {
+    "ServerLive": lambda _core, _incoming: messages.ServerLiveResponse(live=True),
+    "ServerReady": lambda core, _incoming: messages.ServerReadyResponse(ready=core.ready),
+    "ServerMetadata": lambda _core, _incoming: messages.ServerMetadataResponse(**oip_models.server_metadata()),
+    "ModelReady": _model_ready,
+    "ModelMetadata": _model_metadata,
+    "ModelConfig": _model_config,
+    "ModelStatistics": _model_statistics,
+    "RepositoryIndex": _index,
+}
+
+
+def _method(name: str) -> Callable[[InferenceService, Incoming, Any], Awaitable[Any]]:
+    async def answer(self: InferenceService, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer(name, request, grpc_context)
+
+    return answer
+
+
+for _name in (*METHODS, "ModelInfer"):
+    setattr(InferenceService, _name, _method(_name))
 
 
 class OipGrpcCodec:
@@ -321,11 +315,14 @@ def _inputs(message: Any) -> dict[str, NDArray[Any]]:
         raise RequestError(
             f"there are {len(message.inputs)} inputs and {len(raw)} raw_input_contents: one for each, or none"
         )
+    seen: set[str] = set()
+    for tensor in message.inputs:
+        if tensor.name in seen:
+            raise RequestError(f"input '{tensor.name[:64]}' is there twice")
+        seen.add(tensor.name)
     inputs: dict[str, NDArray[Any]] = {}
     for index, tensor in enumerate(message.inputs):
         label, shape = tensor.name[:64], tuple(tensor.shape)
-        if tensor.name in inputs:
-            raise RequestError(f"input '{label}' is there twice")
         dtype = check_form(label, shape, tensor.datatype, tensor.parameters)
         if raw:
             check_size(label, shape, dtype, len(raw[index]), "raw_input_contents are")

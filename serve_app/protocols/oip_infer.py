@@ -193,7 +193,9 @@ def fill_request(core: Core, request: Request, document: Mapping[str, Any], inpu
     if identity is not None and not any(name.startswith(STATE_IN) for name in inputs):
         identity = None  # there is no state that it could be of
     session_id = _session_id(sequence) if sequence else None
-    contract = core.policy(request.policy, request.version, session_id, identity).contract
+    # Of the session, or of the state of that identity, whatever the default is meanwhile.
+    policy = core.episodes.policy_of(core.store(), request.policy, request.version, session_id, identity)
+    contract = policy.contract
     binary = bool(parse_flag(parameters, "binary_data_output")) if parameters else False
     outputs = _wanted_outputs(contract, document, parameters, binary=binary)
     request.reply_options = ReplyOptions(contract, binary, outputs)

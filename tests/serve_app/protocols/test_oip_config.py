@@ -172,7 +172,7 @@ def test_a_run_that_several_requests_share_is_one_execution(store: PolicyStore) 
         batcher._several = True  # as if several had come in the turn before
         obs = np.zeros(27, np.float32)
         requests = [Request("oip", "gathered", None, time.perf_counter(), obs=obs) for _ in range(6)]
-        return await asyncio.gather(*map(core.request_path.decide, requests))
+        return await asyncio.gather(*map(core.decide, requests))
 
     ran = batcher.runs
     for decision in asyncio.run(crowd()):

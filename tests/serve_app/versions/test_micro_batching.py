@@ -224,7 +224,7 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
 
     async def calls() -> list[Any]:
         core = create_app(lambda: store, ServerSettings()).state.core
-        codec, answer = OipGrpcCodec(core), core.request_path.answer
+        codec, answer = OipGrpcCodec(core), core.answer
         asked = messages.ModelInferRequest(model_name="ur5")
         asked.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
         requests = []
@@ -295,7 +295,7 @@ def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(s
         now = time.perf_counter()
         hurried = Request("json", "ur5", None, now, obs=OBS[0], deadline_ms=30.0)
         patient = Request("json", "ur5", None, now, obs=OBS[1], deadline_ms=30_000.0)
-        decide = core.request_path.decide
+        decide = core.decide
         return await asyncio.gather(decide(hurried), decide(patient), slow(), return_exceptions=True)
 
     with watched(store, store.get("ur5")) as sizes:
