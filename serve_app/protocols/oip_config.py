@@ -37,16 +37,13 @@ def model_config(core: Core, name: str, version: str | None) -> dict[str, Any]:
     Raises UnknownPolicyError, UnknownVersionError, UnavailableError.
     """
     policy = core.store().get(name, version)
-    contract = policy.contract
-    last_action = oip_infer.last_action_inputs(contract) if policy.has_step_limit else []
-    offered = oip_infer.output_names(contract)
     config: dict[str, Any] = {
         "name": name,
         "platform": oip_models.PLATFORM,
         "backend": BACKEND,
         "max_batch_size": min(core.settings.max_batch, LARGEST_INT32),
-        "input": [_input(tensor) for tensor in (*contract.inputs, *last_action)],
-        "output": [_tensor(tensor) for tensor in contract.outputs if tensor.name in offered],
+        "input": [_input(tensor) for tensor in oip_infer.offered_inputs(policy)],
+        "output": [_tensor(tensor) for tensor in oip_infer.offered_outputs(policy.contract)],
         "default_model_filename": ONNX_FILE,
         "model_transaction_policy": {"decoupled": False},  # a request has one reply
     }

@@ -22,8 +22,8 @@ from rlservo.serve_app.protocols.oip_infer import (
     InferRequest,
     OipHttpCodec,
     accept_media_type,
-    last_action_inputs,
-    output_names,
+    offered_inputs,
+    offered_outputs,
 )
 from rlservo.serve_app.protocols.oip_tensors import datatype_of, parse_flag
 from rlservo.serve_app.server.api_keys import Access
@@ -174,7 +174,6 @@ def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]
     policy = core.store().get(name, version)
     contract = policy.contract
     versions = core.store().versions(name) if version is None else (contract.version,)
-    inputs = [*contract.inputs, *(last_action_inputs(contract) if policy.has_step_limit else ())]
 
     def described(tensor: TensorSpec) -> dict[str, Any]:
         return {"name": tensor.name, "datatype": datatype_of(tensor.dtype), "shape": tensor.shape}
@@ -183,8 +182,8 @@ def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]
         "name": name,
         "versions": versions,
         "platform": PLATFORM,
-        "inputs": [described(tensor) for tensor in inputs],
-        "outputs": [described(tensor) for tensor in contract.outputs if tensor.name in output_names(contract)],
+        "inputs": [described(tensor) for tensor in offered_inputs(policy)],
+        "outputs": [described(tensor) for tensor in offered_outputs(contract)],
     }
 
 

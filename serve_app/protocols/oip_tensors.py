@@ -55,7 +55,8 @@ def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDAr
     """
     if type(document) is not dict:
         raise RequestError(f"every entry of 'inputs' must be an object, got {json_type(document)}")
-    name, shape, datatype = document.get("name"), document.get("shape"), document.get("datatype")
+    name, datatype = document.get("name"), document.get("datatype")
+    shape: Any = document.get("shape")
     if type(name) is not str:
         raise RequestError(f"an input's 'name' must be a string, got {json_type(name)}")
     label = name[:64]

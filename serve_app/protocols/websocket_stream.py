@@ -32,7 +32,6 @@ from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.idle_timer import IdleTimer
 from rlservo.serve_app.server.request_checks import HEADERS, LABEL, REQUEST_ID, authorize, header_text, presented_key
 from rlservo.serve_app.server.request_metrics import IDLE
 
@@ -169,6 +168,35 @@ class StreamEndpoint:
                 {"policies": list(names)},
             )
         return default, None
+
+
+class IdleTimer:
+    """Cancels the task that made it when nothing happened for a while: one callback a period, not a timer a wait."""
+
+    def __init__(self, seconds: float) -> None:
+        """Start the clock for the current task."""
+        self._seconds = seconds
+        self._task = asyncio.current_task()
+        self._loop = asyncio.get_running_loop()
+        self._touched = self._loop.time()
+        self._handle = self._loop.call_later(seconds, self._check)
+        self.expired = False
+
+    def touch(self) -> None:
+        """Begin the period again."""
+        self._touched = self._loop.time()
+
+    def stop(self) -> None:
+        """Never cancel the task."""
+        self._handle.cancel()
+
+    def _check(self) -> None:
+        left = self._touched + self._seconds - self._loop.time()
+        if left > 0:
+            self._handle = self._loop.call_later(left, self._check)
+        elif self._task is not None:
+            self.expired = True
+            self._task.cancel()
 
 
 async def refuse_upgrade(

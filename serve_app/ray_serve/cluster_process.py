@@ -102,7 +102,7 @@ def _leave_out_extras() -> None:
         parameter.RayParams = functools.partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
     services = ray_parts.find("ray._private.services")
     if ray_parts.is_there("ray._private.services:start_api_server"):
-        services.start_api_server = _no_api_server
+        services.start_api_server = lambda *_, **__: ("", None)  # address and process of none
     start: Any = services.start_ray_process
 
     def start_ray_process(command: list[str], process_type: str, *arguments: Any, **more: Any) -> Any:
@@ -141,11 +141,6 @@ def _ray_ended() -> str | None:
     for name, process in [] if node is None else node.dead_processes():
         return f"its process '{name}' {describe_end(process.poll())}"
     return None
-
-
-def _no_api_server(*_: Any, **__: Any) -> tuple[str, None]:
-    """Return the address and the process of a dashboard that is not there."""
-    return "", None
 
 
 def _watch_input(stop: threading.Event, started: threading.Event, plan: dict[str, Any]) -> None:
