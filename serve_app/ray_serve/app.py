@@ -290,8 +290,3 @@ def start(
     serve.start(http_options=HTTPOptions(host=host, port=port), grpc_options=grpc_options)
     app = build(BuildArguments(policies=policies, replicas=replicas, served=served, settings=settings))
     serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)
-
-
-def stop() -> None:
-    """Shut Serve down: proxies first, then replicas, then the controller."""
-    serve.shutdown()
