@@ -190,24 +190,20 @@ def served_config(
     document = _load_config(file) if file is not None else {}
     policies = document.setdefault("policies", {})
 
-    def of(name: str) -> dict[str, Any]:
-        entry: dict[str, Any] = policies.setdefault(name, {})
-        return entry
-
     for text in versions or ():
         name, numbers = _pair(text, "ur5=3,4")
-        of(name)["versions"] = numbers.split(",")
+        policies.setdefault(name, {})["versions"] = numbers.split(",")
     for text in aliases or ():
         name, pair = _pair(text, "ur5:production=3", ":")
         key, version = _pair(pair, "ur5:production=3")
-        of(name).setdefault("aliases", {})[key] = version
+        policies.setdefault(name, {}).setdefault("aliases", {})[key] = version
     for text in canaries or ():
         name, pair = _pair(text, "ur5:candidate=0.1", ":")
         version, share = _share(pair)
-        of(name)["canary"] = {"version": version, "share": share}
+        policies.setdefault(name, {})["canary"] = {"version": version, "share": share}
     for text in shadows or ():
         name, version = _pair(text, "ur5=candidate")
-        of(name)["shadow"] = version
+        policies.setdefault(name, {})["shadow"] = version
     return document
 
 
