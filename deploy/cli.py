@@ -57,9 +57,10 @@ for command in (
     serve_commands.key,
     serve_commands.rollout,
     serve_commands.demo,
+    robot_commands.server_manager,
 ):
     app.command()(command)
-robot_commands.add_to(app)
+app.add_typer(robot_commands.robot_server, name="robot-server")
 app.add_typer(policy_commands.policy, name="policy")
 app.add_typer(cluster_commands.cluster, name="cluster")
 
