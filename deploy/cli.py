@@ -65,11 +65,12 @@ for command in (
     serve_commands.key,
     serve_commands.rollout,
     serve_commands.demo,
+    robot_commands.server_manager,
     log_commands.replay,
     log_commands.estimate,
 ):
     app.command()(command)
-robot_commands.add_to(app)
+app.add_typer(robot_commands.robot_server, name="robot-server")
 app.add_typer(policy_commands.policy, name="policy")
 app.add_typer(cluster_commands.cluster, name="cluster")
 app.add_typer(log_commands.log, name="log")

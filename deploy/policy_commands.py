@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rlservo.deploy import terminal
+from rlservo.deploy.terminal import Json, needs_extra, print_json
 from rlservo.export.contract.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ KeyFile = Annotated[
     Path | None,
     typer.Option(help="File with the admin key; else RLSERVO_ADMIN_KEY, else the one 'rlservo serve' wrote here."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document for programs.")]
 Name = Annotated[str, typer.Argument(help="Policy name.")]
 LOCAL = "http://127.0.0.1:8000"
 
@@ -42,7 +42,7 @@ def list_policies(url: Url = LOCAL, key_file: KeyFile = None, as_json: Json = Fa
     with _client(url, key_file) as client:
         replicas = client.replicas()
     if as_json:
-        print(json.dumps(replicas, indent=2))
+        print_json(replicas)
         return
     for replica in replicas:
         terminal.output().print(_table(replica))
@@ -68,8 +68,7 @@ def load(
 
     Example: `rlservo policy load ur5 4`
     """
-    with _client(url, key_file) as client:
-        _show(client.load(name, version), as_json)
+    _change(url, key_file, as_json, lambda client: client.load(name, version))
 
 
 @policy.command()
@@ -84,8 +83,7 @@ def unload(
 
     Example: `rlservo policy unload ur5 3`
     """
-    with _client(url, key_file) as client:
-        _show(client.unload(name, version), as_json)
+    _change(url, key_file, as_json, lambda client: client.unload(name, version))
 
 
 @policy.command()
@@ -101,8 +99,7 @@ def alias(
     Example: `rlservo policy alias ur5 production=4`
     """
     key, version = _pair(pair, "production=4")
-    with _client(url, key_file) as client:
-        _show(client.alias(name, key, version or None), as_json)
+    _change(url, key_file, as_json, lambda client: client.alias(name, key, version or None))
 
 
 @policy.command()
@@ -117,8 +114,7 @@ def rollback(
 
     Example: `rlservo policy rollback ur5`
     """
-    with _client(url, key_file) as client:
-        _show(client.rollback(name, alias), as_json)
+    _change(url, key_file, as_json, lambda client: client.rollback(name, alias))
 
 
 @policy.command()
@@ -134,8 +130,7 @@ def canary(
     Example: `rlservo policy canary ur5 candidate=0.1`
     """
     version, share = (None, None) if pair == "off" else _share(pair)
-    with _client(url, key_file) as client:
-        _show(client.canary(name, version, share), as_json)
+    _change(url, key_file, as_json, lambda client: client.canary(name, version, share))
 
 
 @policy.command()
@@ -150,8 +145,7 @@ def shadow(
 
     Example: `rlservo policy shadow ur5 candidate`
     """
-    with _client(url, key_file) as client:
-        _show(client.shadow(name, None if version == "off" else version), as_json)
+    _change(url, key_file, as_json, lambda client: client.shadow(name, None if version == "off" else version))
 
 
 # What `rlservo serve` says of versions.
@@ -196,24 +190,20 @@ def served_config(
     document = _load_config(file) if file is not None else {}
     policies = document.setdefault("policies", {})
 
-    def of(name: str) -> dict[str, Any]:
-        entry: dict[str, Any] = policies.setdefault(name, {})
-        return entry
-
     for text in versions or ():
         name, numbers = _pair(text, "ur5=3,4")
-        of(name)["versions"] = numbers.split(",")
+        policies.setdefault(name, {})["versions"] = numbers.split(",")
     for text in aliases or ():
-        name, pair = _of_policy(text, "ur5:production=3")
+        name, pair = _pair(text, "ur5:production=3", ":")
         key, version = _pair(pair, "ur5:production=3")
-        of(name).setdefault("aliases", {})[key] = version
+        policies.setdefault(name, {}).setdefault("aliases", {})[key] = version
     for text in canaries or ():
-        name, pair = _of_policy(text, "ur5:candidate=0.1")
+        name, pair = _pair(text, "ur5:candidate=0.1", ":")
         version, share = _share(pair)
-        of(name)["canary"] = {"version": version, "share": share}
+        policies.setdefault(name, {})["canary"] = {"version": version, "share": share}
     for text in shadows or ():
         name, version = _pair(text, "ur5=candidate")
-        of(name)["shadow"] = version
+        policies.setdefault(name, {})["shadow"] = version
     return document
 
 
@@ -239,18 +229,11 @@ def _parse_yaml(text: str) -> Any:
         raise ValueError(str(error)) from None
 
 
-def _pair(text: str, example: str) -> tuple[str, str]:
-    key, equals, value = text.partition("=")
-    if not key or not equals:
+def _pair(text: str, example: str, separator: str = "=") -> tuple[str, str]:
+    key, found, value = text.partition(separator)
+    if not key or not found:
         raise UsageError(f"{text!r}: expected for example {example}")
     return key, value
-
-
-def _of_policy(text: str, example: str) -> tuple[str, str]:
-    name, colon, rest = text.partition(":")
-    if not name or not colon:
-        raise UsageError(f"{text!r}: expected for example {example}")
-    return name, rest
 
 
 def _share(pair: str) -> tuple[str, float]:
@@ -263,19 +246,18 @@ def _share(pair: str) -> tuple[str, float]:
 
 @contextlib.contextmanager
 def _client(url: str, key_file: Path | None) -> Iterator[AdminClient]:
-    try:
+    with needs_extra("client"):
         from rlservo.serve_app.client.admin_client import AdminClient, find_key
-    except ModuleNotFoundError as error:
-        raise UsageError(
-            f"this command needs the Python package {error.name!r}: pip install 'rlservo[client]'"
-        ) from error
     with AdminClient(url, api_key=find_key(url, key_file)) as client:
         yield client
 
 
-def _show(reply: dict[str, Any], as_json: bool) -> None:
+def _change(url: str, key_file: Path | None, as_json: bool, change: Callable[[AdminClient], dict[str, Any]]) -> None:
+    """Make a change of what is served, and show what is served then."""
+    with _client(url, key_file) as client:
+        reply = change(client)
     if as_json:
-        print(json.dumps(reply, indent=2))
+        print_json(reply)
         return
     aliases = ", ".join(f"{alias}={version}" for alias, version in reply["aliases"].items()) or "none"
     lines = [f"{reply['policy']}: default {reply['default']}, loaded {', '.join(reply['versions']) or 'none'}"]

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from rlservo.deploy import terminal
-from rlservo.export.contract.errors import RlservoError, UsageError
+from rlservo.export.contract.errors import UsageError
+
+if TYPE_CHECKING:
+    from rlservo.envs.robot_server.settings import Settings
 
 robot_server = typer.Typer(
     help="Serve a simulated robot to robo-gym's environments. It is a drop-in for the ROS robot server.",
@@ -133,15 +136,11 @@ def server_manager(
         )
 
 
-def _serve(settings: object, title: str) -> None:
+def _serve(settings: Settings, title: str) -> None:
     from rlservo.envs.robot_server.server import serve_robot
-    from rlservo.envs.robot_server.settings import Mir100Settings, URSettings
-
-    assert isinstance(settings, URSettings | Mir100Settings)
-    host = settings.host
 
     def ready(port: int) -> None:
-        terminal.output().print(f"robot server on {host}:{port}: {title}; Ctrl-C stops it", highlight=False)
+        terminal.output().print(f"robot server on {settings.host}:{port}: {title}; Ctrl-C stops it", highlight=False)
 
     serve_robot(settings, on_ready=ready)
 
@@ -151,19 +150,7 @@ def _one_sentence_errors() -> Iterator[None]:
     """Turn what the simulators refuse into the command line's errors, and say which extra is missing."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     try:
-        yield
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("rlservo"):
-            raise
-        raise UsageError(f"this command needs the Python package {error.name!r}: pip install 'rlservo[sim]'") from error
+        with terminal.needs_extra("sim"):
+            yield
     except ValueError as error:
         raise UsageError(str(error)) from error
-    except OSError as error:
-        raise RlservoError(str(error)) from error
-
-
-def add_to(app: typer.Typer) -> None:
-    """Add both commands to the command line."""
-    app.add_typer(robot_server, name="robot-server")
-    command: Callable[..., None] = server_manager
-    app.command("server-manager")(command)

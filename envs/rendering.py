@@ -5,11 +5,37 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 RENDER_MODES = ("human", "rgb_array")
+
+
+class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """An environment that shows its simulator; one that derives from it sets `_camera`."""
+
+    _camera: Camera
+
+    def __init__(self, render_mode: str | None, *, gui: bool) -> None:
+        if gui and render_mode is None:
+            render_mode = "human"  # what robo-gym's `gui` shows
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(f"render_mode {render_mode!r} does not exist: expected one of {', '.join(RENDER_MODES)}")
+        self.render_mode = render_mode
+
+    def render(self) -> Any:
+        """Return an (480, 640, 3) uint8 frame in mode rgb_array; the window of mode human refreshes by itself."""
+        return self._camera.frame() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Free the GL context and close the window."""
+        self._camera.close()
+
+    def _refresh_window(self) -> None:
+        if self.render_mode == "human":
+            self._camera.show()
 
 
 class Camera:

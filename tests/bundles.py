@@ -34,9 +34,9 @@ from rlservo.export.contract.contract import (
     TensorSpec,
 )
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, Element
-from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.versions.version_loader import VersionLoader
 
 ROOT = Path(__file__).resolve().parents[1]
 OBS = 27
@@ -389,11 +389,8 @@ def controlled() -> Callable[..., AbstractContextManager[ReplicaVersions]]:
 
     @contextlib.contextmanager
     def control_of(*folders: Path, config: Any = None) -> Iterator[ReplicaVersions]:
-        control = ReplicaVersions(LoadedPolicies(Repository(list(folders))), MemoryLedger(), replica="only")
-        try:
-            asyncio.run(control.configure({} if config is None else config))
-            yield control
-        finally:
-            control.close()
+        control = ReplicaVersions(VersionLoader(Repository(list(folders))), MemoryLedger(), replica="only")
+        asyncio.run(control.configure({} if config is None else config))
+        yield control
 
     return control_of

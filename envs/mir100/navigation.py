@@ -26,7 +26,7 @@ from rlservo.envs.mir100.parameters import (
 )
 from rlservo.envs.mir100.simulation import Mir100Simulation, wrap_angle
 from rlservo.envs.mir100.worlds import Pose
-from rlservo.envs.rendering import RENDER_MODES, Camera
+from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
 
 LINEAR_SCALE, ANGULAR_SCALE = 0.5, 0.7  # [m/s], [rad/s], of an action of 1
 SUCCESS_DISTANCE = 0.2  # [m]
@@ -41,7 +41,7 @@ RESET_OPTIONS = ("start_pose", "target_pose")
 Observation = NDArray[np.float32]
 
 
-class Mir100Navigation(gym.Env[Observation, NDArray[np.float32]]):
+class Mir100Navigation(RenderedEnv):
     """Drive the MiR100 to a target; the tasks that derive from it hold the data sheets."""
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
@@ -65,11 +65,7 @@ class Mir100Navigation(gym.Env[Observation, NDArray[np.float32]]):
     ) -> None:
         del ip, lower_bound_port, upper_bound_port, rs_address  # no robot server to reach
         del rs_state_to_info  # robo-gym's MiR100 environments accept it and put nothing into info either
-        if gui and render_mode is None:
-            render_mode = "human"  # what robo-gym's `gui` shows
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(f"render_mode {render_mode!r} does not exist: expected one of {', '.join(RENDER_MODES)}")
-        self.render_mode = render_mode
+        super().__init__(render_mode, gui=gui)
         self.simulation = Mir100Simulation(self.WORLD, laser_noise=laser_noise)
         self._elements = self.describe()["action"]
 
@@ -124,8 +120,7 @@ class Mir100Navigation(gym.Env[Observation, NDArray[np.float32]]):
         self._place(start, target.tolist() if isinstance(target, np.ndarray) else target)
         self._steps = 0
         self._previous_distance = None
-        if self.render_mode == "human":
-            self._camera.show()
+        self._refresh_window()
         return self._observation(*self._target_polar()), {}
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -151,17 +146,8 @@ class Mir100Navigation(gym.Env[Observation, NDArray[np.float32]]):
         if truncated:
             status = "max_steps_exceeded"
         info = {} if status is None else {"final_status": status, "is_success": status == "success"}
-        if self.render_mode == "human":
-            self._camera.show()
+        self._refresh_window()
         return self._observation(distance, bearing), reward, terminated, truncated, info
-
-    def render(self) -> Any:
-        """Return an (480, 640, 3) uint8 frame in mode rgb_array; the window of mode human refreshes by itself."""
-        return self._camera.frame() if self.render_mode == "rgb_array" else None
-
-    def close(self) -> None:
-        """Free the GL context and close the window."""
-        self._camera.close()
 
     # -- what a task adds
 

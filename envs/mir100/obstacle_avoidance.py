@@ -44,14 +44,8 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
 
     ## Action: Box(2,), float32, -1 .. 1
 
-    | index | name | one means |
-    |---|---|---|
-    | 0 | linear_velocity_normalized | 0.5 m/s |
-    | 1 | angular_velocity_normalized | 0.7 rad/s |
-
-    The robot changes its velocities by at most 2.0 m/s^2 and 2.5 rad/s^2. An action outside the space raises
-    `InvalidActionError` naming the element and the excess. The robot refuses to move while something is within 0.04 m
-    of a scanner, which is inside its housing: no episode lasts that long.
+    That of `NoObstacleNavigationMir100Sim`: velocities up to 0.5 m/s and 0.7 rad/s. The robot refuses to move while
+    something is within 0.04 m of a scanner, which is inside its housing: no episode lasts that long.
 
     ## Reward
 
@@ -80,10 +74,7 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
 
     ## Constructor
 
-    `render_mode`. robo-gym's `ip`, `lower_bound_port`, `upper_bound_port` and `rs_address` are accepted and unused:
-    there is no server to find; so is `rs_state_to_info`: robo-gym's MiR100 environments never put the server's state
-    into info (it is `env.simulation.state()` here). `gui=True` is `render_mode="human"`. `laser_noise`, of our own,
-    is the standard deviation of the readings in m.
+    That of `NoObstacleNavigationMir100Sim`; `laser_noise` is the standard deviation of the readings in m.
 
     ## Differences from robo-gym on Gazebo
 

@@ -20,7 +20,6 @@ from rlservo.envs.mir100.parameters import (
     BEAM_COUNT,
     COMMAND_TIMEOUT_S,
     CYCLE_S,
-    FRONT_SCANNER,
     LASER_NOISE,
     MAX_ANGULAR_ACCELERATION,
     MAX_ANGULAR_VELOCITY,
@@ -179,16 +178,6 @@ class Mir100Simulation:
         """
         self._bring_scan_up_to_date()
         return self._lasers.readings
-
-    @property
-    def front_scan(self) -> Vector:
-        """The front scanner's readings [m], (501,), a part of `scan`."""
-        return self.scan[: FRONT_SCANNER.count]
-
-    @property
-    def back_scan(self) -> Vector:
-        """The back scanner's readings [m], (511,), a part of `scan`."""
-        return self.scan[FRONT_SCANNER.count :]
 
     @property
     def is_blocked(self) -> bool:

@@ -10,11 +10,11 @@ from concurrent import futures
 from typing import Any
 
 import grpc
-from google.protobuf.message import DecodeError
 
 from rlservo.envs.robot_server.launch_line import parse_launch_line
 from rlservo.envs.robot_server.messages import SERVER_MANAGER, ManagerStatus, ServerRequest
 from rlservo.envs.robot_server.robot import CLOCKS
+from rlservo.envs.robot_server.rpc_handler import rpc_handler
 from rlservo.envs.robot_server.server import OPTIONS, PortInUseError, arrives, bind, stop_signals
 from rlservo.envs.robot_server.server_process import ServerProcess
 from rlservo.envs.robot_server.settings import Settings, URSettings
@@ -159,9 +159,7 @@ class ManagerService:
             "KillAllServers": self._kill_all,
             "VerifyConnection": lambda _: ManagerStatus(alive=True),
         }
-        return grpc.method_handlers_generic_handler(
-            SERVER_MANAGER, {name: self._answering(name, call) for name, call in calls.items()}
-        )
+        return rpc_handler(SERVER_MANAGER, calls, lambda _name, reason: ServerRequest(success=False, info=reason), log)
 
     def _start(self, request: bytes) -> Any:
         message = ServerRequest.FromString(request)
@@ -175,25 +173,6 @@ class ManagerService:
         ServerRequest.FromString(request)
         self._servers.kill_all()
         return ServerRequest(success=True)
-
-    @staticmethod
-    def _answering(name: str, call: Callable[[bytes], Any]) -> grpc.RpcMethodHandler:
-        def answer(request: bytes, _context: grpc.ServicerContext) -> bytes:
-            try:
-                message = call(request)
-            except (DecodeError, ValueError) as error:
-                reason = f"{len(request)} bytes that are no such message" if isinstance(error, DecodeError) else error
-                log.error("%s: %s", name, reason)
-                message = ServerRequest(success=False, info=str(reason))
-            except Exception as error:
-                log.exception("%s failed", name)
-                message = ServerRequest(
-                    success=False, info=f"{type(error).__name__} in the server manager, see its log"
-                )
-            reply: bytes = message.SerializeToString()
-            return reply
-
-        return grpc.unary_unary_rpc_method_handler(answer)
 
 
 class ServerManager:

@@ -1,12 +1,14 @@
-"""Interface of a robot behind a robot server: put it somewhere, command it for one cycle, look at it."""
+"""Robot behind a robot server: put it somewhere, command it for one cycle, look at it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
-from rlservo.envs.rendering import Camera
+if TYPE_CHECKING:  # MuJoCo is imported where a robot is made
+    from rlservo.envs.robot_server.mir100_robot import Mir100Robot
+    from rlservo.envs.robot_server.ur_robot import URRobot
 
 CLOCKS = ("fast", "real")
 
@@ -21,31 +23,5 @@ class RobotState:
     string_params: Mapping[str, str] = field(default_factory=dict)
 
 
-class Robot(Protocol):
-    """A simulated robot with the server's vocabulary. Every method raises ValueError for what it cannot honour."""
-
-    @property
-    def camera(self) -> Camera:
-        """The window that shows the robot."""
-        ...
-
-    @property
-    def cycle_s(self) -> float:
-        """How long a control cycle lasts [s]."""
-        ...
-
-    def state(self) -> RobotState:
-        """Return the state of this moment."""
-        ...
-
-    def set_state(self, target: RobotState) -> int:
-        """Reset the robot and what is around it. Return how many cycles that took."""
-        ...
-
-    def act(self, action: Sequence[float]) -> None:
-        """Command the robot and let one cycle pass."""
-        ...
-
-    def idle(self, cycles: int) -> None:
-        """Let cycles pass in which no command arrived."""
-        ...
+Robot: TypeAlias = "URRobot | Mir100Robot"
+"""A simulated robot with the server's vocabulary. Every method raises ValueError for what it cannot honour."""

@@ -1,7 +1,6 @@
 """robo-gym's RobotServer service over a robot: the one file here that knows both.
 
-Requests are parsed here rather than by gRPC, so that garbage is answered like every other error: `success = false`, and
-a line in the log that says why. The message has no field for a reason.
+An error is answered with `success = false`: the message has no field for a reason, which is in the log.
 """
 
 from __future__ import annotations
@@ -12,11 +11,11 @@ from collections.abc import Callable
 from typing import Any
 
 import grpc
-from google.protobuf.message import DecodeError
 
 from rlservo.envs.robot_server.clock import Clock
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, Action, Empty, State, Success
 from rlservo.envs.robot_server.robot import Robot, RobotState
+from rlservo.envs.robot_server.rpc_handler import rpc_handler
 
 log = logging.getLogger("rlservo.robot_server")
 
@@ -37,10 +36,12 @@ class RobotService:
             "SendAction": self.send_action,
             "SendActionGetState": self.send_action_get_state,
         }
-        failure = {"GetState": State, "SendActionGetState": State, "SetState": Success, "SendAction": Success}
-        return grpc.method_handlers_generic_handler(
-            ROBOT_SERVER, {name: self._answering(name, call, failure[name]) for name, call in calls.items()}
-        )
+        kinds = {"GetState": State, "SendActionGetState": State, "SetState": Success, "SendAction": Success}
+
+        def fail(name: str, _reason: str) -> Any:
+            return kinds[name](success=False)
+
+        return rpc_handler(ROBOT_SERVER, calls, fail, log)
 
     def get_state(self, request: bytes) -> Any:
         """Answer GetState."""
@@ -99,24 +100,6 @@ class RobotService:
         except Exception as error:  # whatever a display can do; the robot goes on without a window
             log.warning("no window: %s", error)
             self._gui = False
-
-    def _answering(self, name: str, call: Callable[[bytes], Any], failure: Any) -> grpc.RpcMethodHandler:
-        def answer(request: bytes, _context: grpc.ServicerContext) -> bytes:
-            try:
-                message = call(request)
-            except DecodeError:
-                log.error("%s: %d bytes that are no such message", name, len(request))
-                message = failure(success=False)
-            except ValueError as error:
-                log.error("%s: %s", name, error)
-                message = failure(success=False)
-            except Exception:
-                log.exception("%s failed", name)
-                message = failure(success=False)
-            reply: bytes = message.SerializeToString()
-            return reply
-
-        return grpc.unary_unary_rpc_method_handler(answer)
 
 
 def _message(state: RobotState) -> Any:

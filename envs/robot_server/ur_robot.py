@@ -16,15 +16,16 @@ from rlservo.envs.robot_server.robot import RobotState
 from rlservo.envs.robot_server.settings import URSettings
 from rlservo.envs.ur.object_paths import object_path
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
-from rlservo.envs.ur.rs_modes import ROS_ORDER, positions_in_list, state_length
-from rlservo.envs.ur.server_state import state_dict, state_list
+from rlservo.envs.ur.rs_modes import ROS_ORDER, state_names
+from rlservo.envs.ur.server_state import state_dict
 from rlservo.envs.ur.simulation import SETTLE_CYCLES, VIEW, URSimulation
 
 INITIAL_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad], until the first SetState
 ROS_JOINTS = [JOINTS[index] for index in ROS_ORDER]
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
 ROUNDING = 1e-5  # [rad], by which a float32 may exceed a limit
-OLD_LIST_POSITIONS = slice(6, 12)  # where a list that is no state of ours has them, as in robo-gym's first versions
+# A list that is no state of ours has the positions after six other numbers, as in robo-gym's first versions.
+OLD_LIST = (*range(6), *(f"{joint}_joint_position" for joint in ROS_JOINTS))
 
 
 class URRobot:
@@ -54,11 +55,8 @@ class URRobot:
 
     def state(self) -> RobotState:
         """Return the state of the server's mode, as a list and by names."""
-        mode = self._settings.rs_mode
-        return RobotState(
-            values=state_list(self.simulation, mode, is_turned=self._is_turned),
-            names=state_dict(self.simulation, mode, is_turned=self._is_turned),
-        )
+        names = state_dict(self.simulation, self._settings.rs_mode, is_turned=self._is_turned)
+        return RobotState(values=list(names.values()), names=names)
 
     def set_state(self, target: RobotState) -> int:
         """Put the arm where the state says, set the objects going, and let 20 cycles pass."""
@@ -101,13 +99,11 @@ class URRobot:
             joints = np.array([target.names[name] for name in names], dtype=np.float64)
         elif target.values:
             mode, count = self._settings.rs_mode, len(target.values)
-            part = positions_in_list(mode) if count == state_length(mode) else OLD_LIST_POSITIONS
-            if count < part.stop:
-                raise ValueError(
-                    f"the state has {count} elements: expected {state_length(mode)}, those of rs_mode {mode!r}"
-                )
-            in_list = list(target.values[part])
-            joints = np.array([in_list[index] for index in ROS_ORDER], dtype=np.float64)
+            in_list = state_names(mode)
+            by_name = dict(zip(in_list if count == len(in_list) else OLD_LIST, target.values, strict=False))
+            if not by_name.keys() >= set(names):
+                raise ValueError(f"the state has {count} elements: expected {len(in_list)}, those of rs_mode {mode!r}")
+            joints = np.array([by_name[name] for name in names], dtype=np.float64)
         else:
             missing = ", ".join(name for name in names if name not in target.names)
             raise ValueError(f"state_dict lacks {missing}, and state is empty: expected where to put the arm")

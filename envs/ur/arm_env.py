@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, TypedDict
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -24,7 +24,7 @@ from rlservo.envs.checks import (
     check_option_names,
     element,
 )
-from rlservo.envs.rendering import RENDER_MODES, Camera
+from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
 from rlservo.envs.ur.simulation import VIEW, URSimulation
 
@@ -35,28 +35,7 @@ Observation = NDArray[np.float32]
 Vector = NDArray[np.float64]
 
 
-class ArmArguments(TypedDict, total=False):
-    """Constructor arguments that every task of the arm takes."""
-
-    fix_base: bool
-    fix_shoulder: bool
-    fix_elbow: bool
-    fix_wrist_1: bool
-    fix_wrist_2: bool
-    fix_wrist_3: bool
-    ur_model: str
-    rs_state_to_info: bool
-    gui: bool
-    max_velocity_scale_factor: float | None
-    action_cycle_rate: float | None
-    render_mode: str | None
-    rs_address: str | None
-    ip: str | None
-    lower_bound_port: int | None
-    upper_bound_port: int | None
-
-
-class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
+class URArmEnv(RenderedEnv):
     """Move a UR arm by one command per joint and cycle; the tasks that derive from it hold the data sheets."""
 
     # Not a ClassVar: each instance states its own rate.
@@ -69,6 +48,7 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
     OBJECTS: ClassVar[tuple[str, ...]]
     TABLE: ClassVar[bool]
     ACTION_ELEMENT: ClassVar[tuple[str, str]]  # what follows the joint's name, and its unit
+    TIME_LIMIT_STATUS: ClassVar[str] = "success"  # the final status of an episode that lasts MAX_STEPS
     MAX_VELOCITY_SCALE: ClassVar[float] = 0.2
     RATE_HZ: ClassVar[float] = 20.0
 
@@ -97,13 +77,9 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
         fixed = np.array((fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3))
         scale = self.MAX_VELOCITY_SCALE if max_velocity_scale_factor is None else max_velocity_scale_factor
         rate_hz = self.RATE_HZ if action_cycle_rate is None else action_cycle_rate
-        if gui and render_mode is None:
-            render_mode = "human"  # what robo-gym's `gui` shows
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(f"render_mode {render_mode!r} does not exist: expected one of {', '.join(RENDER_MODES)}")
         if fixed.all():
             raise ValueError("all six joints are fixed: there is nothing left to act on")
-        self.render_mode = render_mode
+        super().__init__(render_mode, gui=gui)
         self.metadata = {**self.metadata, "render_fps": rate_hz}
         self.simulation = URSimulation(
             ur_model,
@@ -146,8 +122,7 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._steps = 0
         self._start = self._place_arm(options)
         self._begin(options)
-        if self.render_mode == "human":
-            self._camera.show()
+        self._refresh_window()
         return self._observation(), {}
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -161,20 +136,18 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.simulation.advance()
 
         observation = self._observation()
-        reward, terminated, truncated, info = self._judge(observation, command)
+        reward, status = self._judge(observation, command)
+        terminated = status is not None
+        truncated = not terminated and self._steps >= self.MAX_STEPS
+        if truncated:
+            status = self.TIME_LIMIT_STATUS
+        info: dict[str, Any] = {}
+        if status is not None:
+            info = {"final_status": status, "is_success": status == "success", **self._final_info(status)}
         if self._rs_state_to_info:
             info["rs_state"] = self.simulation.state(self.RS_MODE)
-        if self.render_mode == "human":
-            self._camera.show()
+        self._refresh_window()
         return observation, reward, terminated, truncated, info
-
-    def render(self) -> Any:
-        """Return an (480, 640, 3) uint8 frame in mode rgb_array; the window of mode human refreshes by itself."""
-        return self._camera.frame() if self.render_mode == "rgb_array" else None
-
-    def close(self) -> None:
-        """Free the GL context and close the window."""
-        self._camera.close()
 
     # -- what a task adds
 
@@ -204,8 +177,15 @@ class URArmEnv(gym.Env[Observation, NDArray[np.float32]]):
         """Return the observation of this moment."""
 
     @abstractmethod
-    def _judge(self, observation: Observation, command: Vector) -> tuple[float, bool, bool, dict[str, Any]]:
-        """Return reward, terminated, truncated and info of the step that ended with `observation`."""
+    def _judge(self, observation: Observation, command: Vector) -> tuple[float, str | None]:
+        """Return the reward of the step that ended with `observation`, and the final status where it ends the episode.
+
+        The time limit is not its concern.
+        """
+
+    def _final_info(self, status: str) -> dict[str, Any]:  # noqa: ARG002
+        """Return what the last step's info holds besides the status."""
+        return {}
 
     # -- parts
 

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from typing_extensions import Unpack
 
 from rlservo.envs.checks import InvalidResetError, as_vector
-from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, ArmArguments, Observation, URArmEnv, Vector, polar
+from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
 from rlservo.envs.ur.object_paths import object_path
 from rlservo.envs.ur.parameters import JOINTS
 
@@ -96,7 +95,7 @@ class BasicAvoidanceURSim(URArmEnv):
     TABLE = True
     ACTION_ELEMENT = ("offset", "rad")
 
-    def __init__(self, *, include_polar_to_elbow: bool = False, **arguments: Unpack[ArmArguments]) -> None:
+    def __init__(self, *, include_polar_to_elbow: bool = False, **arguments: Any) -> None:
         self._include_polar_to_elbow = include_polar_to_elbow
         super().__init__(**arguments)
         self._previous_action: Vector = np.zeros(6)
@@ -174,7 +173,7 @@ class BasicAvoidanceURSim(URArmEnv):
             observation[15:18] = polar((ball - sim.forearm_position) @ sim.forearm_rotation)
         return observation
 
-    def _judge(self, observation: Observation, command: Vector) -> tuple[float, bool, bool, dict[str, Any]]:
+    def _judge(self, observation: Observation, command: Vector) -> tuple[float, str | None]:
         sim = self.simulation
         ball = sim.object_position(0)
         reward = 0.0
@@ -186,13 +185,7 @@ class BasicAvoidanceURSim(URArmEnv):
         if nearest < MINIMUM_DISTANCE:
             reward -= CLOSE_COST
         self._previous_action = command
+        return reward, "collision" if sim.in_collision else None
 
-        if sim.in_collision:
-            return reward, True, False, _ending("collision", ball)
-        if self._steps >= self.MAX_STEPS:
-            return reward, False, True, _ending("success", ball)
-        return reward, False, False, {}
-
-
-def _ending(status: str, ball: Vector) -> dict[str, Any]:
-    return {"final_status": status, "is_success": status == "success", "target_coord": ball}
+    def _final_info(self, status: str) -> dict[str, Any]:  # noqa: ARG002
+        return {"target_coord": self.simulation.object_position(0)}

@@ -96,10 +96,6 @@ class EmptyEnvironmentURSim(URArmEnv):
         observation[6:] = self.simulation.joint_velocities
         return observation
 
-    def _judge(self, observation: Observation, command: Vector) -> tuple[float, bool, bool, dict[str, Any]]:
+    def _judge(self, observation: Observation, command: Vector) -> tuple[float, str | None]:
         del observation, command  # nothing to reach
-        if self.simulation.in_collision:
-            return 0.0, True, False, {"final_status": "collision", "is_success": False}
-        if self._steps >= self.MAX_STEPS:
-            return 0.0, False, True, {"final_status": "success", "is_success": True}
-        return 0.0, False, False, {}
+        return 0.0, "collision" if self.simulation.in_collision else None

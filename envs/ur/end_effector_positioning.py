@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from typing_extensions import Unpack
 
 from rlservo.envs.checks import InvalidResetError, as_vector
-from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, ArmArguments, Observation, URArmEnv, Vector, polar
+from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
 from rlservo.envs.ur.parameters import JOINTS
 
 START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
@@ -94,12 +93,11 @@ class EndEffectorPositioningURSim(URArmEnv):
     OBJECTS = ("sphere50_no_collision",)
     TABLE = True
     ACTION_ELEMENT = ("position_normalized", "1")
+    TIME_LIMIT_STATUS = "max_steps_exceeded"
     MAX_VELOCITY_SCALE = 0.1
     RATE_HZ = 10.0
 
-    def __init__(
-        self, *, restrict_wrist_1: bool = True, randomize_start: bool = False, **arguments: Unpack[ArmArguments]
-    ) -> None:
+    def __init__(self, *, restrict_wrist_1: bool = True, randomize_start: bool = False, **arguments: Any) -> None:
         super().__init__(**arguments)
         self._restrict_wrist_1 = restrict_wrist_1
         self._randomize_start = randomize_start
@@ -181,20 +179,17 @@ class EndEffectorPositioningURSim(URArmEnv):
         observation[21:27] = self._previous_action
         return observation
 
-    def _judge(self, observation: Observation, command: Vector) -> tuple[float, bool, bool, dict[str, Any]]:
+    def _judge(self, observation: Observation, command: Vector) -> tuple[float, str | None]:
         self._previous_action = command  # after the observation: robo-gym's order, see the data sheet
         distance = float(observation[0])
         if self.simulation.in_collision:
-            return -1.0, True, False, self._ending("collision")
+            return -1.0, "collision"
         if distance <= SUCCESS_DISTANCE:
             self._success_joints = self.simulation.joint_positions.copy()
-            return 2.0, True, False, self._ending("success")
-        reward = -0.005 * distance
-        if self._steps >= self.MAX_STEPS:
-            return reward, False, True, self._ending("max_steps_exceeded")
-        return reward, False, False, {}
+            return 2.0, "success"
+        return -0.005 * distance, None
 
-    def _ending(self, status: str) -> dict[str, Any]:
+    def _final_info(self, status: str) -> dict[str, Any]:
         if status != "success":
             self._success_joints = None
-        return {"final_status": status, "is_success": status == "success", "target_coord": self._target.copy()}
+        return {"target_coord": self._target.copy()}

@@ -7,14 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-ROS_ORDER = (
-    2,
-    1,
-    0,
-    3,
-    4,
-    5,
-)  # elbow, shoulder, base, wrists; the same list turns ROS order back into the standard one
+from rlservo.envs.ur.parameters import JOINTS
+
+# Elbow, shoulder, base, wrists; the same list turns ROS order back into the standard one.
+ROS_ORDER = (2, 1, 0, 3, 4, 5)
 
 
 @dataclass(frozen=True)
@@ -40,13 +36,19 @@ def rs_mode_of(name: str) -> RsMode:
     return RS_MODES[name]
 
 
-def state_length(rs_mode: str) -> int:
-    """Return how long the list of a mode is."""
+def state_names(rs_mode: str) -> list[str]:
+    """Return the names of a mode's numbers, in the order of its list: joints in ROS order."""
     mode = rs_mode_of(rs_mode)
-    return 7 * mode.objects + 20 + 7 * mode.forearm
+    joints = [JOINTS[index] for index in ROS_ORDER]
+    return [
+        *(name for index in range(mode.objects) for name in _transform_names(f"object_{index}")),
+        *(f"{joint}_joint_{quantity}" for quantity in ("position", "velocity") for joint in joints),
+        *_transform_names("ee"),
+        "in_collision",
+        *(_transform_names("forearm") if mode.forearm else ()),
+    ]
 
 
-def positions_in_list(rs_mode: str) -> slice:
-    """Return where a mode's list holds the joint positions."""
-    start = 7 * rs_mode_of(rs_mode).objects
-    return slice(start, start + 6)
+def _transform_names(frame: str) -> list[str]:
+    elements = [*(f"translation_{axis}" for axis in "xyz"), *(f"rotation_{axis}" for axis in "xyzw")]
+    return [f"{frame}_to_ref_{element}" for element in elements]

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.checkpoints.location import CTOR_FILE, FACTS_FILE
-from rlservo.export.checkpoints.old_location import ALGORITHM_STATE, POLICY_STATE, old_stack_root
+from rlservo.export.checkpoints.old_location import ALGORITHM_STATE, POLICY_STATE, RLLIB_FILE, old_stack_root
 from rlservo.export.checkpoints.unpickle import unpickle
 from rlservo.export.contract.errors import CheckpointError
 
@@ -144,6 +144,6 @@ def _whole(number: Any) -> int | None:
 
 def _ray_version(root: Path) -> str | None:
     try:
-        return str(json.loads((root / "rllib_checkpoint.json").read_text(encoding="utf-8"))["ray_version"])
+        return str(json.loads((root / RLLIB_FILE).read_text(encoding="utf-8"))["ray_version"])
     except (OSError, ValueError, KeyError, TypeError):
         return None

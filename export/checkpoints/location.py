@@ -7,12 +7,18 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
-from rlservo.export.checkpoints.old_location import OldStackFiles, locate_policy, old_stack_root, policy_ids
+from rlservo.export.checkpoints.old_location import (
+    DEFAULT_POLICY,
+    OldStackFiles,
+    choose,
+    locate_policy,
+    old_stack_root,
+    policy_ids,
+)
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 
 MODULES = Path("learner_group") / "learner" / "rl_module"
@@ -23,7 +29,6 @@ MODULE_TO_ENV = "module_to_env_connector"
 CTOR_FILE = "class_and_ctor_args.pkl"
 STATE_STEMS = {"module": "module_state", "connector": "state"}
 STATE_SUFFIXES = (".pkl", ".msgpack")
-DEFAULT_MODULE = "default_policy"
 FACTS_FILE = "rlservo_facts.json"
 """Written by `prune.py` in place of RLlib's own configuration pickles."""
 
@@ -50,7 +55,7 @@ class CheckpointFiles:
     @property
     def is_one_of_several(self) -> bool:
         """Whether the policy goes by an id of its own, and may have others beside it."""
-        return self.module_id != DEFAULT_MODULE and (self.part or not self.alone)
+        return self.module_id != DEFAULT_POLICY and (self.part or not self.alone)
 
     @property
     def module(self) -> Path:
@@ -120,9 +125,9 @@ def locate_checkpoint(path: str | Path, module_id: str | None = None, agent_id: 
     if _is_module(root):
         parts = _parts(root)
         if parts:
-            module_id = _choose(root, parts, module_id)
+            module_id = choose(root, parts, module_id, "module", "modules")
             root /= module_id
-        alone = CheckpointFiles(root, module_id or DEFAULT_MODULE, alone=True, part=bool(parts))
+        alone = CheckpointFiles(root, module_id or DEFAULT_POLICY, alone=True, part=bool(parts))
         _check_complete(alone)
         return alone
     if not (root / MODULES).is_dir():
@@ -205,19 +210,7 @@ def _choose_module(root: Path, module_id: str | None) -> str:
     present = _present_modules(root)
     if not present and module_id is None:
         raise CheckpointError(f"{root / MODULES} holds no module: looked for <module id>/{CTOR_FILE}")
-    return _choose(root, present, module_id)
-
-
-def _choose(root: Path, present: Sequence[str], module_id: str | None) -> str:
-    """Return the module that is asked for, or the only one. Raises CheckpointError."""
-    if module_id is not None and module_id not in present:
-        raise CheckpointError(f"{root} has no module '{module_id}': it holds {', '.join(present) or 'none'}")
-    if module_id is None and len(present) > 1:
-        raise CheckpointError(
-            f"{root} holds {len(present)} modules ({', '.join(present)}): name the one to export with --module-id, or "
-            "export each of them with --all-modules"
-        )
-    return module_id or present[0]
+    return choose(root, present, module_id, "module", "modules")
 
 
 def _check_complete(files: CheckpointFiles) -> None:

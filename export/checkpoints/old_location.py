@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -17,9 +18,9 @@ from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 POLICIES = "policies"
 POLICY_STATE = "policy_state.pkl"
 ALGORITHM_STATE = "algorithm_state.pkl"
-DEFAULT_POLICY = "default_policy"
+DEFAULT_POLICY = "default_policy"  # RLlib's id of an only policy, and of an only module
+RLLIB_FILE = "rllib_checkpoint.json"
 
-_MARKER = "rllib_checkpoint.json"
 _MSGPACK_STATES = ("policy_state.msgpck", "policy_state.msgpack")
 
 
@@ -95,20 +96,25 @@ def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFil
         present = [policy_id or root.name]  # a policy's folder on its own, which does not tell its id
     elif given.parent == root / POLICIES and policy_id is None:
         policy_id = given.name
-    if policy_id is not None and policy_id not in present:
-        raise CheckpointError(f"{root} has no policy '{policy_id}': it holds {', '.join(present)}")
-    if policy_id is None and len(present) > 1:
-        raise CheckpointError(
-            f"{root} holds {len(present)} policies ({', '.join(present)}): name the one to export with --module-id, "
-            "or export each of them with --all-modules"
-        )
-    files = OldStackFiles(root, policy_id or present[0])
+    files = OldStackFiles(root, choose(root, present, policy_id, "policy", "policies"))
     if not files.state.is_file():
         raise UnsupportedError(
             f"{files.policy} holds its state as msgpack, which is not exported: only {POLICY_STATE}, RLlib's default, "
             "is; restore the algorithm with RLlib (and msgpack_numpy) and save it again without msgpack"
         )
     return files
+
+
+def choose(root: Path, present: Sequence[str], name: str | None, singular: str, plural: str) -> str:
+    """Return the module or policy that is asked for, or the only one of those `present`. Raises CheckpointError."""
+    if name is not None and name not in present:
+        raise CheckpointError(f"{root} has no {singular} '{name}': it holds {', '.join(present) or 'none'}")
+    if name is None and len(present) > 1:
+        raise CheckpointError(
+            f"{root} holds {len(present)} {plural} ({', '.join(present)}): name the one to export with --module-id, "
+            "or export each of them with --all-modules"
+        )
+    return name or present[0]
 
 
 def policy_ids(root: Path) -> list[str]:
@@ -124,7 +130,7 @@ def _has_state(folder: Path) -> bool:
 def _major_version(folder: Path) -> str | None:
     """Return the major checkpoint version in rllib_checkpoint.json, if that can be read."""
     try:
-        recorded = json.loads((folder / _MARKER).read_text(encoding="utf-8"))
+        recorded = json.loads((folder / RLLIB_FILE).read_text(encoding="utf-8"))
         return str(recorded["checkpoint_version"]).split(".")[0]
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -60,17 +60,12 @@ def _download(uri: str, local: Path) -> None:
         if info.type == pyarrow.fs.FileType.File:
             raise CheckpointError(f"{uri} is a file: expected the folder of an RLlib checkpoint")
         local.mkdir()
-        pyarrow.fs.copy_files(inside, str(local), source_filesystem=filesystem, destination_filesystem=_here())
+        here = pyarrow.fs.LocalFileSystem()
+        pyarrow.fs.copy_files(inside, str(local), source_filesystem=filesystem, destination_filesystem=here)
     except CheckpointError:
         raise
     except Exception as error:  # credentials, names, networks: each file system has errors of its own
         raise CheckpointError(f"{uri} cannot be fetched: {first_line(error)}") from error
-
-
-def _here() -> FileSystem:
-    from pyarrow.fs import LocalFileSystem
-
-    return LocalFileSystem()
 
 
 def _filesystem(uri: str) -> tuple[FileSystem, str]:

@@ -7,8 +7,8 @@ nothing about the policy, so whatever is missing or wrong here is a notice and n
 
 from __future__ import annotations
 
-import importlib
 import math
+import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -70,11 +70,7 @@ def _env_class(env_id: str) -> Any:
     entry_point = env_id if is_path else gymnasium.spec(env_id).entry_point
     if not isinstance(entry_point, str):
         return entry_point
-    module, _, name = entry_point.partition(":")
-    found: Any = importlib.import_module(module)
-    for part in name.split("."):
-        found = getattr(found, part)
-    return found
+    return pkgutil.resolve_name(entry_point)
 
 
 def _elements(described: Any) -> tuple[Element, ...]:

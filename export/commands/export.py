@@ -197,7 +197,7 @@ def _build(
     folder = folders.enter_context(_temporary_folder(target))
     with one_thread():
         labels = [element.name for element in elements.action]
-        parity, golden = _write_graphs(folder, restored, labels, files.api_stack, options.progress)
+        parity, inputs, outputs = _write_graphs(folder, restored, labels, files.api_stack, options.progress)
         recipe = restored.recipe
         contract = Contract(
             name=target.parent.name,
@@ -205,8 +205,8 @@ def _build(
             description=options.description,
             observation_space=space_spec(recipe.observation_space, elements.observation),
             action_space=space_spec(recipe.action_space, elements.action, action=True),
-            inputs=tuple(_tensor(name, values) for name, values in golden.inputs.items()),
-            outputs=tuple(_tensor(output, values) for output, values in golden.outputs.items()),
+            inputs=tuple(_tensor(name, values) for name, values in inputs.items()),
+            outputs=tuple(_tensor(output, values) for output, values in outputs.items()),
             state=tuple(state_spec(leaf) for leaf in recipe.state),
             distribution=(
                 Distribution(kind=recipe.distribution, transform=recipe.transform) if recipe.distribution else None
@@ -216,7 +216,7 @@ def _build(
             provenance=_provenance(files, facts, restored),
             parity=parity,
         )
-        _write_rest(folder, contract, golden)
+        _write_rest(folder, contract, inputs, outputs)
     return folder, ExportResult(target, contract)
 
 
@@ -239,15 +239,9 @@ def _temporary_folder(target: Path) -> Iterator[Path]:
                 parent.rmdir()
 
 
-@dataclass(frozen=True)
-class _Golden:
-    inputs: Inputs
-    outputs: Outputs
-
-
 def _write_graphs(
     folder: Path, restored: RestoredPolicy, labels: list[str], api_stack: str, progress: Notify
-) -> tuple[Parity, _Golden]:
+) -> tuple[Parity, Inputs, Outputs]:
     """Write both formats, prove them, and return the proof and the golden vectors."""
     from rlservo.export.graph.onnx_file import run_onnx, write_onnx
     from rlservo.export.graph.policy_graph import PolicyGraph
@@ -277,7 +271,7 @@ def _write_graphs(
     inputs = _golden_inputs(recipe, references, onnx)
     outputs = onnx(inputs)
     ordered = {name: inputs[name] for name in graph.input_names}
-    return parity, _Golden(ordered, {name: outputs[name] for name in graph.output_names})
+    return parity, ordered, {name: outputs[name] for name in graph.output_names}
 
 
 def _golden_inputs(recipe: Recipe, references: list[Reference], run: Runner) -> Inputs:
@@ -341,12 +335,12 @@ def _provenance(files: Files, facts: CheckpointFacts, restored: RestoredPolicy) 
     )
 
 
-def _write_rest(folder: Path, contract: Contract, golden: _Golden) -> None:
+def _write_rest(folder: Path, contract: Contract, golden_inputs: Inputs, golden_outputs: Outputs) -> None:
     """Write golden vectors, contract and hashes, and check that the finished files are what was proven."""
     from rlservo.export.graph.onnx_file import add_metadata, run_onnx
 
     add_metadata(folder / ONNX_FILE, {CONTRACT_KEY: contract_json(contract)})
-    write_golden(folder, golden.inputs, golden.outputs)
+    write_golden(folder, golden_inputs, golden_outputs)
     write_contract(folder, contract)
     inputs, outputs = load_bundle(folder).golden()
     replayed = run_onnx(folder / ONNX_FILE)(inputs)

@@ -12,13 +12,11 @@ from pathlib import Path
 
 from rlservo.export.checkpoints.facts import read_facts
 from rlservo.export.checkpoints.location import FACTS_FILE, Files, locate_checkpoint
+from rlservo.export.checkpoints.old_location import RLLIB_FILE
 from rlservo.export.checkpoints.remote import fetch
 from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.commands.export import LOADING_RUNS_CODE, silent
 from rlservo.export.contract.errors import UsageError
-
-# Beside the class and its arguments (class_and_ctor_args.pkl) and the state, metadata.json names the Ray version.
-_RLLIB_FILE = "rllib_checkpoint.json"
 
 
 def prune_checkpoint(
@@ -53,8 +51,8 @@ def _prune(files: Files, target: Path, app_dir: str | Path, notify: Callable[[st
             copy = target / file.relative_to(files.root)
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, copy)
-        if (files.root / _RLLIB_FILE).is_file():
-            shutil.copyfile(files.root / _RLLIB_FILE, target / _RLLIB_FILE)
+        if (files.root / RLLIB_FILE).is_file():
+            shutil.copyfile(files.root / RLLIB_FILE, target / RLLIB_FILE)
         (target / FACTS_FILE).write_text(facts.to_json(), encoding="utf-8")
     except BaseException:  # an interrupt must not leave half a checkpoint either
         shutil.rmtree(target, ignore_errors=True)

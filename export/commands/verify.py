@@ -72,21 +72,14 @@ def verify_bundle(
         origin = loaded.contract.provenance
         files = locate_checkpoint(local, origin.module_id, origin.agents[0] if origin.agents else None)
         notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else files.root))
-        closed_loop = None if env_id is None else _ClosedLoop(env_id, episodes, first_seed)
-        return _verify(loaded, files, closed_loop, app_dir, notify, progress)
-
-
-@dataclass(frozen=True)
-class _ClosedLoop:
-    env_id: str
-    episodes: int
-    first_seed: int
+        return _verify(loaded, files, env_id, range(first_seed, first_seed + episodes), app_dir, notify, progress)
 
 
 def _verify(
     loaded: Bundle,
     files: Files,
-    closed_loop: _ClosedLoop | None,
+    env_id: str | None,
+    seeds: range,
     app_dir: str | Path,
     notify: Notify,
     progress: Notify,
@@ -107,14 +100,14 @@ def _verify(
         references = record(restored.start_loop, draw_batches(restored.recipe, SEED))
         parity = prove(restored.recipe, references, formats, labels, files.api_stack)
         evaluation = None
-        if closed_loop is not None:
+        if env_id is not None:
             run, recipe = formats["onnx"], restored.recipe
-            progress(f"running {closed_loop.episodes} episodes with each")
+            progress(f"running {len(seeds)} episodes with each")
             bundle, checkpoint = (
-                _rollout(loaded.contract, recipe, start_loop, closed_loop)
+                _rollout(_LoopPolicy(loaded.contract, recipe, start_loop), env_id, seeds)
                 for start_loop in (lambda: GraphLoop(run, recipe.state), restored.start_loop)
             )
-            evaluation = _evaluation(bundle, checkpoint, closed_loop)
+            evaluation = _evaluation(bundle, checkpoint, seeds)
             contract = loaded.contract.model_copy(update={"evaluations": (*loaded.contract.evaluations, evaluation)})
             write_contract(loaded.path, contract)
     return VerifyResult(parity, evaluation, same)
@@ -152,27 +145,20 @@ def _shapes(leaves: dict[str, tuple[int, ...]]) -> str:
     return ", ".join(f"{name} {shape}" for name, shape in leaves.items())
 
 
-def _rollout(
-    contract: Contract, recipe: Recipe, start_loop: Callable[[], Loop], closed_loop: _ClosedLoop
-) -> RolloutReport:
-    report = rollout(
-        _LoopPolicy(contract, recipe, start_loop),
-        closed_loop.env_id,
-        episodes=closed_loop.episodes,
-        seed=closed_loop.first_seed,
-        env_kwargs=contract.provenance.env_config,
-    )
+def _rollout(policy: _LoopPolicy, env_id: str, seeds: range) -> RolloutReport:
+    arguments = policy.contract.provenance.env_config
+    report = rollout(policy, env_id, episodes=len(seeds), seed=seeds.start, env_kwargs=arguments)
     if report.interrupted:  # half a comparison is none
         raise KeyboardInterrupt
     return report
 
 
-def _evaluation(bundle: RolloutReport, checkpoint: RolloutReport, closed_loop: _ClosedLoop) -> Evaluation:
+def _evaluation(bundle: RolloutReport, checkpoint: RolloutReport, seeds: range) -> Evaluation:
     assert bundle.return_mean is not None and checkpoint.return_mean is not None, "every episode was finished"
     return Evaluation(
-        env_id=closed_loop.env_id,
-        episodes=closed_loop.episodes,
-        first_seed=closed_loop.first_seed,
+        env_id=bundle.env_id,
+        episodes=len(seeds),
+        first_seed=seeds.start,
         return_bundle=bundle.return_mean,
         return_checkpoint=checkpoint.return_mean,
         success_rate_bundle=bundle.success_rate,

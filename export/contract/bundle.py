@@ -30,9 +30,8 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from rlservo.export.contract.contract import VERSION_PATTERN, Contract, contract_json, version_key
+from rlservo.export.contract.contract import VERSION_PATTERN, Contract, contract_json, parse_contract, version_key
 from rlservo.export.contract.errors import BundleError, BundleTamperedError
 from rlservo.export.contract.regular_files import FileTooLargeError, NotReadableError, blocks, open_regular
 from rlservo.export.contract.spaces import DictSpec, TupleSpec
@@ -213,13 +212,9 @@ def read_contract(folder: Path, limits: BundleLimits = DEFAULT_LIMITS) -> Contra
 
 def _parse_contract(file: Path, content: bytes) -> Contract:
     try:
-        return Contract.model_validate_json(content.decode("utf-8"))
+        return parse_contract(content.decode("utf-8"), str(file))
     except UnicodeDecodeError as error:
         raise BundleError(f"{file} cannot be read: {error}") from error
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the document"
-        raise BundleError(f"{file}: {where}: {first['msg']}") from error
 
 
 def digest_of(folder: Path) -> str:
@@ -325,8 +320,4 @@ def write_contract(folder: Path, contract: Contract) -> None:
 
 def sha256(file: Path) -> str:
     """Return the file's hash as 64 hexadecimal digits."""
-    digest = hashlib.sha256()
-    with file.open("rb") as stream:
-        for block in iter(lambda: stream.read(1 << 20), b""):
-            digest.update(block)
-    return digest.hexdigest()
+    return hashlib.sha256(file.read_bytes()).hexdigest()

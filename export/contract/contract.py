@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
@@ -154,13 +153,18 @@ def version_key(version: str) -> tuple[int, ...]:
     return parts + (0,) * (3 - len(parts))
 
 
-def embedded_contract(text: str, where: Path) -> Contract:
-    """Parse the copy of the contract that the graph's metadata hold under CONTRACT_KEY."""
+def first_fault(error: ValidationError) -> str:
+    """Return the first thing that is wrong with a document: `field: message`."""
+    first = error.errors(include_url=False)[0]
+    return f"{'.'.join(str(part) for part in first['loc']) or 'the document'}: {first['msg']}"
+
+
+def parse_contract(text: str, source: str) -> Contract:
+    """Parse contract.json, or the copy of it in the graph's metadata. Raises BundleError naming `source` and field."""
     try:
         return Contract.model_validate_json(text)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise BundleError(f"{where}: the contract inside it is malformed: {first['msg']}") from error
+        raise BundleError(f"{source}: {first_fault(error)}") from error
 
 
 def contract_json(contract: Contract) -> str:

@@ -41,15 +41,6 @@ def open_regular(file: Path, max_bytes: int | None = None) -> Iterator[BinaryIO]
         yield stream
 
 
-def read_regular(file: Path, max_bytes: int) -> bytes:
-    """Return a regular file's content. Raises what `open_regular` raises, also where the file grows meanwhile."""
-    with open_regular(file, max_bytes) as stream:
-        content = bytearray()
-        for block in blocks(stream, max_bytes):
-            content += block
-    return bytes(content)
-
-
 def blocks(stream: BinaryIO, max_bytes: int | None = None) -> Iterator[bytes]:
     """Yield the rest of a file. Raises FileTooLargeError when it is longer than `max_bytes`, and OSError."""
     length = 0

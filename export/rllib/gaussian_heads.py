@@ -44,19 +44,14 @@ class FreeGaussianHead(nn.Module):
 
 
 def replace_heads(module: nn.Module) -> None:
-    """Replace every head of RLlib's in `module` by one of these, in place."""
+    """Replace every head of RLlib's in `module` by one of these, in place.
+
+    Also the old stack's layer that appends a free scale, by one whose batch size is not fixed.
+    """
     for parent in list(module.modules()):
         for name, child in list(parent.named_children()):
             if (lean := _lean(child)) is not None:
                 setattr(parent, name, lean)
-
-
-def replace_bias_layers(model: nn.Module) -> None:
-    """Replace, in place, the old stack's layer that appends a free scale by one whose batch size is not fixed."""
-    for parent in list(model.modules()):
-        for name, child in list(parent.named_children()):
-            if type(child).__name__ == "AppendBiasLayer" and isinstance(child.log_std, Tensor):
-                setattr(parent, name, FreeGaussianHead(nn.Identity(), child.log_std.detach().clone()))
 
 
 def _lean(head: Any) -> nn.Module | None:
@@ -70,4 +65,6 @@ def _lean(head: Any) -> nn.Module | None:
             bound = float(head.log_std_clip_param_const)
             log_std = log_std.clamp(-bound, bound)
         return FreeGaussianHead(head.net, log_std)
+    if kind == "AppendBiasLayer" and isinstance(head.log_std, Tensor):
+        return FreeGaussianHead(nn.Identity(), head.log_std.detach().clone())
     return None

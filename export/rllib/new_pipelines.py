@@ -40,13 +40,15 @@ class Pipelines:
     module_to_env: ConnectorPipelineV2
     observation_space: Any
     action_space: Any
+    connector_module: Any
+    """What RLlib hands to its connectors: the module, or a MultiRLModule that holds it alone."""
 
     def to_module(self, episodes: list[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return (the module's batch, what the pipelines tell each other)."""
         shared: dict[str, Any] = {}
         with torch.no_grad():
             batch = self.env_to_module(
-                rl_module=self.module, batch={}, episodes=episodes, explore=False, shared_data=shared
+                rl_module=self.connector_module, batch={}, episodes=episodes, explore=False, shared_data=shared
             )
         return batch, shared
 
@@ -60,7 +62,7 @@ class Pipelines:
         """Return what comes out for the environment and for the episodes."""
         with torch.no_grad():
             sent: dict[str, Any] = self.module_to_env(
-                rl_module=self.module, batch=given, episodes=episodes, explore=False, shared_data=shared
+                rl_module=self.connector_module, batch=given, episodes=episodes, explore=False, shared_data=shared
             )
         return sent
 
@@ -80,28 +82,15 @@ class MultiAgentPipelines(Pipelines):
     """The same among several agents, of which only the slot's acts."""
 
     slot: AgentSlot
-    together: MultiRLModule
-    """What RLlib hands to its connectors; it holds the one module."""
 
     def to_module(self, episodes: list[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return (the module's batch, what the pipelines tell each other)."""
-        shared: dict[str, Any] = {}
-        with torch.no_grad():
-            batch = self.env_to_module(
-                rl_module=self.together, batch={}, episodes=episodes, explore=False, shared_data=shared
-            )
+        batch, shared = super().to_module(episodes)
         return batch[self.slot.module], shared
 
     def to_env(self, given: dict[str, Any], episodes: list[Any], shared: dict[str, Any]) -> dict[str, Any]:
         """Return what comes out for the environment and for the episodes, of the one agent."""
-        with torch.no_grad():
-            sent = self.module_to_env(
-                rl_module=self.together,
-                batch={self.slot.module: given},
-                episodes=episodes,
-                explore=False,
-                shared_data=shared,
-            )
+        sent = super().to_env({self.slot.module: given}, episodes, shared)
         own = {name: [by_agent[self.slot.agent] for by_agent in rows] for name, rows in sent.items()}
         acting = (Columns.ACTIONS, Columns.ACTIONS_FOR_ENV)
         return {name: _stacked(rows) if name in acting else rows for name, rows in own.items()}
@@ -133,10 +122,10 @@ def pipelines_of(
 ) -> Pipelines:
     """Return RLlib's way to act for the slot's agent, whose own the spaces are."""
     if slot is SINGLE_AGENT:
-        return Pipelines(module, env_to_module, module_to_env, observation_space, action_space)
+        return Pipelines(module, env_to_module, module_to_env, observation_space, action_space, module)
     together = MultiRLModule()
     together.add_module(slot.module, module)
-    return MultiAgentPipelines(module, env_to_module, module_to_env, observation_space, action_space, slot, together)
+    return MultiAgentPipelines(module, env_to_module, module_to_env, observation_space, action_space, together, slot)
 
 
 def find_agent_slot(files: CheckpointFiles, env_to_module: Any, module_to_env: Any) -> AgentSlot:

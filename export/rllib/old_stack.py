@@ -41,7 +41,7 @@ from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLe
 from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.trees import build, named_leaves, space_leaves, tree_leaves
 from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
-from rlservo.export.rllib.gaussian_heads import replace_bias_layers
+from rlservo.export.rllib.gaussian_heads import replace_heads
 from rlservo.export.rllib.old_connectors import check_connectors, read_old_steps, read_old_transform
 from rlservo.export.rllib.old_models import register_custom_parts
 from rlservo.export.rllib.restored_policy import RestoredPolicy
@@ -165,7 +165,7 @@ def restore_old_stack(
     # A second policy to trace: a model keeps tensors of its last forward pass, which the reference needs for itself.
     traced = _restore(files, app_dir)
     _prepare(traced)
-    replace_bias_layers(traced.model)
+    replace_heads(traced.model)
     network = OldStackNetwork(traced, names, acts=mode == "given")
     model = type(policy.model)
     module_class = f"{model.__module__}.{model.__qualname__}"

@@ -234,9 +234,14 @@ def _connection_pool(url: str, backend: DeadlineBackend) -> httpcore.ConnectionP
     # Reading the certificates takes 20 ms; http has no use for them.
     certificates = _certificates() if url.startswith("https") else None
     proxy = _proxy_of(url)
-    options: dict[str, Any] = {"max_connections": 100, "keepalive_expiry": KEEPALIVE_S, "network_backend": backend}
+    options: dict[str, Any] = {
+        "ssl_context": certificates,
+        "max_connections": 100,
+        "keepalive_expiry": KEEPALIVE_S,
+        "network_backend": backend,
+    }
     if proxy is None:
-        return httpcore.ConnectionPool(certificates, **options)
+        return httpcore.ConnectionPool(**options)
     parts = urlsplit(proxy)
     user = None if parts.username is None else (unquote(parts.username), unquote(parts.password or ""))
     address = httpcore.URL(scheme=parts.scheme.encode(), host=host_of(parts), port=parts.port, target=b"/")
@@ -244,14 +249,7 @@ def _connection_pool(url: str, backend: DeadlineBackend) -> httpcore.ConnectionP
         raise UsageError(
             f"a proxy of the environment begins with {parts.scheme!r}: expected for example 'http://proxy:3128'"
         )
-    return PROXIES[parts.scheme](
-        address,
-        user,
-        ssl_context=certificates,
-        max_connections=100,
-        keepalive_expiry=KEEPALIVE_S,
-        network_backend=backend,
-    )
+    return PROXIES[parts.scheme](address, user, **options)
 
 
 def _certificates() -> ssl.SSLContext:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
-from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.contract import Contract, first_fault
 from rlservo.export.contract.errors import DeadlineError, UnavailableError, UsageError
 from rlservo.serve_app.client.episode_state import EpisodeState
 from rlservo.serve_app.client.observations import encode_observation
@@ -169,9 +169,7 @@ class RemotePolicy(ActingPolicy):
         try:
             return Contract.model_validate(document)
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(str(part) for part in first["loc"]) or "the document"
             raise UnavailableError(
-                f"{self.url} sent a contract that this client cannot read: {where}: {first['msg']} "
+                f"{self.url} sent a contract that this client cannot read: {first_fault(error)} "
                 "(is the server another version of rlservo?)"
             ) from error

@@ -13,7 +13,6 @@ from typing import Any
 
 from rlservo.export.contract.errors import RequestError
 from rlservo.serve_app.runtime.policy import Policy, Step
-from rlservo.serve_app.runtime.recurrent_state import State
 from rlservo.serve_app.wire.state_names import BELONGS_TO, LAST_ACTION, MARK
 
 
@@ -56,13 +55,8 @@ NO_STATE = CarriedState({}, is_empty=True)
 
 def carry(policy: Policy, step: Step) -> dict[str, Any]:
     """Return the state that a client is to send with its next request."""
-    carried: dict[str, Any] = dict(step.state if step.batch is not None else first_row(step.state))
+    carried: dict[str, Any] = dict(step.own_state)
     carried[BELONGS_TO] = policy.identity
     if policy.has_step_limit:
         carried[LAST_ACTION] = step.action
     return carried
-
-
-def first_row(state: State) -> State:
-    """Return the state of the one episode there is, without the batch axis."""
-    return {name: leaf[0, ...] for name, leaf in state.items()}

@@ -7,9 +7,8 @@ right. A state goes to the version that it is of, and to no other. Whatever is r
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
@@ -23,6 +22,7 @@ from rlservo.serve_app.versions.policy_store import (
     Decision,
     EpisodeNote,
     PolicyStore,
+    take_step,
 )
 from rlservo.serve_app.wire.state_names import BELONGS_TO
 
@@ -63,7 +63,7 @@ class Episodes:
             raise StateNeededError(f"policy '{request.policy}' {NEEDS_STATE}")
         if policy.has_step_limit and episode.last_action is None:
             raise StateNeededError(f"policy '{request.policy}' {NEEDS_LAST}")
-        return _take_step(policy, request, episode).decision(policy, None)
+        return _take_step(policy, request, episode)[0]
 
     def policy_of(
         self, store: PolicyStore, name: str, version: str | None, session_id: SessionId | None, identity: Any
@@ -96,9 +96,10 @@ class Episodes:
         needs_last = policy.has_step_limit and not carried.is_empty
         if needs_last and carried.last_action is None and episode.last_action is None:
             raise StateNeededError(f"policy '{name}' {NEEDS_LAST}")
-        timed = _take_step(policy, request, episode, carried)
-        carries = bool(policy.contract.state) or policy.has_step_limit
-        return timed.decision(policy, EpisodeNote(state=carry(policy, timed.step)) if carries else None)
+        decision, step = _take_step(policy, request, episode, carried)
+        if policy.is_stateful:
+            decision.episode = EpisodeNote(state=carry(policy, step))
+        return decision
 
     def _act_on_stream(self, store: PolicyStore, request: Request, episode: Episode, stream: Session) -> Decision:
         """Act from the state that the connection keeps."""
@@ -109,14 +110,15 @@ class Episodes:
             if not begins:
                 raise
             policy = _choose(store, request)  # an episode begins: with what is there now
-        timed = _take_step(policy, request, episode, session=Session(policy) if begins else stream)
-        rows = timed.step.rows if policy.is_stateful else 0
+        decision, step = _take_step(policy, request, episode, session=Session(policy) if begins else stream)
+        rows = step.rows if policy.is_stateful else 0
         if rows != stream.rows:
             self.sessions.reserve(stream, rows)
         if begins:
             stream.begin(policy)
-        stream.keep(timed.step)
-        return timed.decision(policy, EpisodeNote(step=stream.steps))
+        stream.keep(step)
+        decision.episode = EpisodeNote(step=stream.steps)
+        return decision
 
     def _act_in_session(
         self, store: PolicyStore, request: Request, episode: Episode, session_id: SessionId
@@ -141,15 +143,15 @@ class Episodes:
             repeated = session.answer_again(seq, request.obs)
             if repeated is not None:
                 return repeated
-        timed = _take_step(session.policy, request, episode, session=session)
+        decision, step = _take_step(session.policy, request, episode, session=session)
         if episode.end:
             self.sessions.end(name, session_id)
         elif episode.reset:
-            self.sessions.put(name, session_id, session, timed.step.rows if session.policy.is_stateful else 0)
-        session.keep(timed.step)
-        decision = timed.decision(session.policy, EpisodeNote(session_id=session_id, step=session.steps))
+            self.sessions.put(name, session_id, session, step.rows if session.policy.is_stateful else 0)
+        session.keep(step)
+        decision.episode = EpisodeNote(session_id=session_id, step=session.steps)
         session.seq, session.answer = seq, decision
-        session.inputs_hash = b"" if seq is None else session.policy.fingerprint(timed.step.inputs)
+        session.inputs_hash = b"" if seq is None else session.policy.fingerprint(step.inputs)
         return decision
 
     def _check_version(
@@ -198,18 +200,6 @@ def _owner(store: PolicyStore, name: str, version: str | None, identity: str) ->
     return own
 
 
-@dataclass(frozen=True, slots=True)
-class _TimedStep:
-    """A step, and how long it took."""
-
-    step: Step
-    milliseconds: float
-
-    def decision(self, policy: Policy, note: EpisodeNote | None) -> Decision:
-        contract, step = policy.contract, self.step
-        return Decision(step.action, contract.name, contract.version, self.milliseconds, step.batch, step.notices, note)
-
-
 def _take_step(
     policy: Policy,
     request: Request,
@@ -217,10 +207,10 @@ def _take_step(
     carried: CarriedState = NO_STATE,
     *,
     session: Session | None = None,
-) -> _TimedStep:
+) -> tuple[Decision, Step]:
     """Take a step from what the client carries, or from a session's state."""
-    started = time.perf_counter()
-    step = policy.step(
+    return take_step(
+        policy,
         request.obs,
         before=None if session is None else session.state,
         last=None if session is None else session.last,
@@ -230,4 +220,3 @@ def _take_step(
         explore=request.explore,
         seed=request.seed,
     )
-    return _TimedStep(step, (time.perf_counter() - started) * 1e3)

@@ -86,9 +86,7 @@ class Sessions:
         """`most` bounds the episodes that are remembered, and apart from them the sessions that remember none."""
         self._most = most
         self._idle_s = idle_s
-        # The longest unused come first, in both.
-        self._stateful: OrderedDict[Key, Session] = OrderedDict()
-        self._stateless: OrderedDict[Key, Session] = OrderedDict()
+        self._sessions: OrderedDict[Key, Session] = OrderedDict()  # the longest unused come first
         self._sweeper: asyncio.TimerHandle | None = None
         self.rows = 0  # episodes remembered, in sessions and on streams
         self.begun: Counter[str] = Counter()  # by policy name, as the next two
@@ -96,24 +94,24 @@ class Sessions:
         self.lost: Counter[str] = Counter()
 
     def __len__(self) -> int:
-        return len(self._stateful) + len(self._stateless)
+        return len(self._sessions)
 
     def count(self) -> Counter[str]:
         """Return how many sessions there are, by policy name."""
-        return Counter(name for sessions in (self._stateful, self._stateless) for name, _ in sessions)
+        return Counter(name for name, _ in self._sessions)
 
     def check_room(self, name: str, session_id: SessionId) -> None:
         """Raise UnavailableError where not even one more episode could be remembered: before any work for it."""
         self._evict()
-        key = (name, session_id)
-        if self.rows >= self._most and key not in self._stateful:
+        before = self._sessions.get((name, session_id))
+        if self.rows >= self._most and (before is None or not before.rows):
             raise self._full(1)
 
     def put(self, name: str, session_id: SessionId, session: Session, rows: int) -> None:
         """Keep a session that was begun; one of that id ends. Raises UnavailableError, and nothing has changed."""
         self._evict()
         key = (name, session_id)
-        before = self._stateful.get(key)
+        before = self._sessions.get(key)
         if rows and self.rows - (0 if before is None else before.rows) + rows > self._most:
             raise self._full(rows)
         self.end(name, session_id)
@@ -121,12 +119,11 @@ class Sessions:
         session.used = time.monotonic()
         self.rows += rows
         self.begun[name] += 1
-        if rows:
-            self._stateful[key] = session
-        else:
-            self._stateless[key] = session
-            if len(self._stateless) > self._most:
-                self._stateless.popitem(last=False)
+        self._sessions[key] = session
+        if not rows:
+            stateless = [each for each, other in self._sessions.items() if not other.rows]
+            if len(stateless) > self._most:
+                del self._sessions[stateless[0]]
         self._sweep_later()
 
     def reserve(self, stream: Session, rows: int) -> None:
@@ -148,8 +145,7 @@ class Sessions:
         """Return a session that was begun here. Raises SessionLostError."""
         self._evict()
         key = (name, session_id)
-        sessions = self._stateful if key in self._stateful else self._stateless
-        session = sessions.get(key)
+        session = self._sessions.get(key)
         if session is None:
             self.lost[name] += 1
             raise SessionLostError(
@@ -158,19 +154,17 @@ class Sessions:
                 {"session_id": shorten(session_id), "policy": name[:64]},
             )
         session.used = time.monotonic()
-        sessions.move_to_end(key)
+        self._sessions.move_to_end(key)
         return session
 
     def peek(self, name: str, session_id: SessionId) -> Session | None:
         """Return a session, if it is here and not idle, without counting that as its use."""
-        key = (name, session_id)
-        session = self._stateful.get(key) or self._stateless.get(key)
+        session = self._sessions.get((name, session_id))
         return session if session is not None and session.used > time.monotonic() - self._idle_s else None
 
     def end(self, name: str, session_id: SessionId, *, lost: bool = False) -> None:
         """Forget a session; `lost` counts it among those that a client will miss."""
-        key = (name, session_id)
-        session = self._stateful.pop(key, None) or self._stateless.pop(key, None)
+        session = self._sessions.pop((name, session_id), None)
         if session is not None:
             self.rows -= session.rows
             self.lost[name] += lost
@@ -186,13 +180,12 @@ class Sessions:
 
     def _evict(self) -> None:
         oldest = time.monotonic() - self._idle_s
-        for sessions in (self._stateful, self._stateless):
-            while sessions:
-                name, session_id = next(iter(sessions))
-                if sessions[name, session_id].used > oldest:
-                    break
-                self.end(name, session_id)
-                self.evicted[name] += 1
+        while self._sessions:
+            name, session_id = next(iter(self._sessions))
+            if self._sessions[name, session_id].used > oldest:
+                break
+            self.end(name, session_id)
+            self.evicted[name] += 1
 
     def _sweep_later(self) -> None:
         """Look for idle sessions again when the first of them may be one: nobody may ask for anything by then."""
@@ -202,14 +195,13 @@ class Sessions:
             loop = asyncio.get_running_loop()
         except RuntimeError:  # in process, without a server: whoever asks next sweeps
             return
-        first = [next(iter(sessions.values())).used for sessions in (self._stateful, self._stateless) if sessions]
-        wait_s = min(first) + self._idle_s - time.monotonic()
+        wait_s = next(iter(self._sessions.values())).used + self._idle_s - time.monotonic()
         self._sweeper = loop.call_later(max(wait_s, min(SWEEP_S, self._idle_s)), self._sweep)
 
     def _sweep(self) -> None:
         self._sweeper = None
         self._evict()
-        if self._stateful or self._stateless:
+        if self._sessions:
             self._sweep_later()
 
 

@@ -1,6 +1,6 @@
 """Administration over HTTP: load, unload, alias, rollback, canary, shadow, on every replica at once.
 
-Every command answers when all replicas serve the change, or says which do not and why. `request_checks.Authorizer`
+Every command answers when all replicas serve the change, or says which do not and why. `request_checks.authorize`
 lets nobody in without an admin key. The Open Inference Protocol's `load` and `unload` are two of these under other
 names.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from functools import partial
-from typing import Any, TypeVar
 
 import orjson
 from fastapi import Depends, FastAPI, Request
@@ -17,13 +16,14 @@ from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from rlservo.export.contract.errors import RequestError, RlservoError
+from rlservo.serve_app.protocols.fastapi_routes import Endpoint, add_route
 from rlservo.serve_app.protocols.http_endpoint import KEY, peer_of
-from rlservo.serve_app.protocols.http_errors import error_models
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.media_types import accept_json
 from rlservo.serve_app.protocols.oip_infer import accept_media_type
+from rlservo.serve_app.protocols.oip_models import TAG
 from rlservo.serve_app.server import listing
-from rlservo.serve_app.server.api_keys import Access, grant
+from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_checks import HEADERS, REQUEST_ID, header_text
 from rlservo.serve_app.server.request_log import write_change
@@ -31,7 +31,7 @@ from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
 from rlservo.serve_app.versions.replica_versions import Change, ReplicaVersions
 
-Route = TypeVar("Route", bound=Callable[..., Any])
+STATUSES = (404, 409, 415, 503)
 
 
 class _Command(BaseModel):
@@ -81,17 +81,11 @@ class Changed(BaseModel):
 
 def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
     """Add /v1/admin and the repository extension's load and unload to the application."""
-    errors = error_models(404, 409, 415, 503)
+    post = partial(add_route, app, Access.admin, "POST")
 
-    def command(path: str, summary: str) -> Callable[[Route], Route]:
-        return app.post(
-            f"/v1/admin/policies/{{name}}/{path}",
-            tags=["admin"],
-            summary=summary,
-            response_model=Changed,
-            responses=errors,
-            dependencies=[Depends(accept_json)],
-        )
+    def command(path: str, summary: str) -> Callable[[Endpoint], Endpoint]:
+        path, accepted = f"/v1/admin/policies/{{name}}/{path}", [Depends(accept_json)]
+        return post(path, "admin", summary, *STATUSES, response_model=Changed, dependencies=accepted)
 
     async def apply(request: Request, what: str, command: Awaitable[Plan]) -> Plan:
         key = request.scope.get(KEY)
@@ -113,26 +107,26 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
     async def changed(request: Request, name: str, what: str, change: Change) -> Response:
         return _answer(name, await apply(request, what, control.change(change, what=what)))
 
-    @app.get(
+    @add_route(
+        app,
+        Access.admin,
+        "GET",
         "/v1/admin/policies",
-        tags=["admin"],
-        summary="What every replica serves",
+        "admin",
+        "What every replica serves",
+        *STATUSES,
         response_model=list[listing.PolicyList],
-        responses=errors,
     )
-    @grant(Access.admin)
     async def status() -> Response:
         replies = [listing.describe(core)] if control.gather is None else await control.gather()
         return Response(orjson.dumps(replies), media_type="application/json")
 
     @command("load", "Load a version, prove it, and keep it ready: not in use until an alias leads to it")
-    @grant(Access.admin)
     async def load(request: Request, name: str, given: LoadCommand) -> Response:
         what = f"load {name} {given.version or 'newest'}"
         return _answer(name, await apply(request, what, control.load(name, given.version, what=what)))
 
     @command("unload", "Drop a version, or the policy")
-    @grant(Access.admin)
     async def unload(request: Request, name: str, given: UnloadCommand) -> Response:
         version = given.version
         return await changed(
@@ -140,20 +134,17 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
         )
 
     @command("alias", "Let an alias lead to a loaded version")
-    @grant(Access.admin)
     async def alias(request: Request, name: str, given: AliasCommand) -> Response:
         what = f"alias {name} {given.alias}={given.version or ''}"
         return await changed(request, name, what, lambda p: plan_changes.set_alias(p, name, given.alias, given.version))
 
     @command("rollback", "Let an alias lead where it led before")
-    @grant(Access.admin)
     async def rollback(request: Request, name: str, given: RollbackCommand) -> Response:
         what = f"rollback {name} {given.alias}"
         alias, expected = given.alias, given.expected
         return await changed(request, name, what, lambda p: plan_changes.roll_back(p, name, alias, expected=expected))
 
     @command("canary", "Send a share of the sessions to another version")
-    @grant(Access.admin)
     async def canary(request: Request, name: str, given: CanaryCommand) -> Response:
         if given.version is not None and given.share is None:
             raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
@@ -163,33 +154,24 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
         return await changed(request, name, what, lambda p: plan_changes.set_canary(p, name, chosen))
 
     @command("shadow", "Let another version compute along")
-    @grant(Access.admin)
     async def shadow(request: Request, name: str, given: ShadowCommand) -> Response:
         what = f"shadow {name} {given.version or 'off'}"
         return await changed(request, name, what, lambda p: plan_changes.set_shadow(p, name, given.version))
 
     # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: nobody reads it.
-    def repository(path: str, summary: str) -> Callable[[Route], Route]:
-        return app.post(
-            f"/v2/repository/models/{{name}}/{path}",
-            tags=["open inference protocol"],
-            summary=summary,
-            response_class=Response,
-            responses=errors,
-            dependencies=[Depends(accept_media_type)],
-        )
+    def repository(path: str, summary: str) -> Callable[[Endpoint], Endpoint]:
+        path, accepted = f"/v2/repository/models/{{name}}/{path}", [Depends(accept_media_type)]
+        return post(path, TAG, summary, *STATUSES, response_class=Response, dependencies=accepted)
 
     # As a Triton that serves what its configuration pins: loading changes what clients get only where the model was not
     # there at all. Moving `production` is /v1/admin's, with a way back.
     @repository("load", "Load a model's newest version; in use at once only if the model was not served")
-    @grant(Access.admin)
     async def load_model(request: Request, name: str) -> Response:
         what = f"load {name} newest"
         await apply(request, what, control.load(name, None, what=what))
         return Response(b"{}", media_type="application/json")
 
     @repository("unload", "Unload a model, all its versions")
-    @grant(Access.admin)
     async def unload_model(request: Request, name: str) -> Response:
         what = f"unload {name}"
         await apply(request, what, control.change(lambda p: plan_changes.unload(p, name, None), what=what))

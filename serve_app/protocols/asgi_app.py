@@ -14,11 +14,12 @@ from rlservo.export.contract.errors import RequestError, RlservoError
 from rlservo.serve_app.protocols import http_errors, json_routes, oip_config, oip_models, websocket_stream
 from rlservo.serve_app.protocols.admin_routes import add_admin
 from rlservo.serve_app.protocols.docs_page import add_docs
+from rlservo.serve_app.protocols.fastapi_routes import add_route
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.gauges import gauges_of
+from rlservo.serve_app.server.gauges import exposition
 from rlservo.serve_app.server.request_checks import Hosts, RequestChecks
 from rlservo.serve_app.server.request_path import StoreProvider
 from rlservo.serve_app.server.settings import ServerSettings
@@ -43,8 +44,7 @@ def create_app(
     `settings` name cannot be read.
     """
     core = Core(store_provider, settings, replica=replica, control=control, alone=alone)
-    core.metrics.sources += gauges_of(core)
-    checks = RequestChecks(Hosts(host, settings, keyed=core.authorizer.needs_keys), core.authorizer)
+    checks = RequestChecks(Hosts(host, settings, keyed=bool(core.keys.accepted.keys)), core.keys)
     # A redirect would be an answer to a path that no route has: there is none.
     app = PolicyApp(
         core, checks, title="rlservo", description=DESCRIPTION, docs_url=None, redoc_url=None, redirect_slashes=False
@@ -69,27 +69,15 @@ def create_app(
 
 
 def _add_health(app: FastAPI, core: Core) -> None:
-    @app.get(
-        "/healthz",
-        tags=["health"],
-        summary="The process answers",
-        response_class=Response,
-        responses=http_errors.error_models(),
-    )
-    @grant(Access.open)
+    @add_route(app, Access.open, "GET", "/healthz", "health", "The process answers", response_class=Response)
     async def healthz() -> Response:
         return Response("OK", media_type="text/plain")
 
-    @app.get(
-        "/metrics",
-        tags=["health"],
-        summary="For Prometheus: what this replica answered",
-        response_class=Response,
-        responses=http_errors.error_models(),
-    )
-    @grant(Access.act)
+    counted = "For Prometheus: what this replica answered"
+
+    @add_route(app, Access.act, "GET", "/metrics", "health", counted, response_class=Response)
     async def metrics() -> Response:
-        return Response(core.exposition(), media_type=CONTENT_TYPE_LATEST)
+        return Response(exposition(core), media_type=CONTENT_TYPE_LATEST)
 
 
 # Errors of the routes that FastAPI runs; `http_errors.py` has the table.

@@ -9,7 +9,10 @@ from fastapi.routing import APIRoute
 from starlette.routing import WebSocketRoute
 from starlette.types import ASGIApp
 
+from rlservo.serve_app.protocols.http_errors import error_models
 from rlservo.serve_app.server.api_keys import Access
+
+STATUSES = (400, 404, 408, 409, 410, 413, 415, 422, 500, 503)
 
 
 class PostRoute(APIRoute):
@@ -27,7 +30,6 @@ class PostRoute(APIRoute):
         summary: str,
         reply: Any,
         body: Mapping[str, Any],
-        responses: dict[int | str, dict[str, Any]],
     ) -> None:
         async def documented() -> None:
             """Documented, never called: `app` answers."""
@@ -41,7 +43,7 @@ class PostRoute(APIRoute):
             summary=summary,
             description=summary + ".",
             response_model=reply,
-            responses=responses,
+            responses=error_models(*STATUSES),
             openapi_extra={
                 "requestBody": {"required": True, "content": body},
                 "parameters": [
@@ -53,6 +55,18 @@ class PostRoute(APIRoute):
             generate_unique_id_function=lambda _route: operation,
         )
         self.app = endpoint
+
+
+def post_routes(prefix: str, operation: str, endpoint: ASGIApp, **documentation: Any) -> list[PostRoute]:
+    """Return an operation's two routes: with a policy's default version, and with one version or an alias."""
+    verb, policy = operation.capitalize(), f"{prefix}/{{name}}"
+    version = f"{policy}/versions/{{version}}/{operation}"
+    summary = f"{verb} with the default version"
+    of_version = f"{verb} with one version, or with what an alias leads to"
+    return [
+        PostRoute(f"{policy}/{operation}", endpoint, operation=operation, summary=summary, **documentation),
+        PostRoute(version, endpoint, operation=f"{operation}_version", summary=of_version, **documentation),
+    ]
 
 
 class StreamRoute(WebSocketRoute):

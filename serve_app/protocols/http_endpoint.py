@@ -27,7 +27,6 @@ from rlservo.serve_app.protocols.http_errors import Headers, error_answer, http_
 from rlservo.serve_app.protocols.websocket_stream import refuse_upgrade
 from rlservo.serve_app.server.api_keys import Access, access_of
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.loop_clock import STAMP
 from rlservo.serve_app.server.request_checks import (
     HEADERS,
     LABEL,
@@ -40,6 +39,7 @@ from rlservo.serve_app.server.request_checks import (
 )
 from rlservo.serve_app.server.request_log import FIELDS
 from rlservo.serve_app.server.request_path import ClientGoneError, Codec
+from rlservo.serve_app.wire.request_stamp import STAMP
 
 logger = logging.getLogger(__name__)
 
@@ -150,8 +150,8 @@ class PolicyApp(FastAPI):
     async def _refuse(
         self, scope: Scope, headers: Mapping[bytes, bytes], receive: Receive, send: Send, error: RlservoError
     ) -> None:
-        request_id = header_text(headers, REQUEST_ID)
-        self._core.request_path.record_refusal(scope["type"], error, request_id, peer=peer_of(scope))
+        request = Request(scope["type"], "", None, time.perf_counter(), request_id=header_text(headers, REQUEST_ID))
+        self._core.record_failure(request, error.code, error.message, peer=peer_of(scope))
         await _send_refusal(scope, receive, send, error)
 
     def _find_direct(self, scope: Scope, path: str) -> DirectMatch | None:
@@ -193,8 +193,7 @@ class HttpEndpoint:
         """Take the protocol's name, as metrics and log have it."""
         self._protocol = protocol
         self._codec = codec
-        self._request_path = core.request_path
-        self._admission = core.admission
+        self._core = core
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request, errors included."""
@@ -207,11 +206,11 @@ class HttpEndpoint:
             label=header_text(headers, LABEL),
             request_id=header_text(headers, REQUEST_ID),
             headers=headers,
-            waited=self._admission.waited(headers.get(STAMP_HEADER)),
+            waited=self._core.admission.waited(headers.get(STAMP_HEADER)),
         )
         status = 200
         try:
-            content, reply_headers = await self._request_path.answer(self._codec, request, receive)
+            content, reply_headers = await self._core.answer(self._codec, request, receive)
         except RlservoError as error:
             status, content, reply_headers = error_answer(error)
         except ClientGoneError:

@@ -9,9 +9,9 @@ extension_statistics.md; github.com/triton-inference-server/common, protobuf/mod
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
-import orjson
 from fastapi import FastAPI
 from fastapi.responses import Response
 
@@ -19,10 +19,10 @@ from rlservo.export.contract.bundle import ONNX_FILE
 from rlservo.export.contract.contract import REWARD, TensorSpec
 from rlservo.export.contract.errors import RequestError
 from rlservo.serve_app.protocols import oip_infer, oip_models
-from rlservo.serve_app.protocols.http_errors import error_models
+from rlservo.serve_app.protocols.fastapi_routes import add_route
 from rlservo.serve_app.protocols.oip_tensors import datatype_of
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.api_keys import Access, grant
+from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_metrics import Totals
 
@@ -37,16 +37,13 @@ def model_config(core: Core, name: str, version: str | None) -> dict[str, Any]:
     Raises UnknownPolicyError, UnknownVersionError, UnavailableError.
     """
     policy = core.store().get(name, version)
-    contract = policy.contract
-    last_action = oip_infer.last_action_inputs(contract) if policy.has_step_limit else []
-    offered = oip_infer.output_names(contract)
     config: dict[str, Any] = {
         "name": name,
         "platform": oip_models.PLATFORM,
         "backend": BACKEND,
         "max_batch_size": min(core.settings.max_batch, LARGEST_INT32),
-        "input": [_input(tensor) for tensor in (*contract.inputs, *last_action)],
-        "output": [_tensor(tensor) for tensor in contract.outputs if tensor.name in offered],
+        "input": [_input(tensor) for tensor in oip_infer.offered_inputs(policy)],
+        "output": [_tensor(tensor) for tensor in oip_infer.offered_outputs(policy.contract)],
         "default_model_filename": ONNX_FILE,
         "model_transaction_policy": {"decoupled": False},  # a request has one reply
     }
@@ -132,39 +129,28 @@ def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
 
 def add_routes(app: FastAPI, core: Core) -> None:
     """Add both to the application: before /v2/models/{name}, which would take /v2/models/stats for a model."""
-    tags: list[Any] = ["open inference protocol"]
-    errors = error_models(404, 503)
+    get = partial(add_route, app, Access.act, "GET")
+    model, one_version = oip_models.MODEL, oip_models.VERSION
 
     def statistics_reply(name: str | None = None, version: str | None = None) -> Response:
-        return _json({"model_stats": statistics(core, name, version)})
+        return oip_models.json_response({"model_stats": statistics(core, name, version)})
 
-    @app.get("/v2/models/stats", tags=tags, summary="Statistics of every model", responses=error_models(503))
-    @grant(Access.act)
+    @get("/v2/models/stats", oip_models.TAG, "Statistics of every model", 503)
     async def all_statistics() -> Response:
         return statistics_reply()
 
-    @app.get("/v2/models/{name}/stats", tags=tags, summary="Statistics of a model's versions", responses=errors)
-    @grant(Access.act)
+    @get(f"{model}/stats", oip_models.TAG, "Statistics of a model's versions", 404, 503)
     async def model_statistics(name: str) -> Response:
         return statistics_reply(name)
 
-    @app.get(
-        "/v2/models/{name}/versions/{version}/stats", tags=tags, summary="A version's statistics", responses=errors
-    )
-    @grant(Access.act)
+    @get(f"{one_version}/stats", oip_models.TAG, "A version's statistics", 404, 503)
     async def version_statistics(name: str, version: str) -> Response:
         return statistics_reply(name, version)
 
-    @app.get("/v2/models/{name}/config", tags=tags, summary="How a model is run", responses=errors)
-    @grant(Access.act)
+    @get(f"{model}/config", oip_models.TAG, "How a model is run", 404, 503)
     async def config(name: str) -> Response:
-        return _json(model_config(core, name, None))
+        return oip_models.json_response(model_config(core, name, None))
 
-    @app.get("/v2/models/{name}/versions/{version}/config", tags=tags, summary="How a version is run", responses=errors)
-    @grant(Access.act)
+    @get(f"{one_version}/config", oip_models.TAG, "How a version is run", 404, 503)
     async def version_config(name: str, version: str) -> Response:
-        return _json(model_config(core, name, version))
-
-
-def _json(document: Any) -> Response:
-    return Response(orjson.dumps(document), media_type="application/json")
+        return oip_models.json_response(model_config(core, name, version))

@@ -13,7 +13,7 @@ import logging
 import math
 import secrets
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from typing import Any
 from urllib.parse import unquote
 
@@ -34,15 +34,15 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
-from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.http_errors import RETRY_AFTER_S, status_of
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of, from_bytes, is_shape
+from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, check_form, check_size, datatype_of, from_bytes
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.loop_clock import STAMP
-from rlservo.serve_app.server.request_checks import presented_key
+from rlservo.serve_app.server.request_checks import authorize, presented_key
 from rlservo.serve_app.server.request_path import BUG
 from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.request_stamp import STAMP
 
 Incoming = tuple[bytes, float | None]
 """A request's bytes, and how many seconds its caller still waits for the answer (None: for ever)."""
@@ -86,33 +86,6 @@ class InferenceService:
         """Answer from `core`; with `local_only`, only callers on this machine."""
         self._grpc = Grpc(core, local_only=local_only)
 
-    async def ServerLive(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ServerLive", request, grpc_context)
-
-    async def ServerReady(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ServerReady", request, grpc_context)
-
-    async def ServerMetadata(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ServerMetadata", request, grpc_context)
-
-    async def ModelReady(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ModelReady", request, grpc_context)
-
-    async def ModelMetadata(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ModelMetadata", request, grpc_context)
-
-    async def ModelConfig(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ModelConfig", request, grpc_context)
-
-    async def ModelStatistics(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ModelStatistics", request, grpc_context)
-
-    async def ModelInfer(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("ModelInfer", request, grpc_context)
-
-    async def RepositoryIndex(self, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer("RepositoryIndex", request, grpc_context)
-
     async def ModelStreamInfer(self, requests: AsyncIterator[bytes], grpc_context: Any) -> AsyncIterator[Any]:
         async for reply in self._grpc.stream(requests, grpc_context):
             yield reply
@@ -126,16 +99,6 @@ class Grpc:
         self._core = core
         self._codec = OipGrpcCodec(core)
         self._local_only = local_only
-        self._methods: dict[str, Callable[[Incoming], Any]] = {
-            "ServerLive": lambda _request: messages.ServerLiveResponse(live=True),
-            "ServerReady": lambda _request: messages.ServerReadyResponse(ready=core.ready),
-            "ServerMetadata": lambda _request: messages.ServerMetadataResponse(**oip_models.server_metadata()),
-            "ModelReady": self._model_ready,
-            "ModelMetadata": self._model_metadata,
-            "ModelConfig": self._model_config,
-            "ModelStatistics": self._model_statistics,
-            "RepositoryIndex": self._index,
-        }
 
     async def answer(self, method: str, incoming: Incoming, context: Any) -> Any:
         """Return the reply to one call. An error sets the status, and the empty reply is not looked at."""
@@ -144,8 +107,8 @@ class Grpc:
             if request.request_id is not None:
                 context.set_trailing_metadata([(REQUEST_ID, request.request_id)])  # in addition to Serve's own
             if method == "ModelInfer":
-                return await self._core.request_path.answer(self._codec, request, incoming)
-            return self._methods[method](incoming)
+                return await self._core.answer(self._codec, request, incoming)
+            return METHODS[method](self._core, incoming)
         except Exception as error:
             _fail(context, error)
             return messages.ServerLiveResponse()
@@ -161,7 +124,7 @@ class Grpc:
         try:
             opening = self._begin("ModelStreamInfer", context)
             opening.label = opening.label or secrets.token_hex(8)  # one version for all where a canary runs
-            core.request_path.open_stream(opening)
+            core.open_stream(opening)
         except Exception as error:
             _fail(context, error)
             return
@@ -185,7 +148,7 @@ class Grpc:
                     PROTOCOL, "", None, time.perf_counter(), label=opening.label, request_id=opening.request_id
                 )
                 try:
-                    reply = await core.request_path.answer(self._codec, request, (content, None))
+                    reply = await core.answer(self._codec, request, (content, None))
                     yield messages.ModelStreamInferResponse(infer_response=reply)
                 except RlservoError as error:
                     sentence = _explain(error)[1]
@@ -193,7 +156,7 @@ class Grpc:
                         error_message=sentence, infer_response=messages.ModelInferResponse(id=_id_of(content))
                     )
         finally:
-            core.request_path.close_stream(opening)
+            core.close_stream(opening)
 
     def _begin(self, method: str, context: Any) -> Request:
         """Return a call's request, whose content is still to be read. Raises ForbiddenError, UnauthenticatedError."""
@@ -206,46 +169,72 @@ class Grpc:
         for name, value in metadata:
             headers.setdefault(name.encode(), _bytes(value))
         texts = {name: value for name, value in metadata if type(value) is str}
-        request_id = texts.get(REQUEST_ID)
-        try:
-            self._core.authorizer.authorize(presented_key(headers), Access.open if method in OPEN else Access.act)
-        except RlservoError as error:
-            peer = _peer(context.peer(), metadata)
-            self._core.request_path.record_refusal(PROTOCOL, error, request_id, peer=peer)
-            raise
-        return Request(
+        request = Request(
             PROTOCOL,
             "",
             None,
             time.perf_counter(),
             label=texts.get(LABEL),
-            request_id=request_id,
+            request_id=texts.get(REQUEST_ID),
             waited=self._core.admission.waited(headers.get(STAMP.encode())),
         )
+        try:
+            authorize(self._core.keys, presented_key(headers), Access.open if method in OPEN else Access.act)
+        except RlservoError as error:
+            peer = _peer(context.peer(), metadata)
+            self._core.record_failure(request, error.code, error.message, peer=peer)
+            raise
+        return request
 
-    def _model_ready(self, incoming: Incoming) -> Any:
-        message = _parse(messages.ModelReadyRequest, incoming[0])
-        return messages.ModelReadyResponse(ready=self._core.has(message.name, message.version or None))
 
-    def _model_metadata(self, incoming: Incoming) -> Any:
-        message = _parse(messages.ModelMetadataRequest, incoming[0])
-        return messages.ModelMetadataResponse(
-            **oip_models.model_metadata(self._core, message.name, message.version or None)
-        )
+def _model_ready(core: Core, incoming: Incoming) -> Any:
+    message = _parse(messages.ModelReadyRequest, incoming[0])
+    return messages.ModelReadyResponse(ready=core.has(message.name, message.version or None))
 
-    def _model_config(self, incoming: Incoming) -> Any:
-        message = _parse(messages.ModelConfigRequest, incoming[0])
-        config = oip_config.model_config(self._core, message.name, message.version or None)
-        return messages.ModelConfigResponse(config=_numbered(config))
 
-    def _model_statistics(self, incoming: Incoming) -> Any:
-        message = _parse(messages.ModelStatisticsRequest, incoming[0])
-        found = oip_config.statistics(self._core, message.name or None, message.version or None)
-        return messages.ModelStatisticsResponse(model_stats=found)
+def _model_metadata(core: Core, incoming: Incoming) -> Any:
+    message = _parse(messages.ModelMetadataRequest, incoming[0])
+    return messages.ModelMetadataResponse(**oip_models.model_metadata(core, message.name, message.version or None))
 
-    def _index(self, incoming: Incoming) -> Any:
-        message = _parse(messages.RepositoryIndexRequest, incoming[0])
-        return messages.RepositoryIndexResponse(models=oip_models.repository_index(self._core, ready=message.ready))
+
+def _model_config(core: Core, incoming: Incoming) -> Any:
+    message = _parse(messages.ModelConfigRequest, incoming[0])
+    config = oip_config.model_config(core, message.name, message.version or None)
+    return messages.ModelConfigResponse(config=_numbered(config))
+
+
+def _model_statistics(core: Core, incoming: Incoming) -> Any:
+    message = _parse(messages.ModelStatisticsRequest, incoming[0])
+    found = oip_config.statistics(core, message.name or None, message.version or None)
+    return messages.ModelStatisticsResponse(model_stats=found)
+
+
+def _index(core: Core, incoming: Incoming) -> Any:
+    message = _parse(messages.RepositoryIndexRequest, incoming[0])
+    return messages.RepositoryIndexResponse(models=oip_models.repository_index(core, ready=message.ready))
+
+
+METHODS: dict[str, Callable[[Core, Incoming], Any]] = {
+    "ServerLive": lambda _core, _incoming: messages.ServerLiveResponse(live=True),
+    "ServerReady": lambda core, _incoming: messages.ServerReadyResponse(ready=core.ready),
+    "ServerMetadata": lambda _core, _incoming: messages.ServerMetadataResponse(**oip_models.server_metadata()),
+    "ModelReady": _model_ready,
+    "ModelMetadata": _model_metadata,
+    "ModelConfig": _model_config,
+    "ModelStatistics": _model_statistics,
+    "RepositoryIndex": _index,
+}
+
+
+def _method(name: str) -> Callable[[InferenceService, Incoming, Any], Awaitable[Any]]:
+    async def answer(self: InferenceService, request: Incoming, grpc_context: Any) -> Any:
+        return await self._grpc.answer(name, request, grpc_context)
+
+    return answer
+
+
+for _name in (*METHODS, "ModelInfer"):
+    setattr(InferenceService, _name, _method(_name))
 
 
 class OipGrpcCodec:
@@ -302,10 +291,7 @@ class OipGrpcCodec:
 def _numbered(document: Any) -> Any:
     """Return a configuration with the names of its data types as the numbers that stand for them in a message."""
     if isinstance(document, dict):
-        return {
-            key: messages.DATA_TYPES[value] if key == "data_type" else _numbered(value)
-            for key, value in document.items()
-        }
+        return {key: DATA_TYPES[value] if key == "data_type" else _numbered(value) for key, value in document.items()}
     return [_numbered(each) for each in document] if isinstance(document, list) else document
 
 
@@ -337,24 +323,9 @@ def _inputs(message: Any) -> dict[str, NDArray[Any]]:
     inputs: dict[str, NDArray[Any]] = {}
     for index, tensor in enumerate(message.inputs):
         label, shape = tensor.name[:64], tuple(tensor.shape)
-        if tensor.datatype == "BYTES":
-            raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")
-        dtype = DTYPES.get(tensor.datatype)
-        if dtype is None:
-            raise RequestError(
-                f"input '{label}': datatype must be one of {', '.join(DTYPES)}, got '{tensor.datatype[:64]}'"
-            )
-        if not is_shape(shape):
-            raise RequestError(f"input '{label}': 'shape' must be sizes such as [1, 27]")
-        if tensor.parameters and "shared_memory_region" in tensor.parameters:
-            raise RequestError(f"input '{label}' is in shared memory, which this server does not read: send the data")
+        dtype = check_form(label, shape, tensor.datatype, tensor.parameters)
         if raw:
-            expected = math.prod(shape) * dtype.itemsize
-            if len(raw[index]) != expected:
-                raise RequestError(
-                    f"input '{label}' of shape {list(shape)} and datatype {tensor.datatype} is {expected} bytes, "
-                    f"but its raw_input_contents are {len(raw[index])}"
-                )
+            check_size(label, shape, dtype, len(raw[index]), "raw_input_contents are")
             inputs[tensor.name] = from_bytes(memoryview(raw[index]), shape, dtype)
         else:
             inputs[tensor.name] = _typed(label, tensor, shape, dtype)

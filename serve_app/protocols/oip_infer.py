@@ -41,6 +41,7 @@ from rlservo.serve_app.protocols.oip_tensors import (
     parse_tensor,
     write_tensor,
 )
+from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
 from rlservo.serve_app.server.request_checks import HEADERS
@@ -193,7 +194,9 @@ def fill_request(core: Core, request: Request, document: Mapping[str, Any], inpu
     if identity is not None and not any(name.startswith(STATE_IN) for name in inputs):
         identity = None  # there is no state that it could be of
     session_id = _session_id(sequence) if sequence else None
-    contract = core.policy(request.policy, request.version, session_id, identity).contract
+    # Of the session, or of the state of that identity, whatever the default is meanwhile.
+    policy = core.episodes.policy_of(core.store(), request.policy, request.version, session_id, identity)
+    contract = policy.contract
     binary = bool(parse_flag(parameters, "binary_data_output")) if parameters else False
     outputs = _wanted_outputs(contract, document, parameters, binary=binary)
     request.reply_options = ReplyOptions(contract, binary, outputs)
@@ -406,7 +409,7 @@ def _wanted_outputs(
         return {}
     if type(outputs) is not list:
         raise RequestError(f"'outputs' must be a list of {{\"name\": ...}}, got {json_type(outputs)}")
-    known = output_names(contract)
+    known = [tensor.name for tensor in offered_outputs(contract)]
     wanted: dict[str, bool] = {}
     for output in outputs:
         name = output.get("name") if type(output) is dict else None
@@ -431,10 +434,15 @@ def quoted(names: list[str]) -> str:
     return ", ".join(f"'{name}'" for name in names)
 
 
-def output_names(contract: Contract) -> list[str]:
+def offered_inputs(policy: Policy) -> list[TensorSpec]:
+    """Return the inputs this protocol offers: the contract's, and the last action where the step is limited."""
+    return [*policy.contract.inputs, *(last_action_inputs(policy.contract) if policy.has_step_limit else ())]
+
+
+def offered_outputs(contract: Contract) -> list[TensorSpec]:
     """Return the outputs this protocol offers: actions and states, not the network's inner values."""
     return [
-        tensor.name
+        tensor
         for tensor in contract.outputs
         if tensor.name == "action" or tensor.name.startswith(("action.", STATE_OUT))
     ]

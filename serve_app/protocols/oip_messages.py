@@ -6,6 +6,7 @@ and the repository index github.com/triton-inference-server/common, grpc_service
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 from rlservo.serve_app.wire.protobuf_messages import build_messages
@@ -16,13 +17,10 @@ SERVICE = f"{PACKAGE}.GRPCInferenceService"
 _TENSOR = ["string name", "string datatype", "repeated int64 shape"]
 _VALUES = ["map InferParameter parameters", "InferTensorContents contents"]
 _MESSAGES: dict[str, list[str]] = {
-    "ServerLiveRequest": [],
     "ServerLiveResponse": ["bool live"],
-    "ServerReadyRequest": [],
     "ServerReadyResponse": ["bool ready"],
     "ModelReadyRequest": ["string name", "string version"],
     "ModelReadyResponse": ["bool ready"],
-    "ServerMetadataRequest": [],
     "ServerMetadataResponse": ["string name", "string version", "repeated string extensions"],
     "ModelMetadataRequest": ["string name", "string version"],
     "ModelMetadataResponse": [
@@ -127,20 +125,5 @@ _DATA_TYPES = "INVALID BOOL UINT8 UINT16 UINT32 UINT64 INT8 INT16 INT32 INT64 FP
 DATA_TYPES = {f"TYPE_{name}": number for number, name in enumerate(_DATA_TYPES.split())}
 """Triton's numbers of the data types in a ModelConfig."""
 
-_CLASSES = build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice")
-ServerLiveResponse: Any = _CLASSES["ServerLiveResponse"]
-ServerReadyResponse: Any = _CLASSES["ServerReadyResponse"]
-ServerMetadataResponse: Any = _CLASSES["ServerMetadataResponse"]
-ModelReadyRequest: Any = _CLASSES["ModelReadyRequest"]
-ModelReadyResponse: Any = _CLASSES["ModelReadyResponse"]
-ModelMetadataRequest: Any = _CLASSES["ModelMetadataRequest"]
-ModelMetadataResponse: Any = _CLASSES["ModelMetadataResponse"]
-ModelConfigRequest: Any = _CLASSES["ModelConfigRequest"]
-ModelConfigResponse: Any = _CLASSES["ModelConfigResponse"]
-ModelStatisticsRequest: Any = _CLASSES["ModelStatisticsRequest"]
-ModelStatisticsResponse: Any = _CLASSES["ModelStatisticsResponse"]
-ModelInferRequest: Any = _CLASSES["ModelInferRequest"]
-ModelInferResponse: Any = _CLASSES["ModelInferResponse"]
-ModelStreamInferResponse: Any = _CLASSES["ModelStreamInferResponse"]
-RepositoryIndexRequest: Any = _CLASSES["RepositoryIndexRequest"]
-RepositoryIndexResponse: Any = _CLASSES["RepositoryIndexResponse"]
+messages: Any = SimpleNamespace(**build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice"))
+"""The classes by name; those made at run time have no static type. A nested one is an attribute of its outer one's."""

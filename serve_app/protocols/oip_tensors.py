@@ -55,25 +55,18 @@ def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDAr
     """
     if type(document) is not dict:
         raise RequestError(f"every entry of 'inputs' must be an object, got {json_type(document)}")
-    name, shape, datatype = document.get("name"), document.get("shape"), document.get("datatype")
+    name, datatype = document.get("name"), document.get("datatype")
+    shape: Any = document.get("shape")
     if type(name) is not str:
         raise RequestError(f"an input's 'name' must be a string, got {json_type(name)}")
     label = name[:64]
     unknown = sorted(document.keys() - TENSOR_FIELDS)
     if unknown:
         raise RequestError(f"input '{label}' has the unknown field '{unknown[0][:64]}': known are name, shape, ...")
-    if type(shape) is not list or not is_shape(shape):
-        raise RequestError(f"input '{label}': 'shape' must be a list of sizes such as [1, 27]")
-    if datatype == "BYTES":
-        raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")
-    dtype = DTYPES.get(datatype) if type(datatype) is str else None
-    if dtype is None:
-        raise RequestError(f"input '{label}': datatype must be one of {', '.join(DTYPES)}, got {json_type(datatype)}")
     parameters = document.get("parameters") or {}
     if type(parameters) is not dict:
         raise RequestError(f"input '{label}': 'parameters' must be an object, got {json_type(parameters)}")
-    if "shared_memory_region" in parameters:
-        raise RequestError(f"input '{label}' is in shared memory, which this server does not read: send the data")
+    dtype = check_form(label, shape if type(shape) is list else None, datatype, parameters)
     size = parameters.get("binary_data_size")
     if size is None:
         return name, _from_json(label, document.get("data"), tuple(shape), dtype), offset
@@ -81,17 +74,37 @@ def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDAr
         raise RequestError(f"input '{label}' has both 'data' and 'binary_data_size': send one of them")
     if type(size) is not int or size < 0:
         raise RequestError(f"input '{label}': 'binary_data_size' must be a number of bytes, got {json_type(size)}")
-    expected = math.prod(shape) * dtype.itemsize
-    if size != expected:
-        raise RequestError(
-            f"input '{label}' of shape {shape} and datatype {datatype} is {expected} bytes, "
-            f"but its 'binary_data_size' is {size}"
-        )
+    check_size(label, shape, dtype, size, "'binary_data_size' is")
     if offset + size > len(raw):
         raise RequestError(
             f"input '{label}' needs {size} bytes after the JSON and {max(0, len(raw) - offset)} are left of the body"
         )
     return name, from_bytes(raw[offset : offset + size], tuple(shape), dtype), offset + size
+
+
+def check_form(label: str, shape: Sequence[Any] | None, datatype: Any, parameters: Mapping[str, Any]) -> np.dtype[Any]:
+    """Return the dtype of an input of either transport, whose bytes or numbers come next. Raises RequestError."""
+    if shape is None or not is_shape(shape):
+        raise RequestError(f"input '{label}': 'shape' must be a list of sizes such as [1, 27]")
+    if datatype == "BYTES":
+        raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")
+    dtype = DTYPES.get(datatype) if type(datatype) is str else None
+    if dtype is None:
+        given = f"'{datatype[:64]}'" if type(datatype) is str else json_type(datatype)
+        raise RequestError(f"input '{label}': datatype must be one of {', '.join(DTYPES)}, got {given}")
+    if "shared_memory_region" in parameters:
+        raise RequestError(f"input '{label}' is in shared memory, which this server does not read: send the data")
+    return dtype
+
+
+def check_size(label: str, shape: Sequence[int], dtype: np.dtype[Any], size: int, given: str) -> None:
+    """Raise RequestError unless a tensor's bytes are as many as its shape says; `given` is what said `size`."""
+    expected = math.prod(shape) * dtype.itemsize
+    if size != expected:
+        raise RequestError(
+            f"input '{label}' of shape {list(shape)} and datatype {datatype_of(dtype.name)} is {expected} bytes, "
+            f"but its {given} {size}"
+        )
 
 
 def from_bytes(raw: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:

@@ -32,8 +32,7 @@ from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.idle_timer import IdleTimer
-from rlservo.serve_app.server.request_checks import HEADERS, LABEL, REQUEST_ID, header_text, presented_key
+from rlservo.serve_app.server.request_checks import HEADERS, LABEL, REQUEST_ID, authorize, header_text, presented_key
 from rlservo.serve_app.server.request_metrics import IDLE
 
 logger = logging.getLogger(__name__)
@@ -73,7 +72,7 @@ class StreamEndpoint:
             opening.label = header_text(headers, LABEL) or secrets.token_hex(8)
             policy = core.store().choose(opening.policy, opening.version, opening.label)
         except RlservoError as error:
-            core.request_path.record_failure(opening, error.code, error.message)
+            core.record_failure(opening, error.code, error.message)
             await refuse_upgrade(scope, receive, send, error)
             return
         await receive()  # websocket.connect
@@ -82,7 +81,7 @@ class StreamEndpoint:
         except OSError:  # the client has gone already
             return
         try:
-            core.request_path.open_stream(opening)
+            core.open_stream(opening)
         except OverloadedError as error:
             await _fail(send, error_answer(error)[1])
             return
@@ -96,20 +95,20 @@ class StreamEndpoint:
                 raise
             if sys.version_info >= (3, 11) and (task := asyncio.current_task()) is not None:
                 task.uncancel()  # Python counts cancellations
-            core.request_path.record_failure(opening, IDLE, SILENT)
+            core.record_failure(opening, IDLE, SILENT)
             await _close_idle(send)
         except RlservoError as error:
             await _fail(send, error_answer(error)[1])
         except OSError:  # the client went while its reply was being sent: nobody is left to tell
             logger.debug("a stream's client went before its reply could be sent")
         except Exception:
-            core.request_path.record_bug(opening)
+            core.record_bug(opening)
             await _fail(send, encode_bug())
         finally:
             idle.stop()
             if opening.stream is not None:
                 core.episodes.sessions.release(opening.stream)
-            core.request_path.close_stream(opening)
+            core.close_stream(opening)
 
     async def _answer_all(self, opening: Request, scope: Scope, receive: Receive, send: Send, idle: IdleTimer) -> None:
         """Answer request by request. Raises RlservoError, which has been recorded, where it ends the stream."""
@@ -138,13 +137,13 @@ class StreamEndpoint:
             if key_changes != core.keys.changes:  # the key may be no longer accepted: this ends every stream
                 key_changes = core.keys.changes
                 try:
-                    core.authorizer.authorize(key, Access.act)
+                    authorize(core.keys, key, Access.act)
                 except RlservoError as error:
-                    core.request_path.record_failure(request, error.code, error.message)
+                    core.record_failure(request, error.code, error.message)
                     raise
             waited = None
             try:
-                reply = await core.request_path.answer(codec, request, message)
+                reply = await core.answer(codec, request, message)
             except RlservoError as error:
                 if not keeps:
                     raise
@@ -169,6 +168,35 @@ class StreamEndpoint:
                 {"policies": list(names)},
             )
         return default, None
+
+
+class IdleTimer:
+    """Cancels the task that made it when nothing happened for a while: one callback a period, not a timer a wait."""
+
+    def __init__(self, seconds: float) -> None:
+        """Start the clock for the current task."""
+        self._seconds = seconds
+        self._task = asyncio.current_task()
+        self._loop = asyncio.get_running_loop()
+        self._touched = self._loop.time()
+        self._handle = self._loop.call_later(seconds, self._check)
+        self.expired = False
+
+    def touch(self) -> None:
+        """Begin the period again."""
+        self._touched = self._loop.time()
+
+    def stop(self) -> None:
+        """Never cancel the task."""
+        self._handle.cancel()
+
+    def _check(self) -> None:
+        left = self._touched + self._seconds - self._loop.time()
+        if left > 0:
+            self._handle = self._loop.call_later(left, self._check)
+        elif self._task is not None:
+            self.expired = True
+            self._task.cancel()
 
 
 async def refuse_upgrade(

@@ -32,11 +32,11 @@ from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
 from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.versions.policy_store import load_policy
 from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.versions.version_loader import VersionLoader
 from rlservo.serve_app.wire.loopback import is_loopback
 
 logger = logging.getLogger(__name__)
@@ -133,18 +133,21 @@ class PolicyServer(InferenceService):
                 options=self._settings.policy_options,
                 limits=limits,
             )
-            library = LoadedPolicies(Repository(folders, limits), load)
+            loader = VersionLoader(
+                Repository(folders, limits),
+                load,
+                scan_timeout_s=self._settings.scan_timeout_s,
+                load_timeout_s=self._settings.load_timeout_s,
+            )
         except RlservoError as error:
             raise _plain(error) from None
         self._control = ReplicaVersions(
-            library,
+            loader,
             GcsLedger(_controller()._actor_id.hex(), context.app_name, context.deployment),
             replica=self._replica,
             broadcast=self._tell_all,
             gather=self._ask_all,
             is_current=self._is_current,
-            scan_timeout_s=self._settings.scan_timeout_s,
-            load_timeout_s=self._settings.load_timeout_s,
         )
 
     def __serve_build_asgi_app__(self) -> PolicyApp:  # Serve's hook: the app is built in the replica
@@ -287,8 +290,3 @@ def start(
     serve.start(http_options=HTTPOptions(host=host, port=port), grpc_options=grpc_options)
     app = build(BuildArguments(policies=policies, replicas=replicas, served=served, settings=settings))
     serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)
-
-
-def stop() -> None:
-    """Shut Serve down: proxies first, then replicas, then the controller."""
-    serve.shutdown()

@@ -17,6 +17,8 @@ import urllib.request
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
+from rlservo.serve_app.ray_serve.server_log import error_line, last_line
+
 REACH_S = 5.0
 NODE_S = 60.0  # a node's first worker takes seconds to start, on a small computer a quarter of a minute
 OURS = "rlservo."  # what our applications' import path begins with
@@ -44,7 +46,7 @@ def main() -> None:
         for name, problem, found in check(plan, lambda what: report(waits=what)):
             report(check=name, ok=problem is None, message=problem or found)
     except Exception as error:
-        report(error=_sentence(error))
+        report(error=error_line(error))
     report(done=True)
 
 
@@ -62,7 +64,7 @@ def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Result]
             raise
         # Somebody listens there; Ray says no more than that it failed, of a wrong token, too.
         hint = "is it a head node, and is the token here the cluster's (RAY_AUTH_MODE, ~/.ray/auth_token)?"
-        raise ConnectionError(f"{_sentence(error)}: {hint}") from None
+        raise ConnectionError(f"{error_line(error)}: {hint}") from None
     nodes = [node for node in ray.nodes() if node["Alive"]]
     addresses = ", ".join(node["NodeManagerAddress"] for node in nodes)
     yield "cluster", None, f"{context.address_info['gcs_address']} answers; alive: {addresses}"
@@ -76,8 +78,7 @@ def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Result]
     folders = plan["policies"] or [folder for each in applications for folder in _folders(each)]
     settings = proxy_settings(applications)
     reports = _inspect_nodes(nodes, [*plan["variables"], *plan["any_value"], *settings], folders)
-    yield from check_nodes(reports, plan, settings)
-    yield from _policies(reports, folders)
+    yield from check_nodes(reports, plan, settings, folders)
     if problem is not None:
         yield "serve", problem, ""
         return
@@ -145,12 +146,14 @@ def _inspect_nodes(nodes: list[dict[str, Any]], names: list[str], folders: list[
         try:
             found = ray.get(reference) if reference in ready else found
         except Exception as error:
-            found = _sentence(error)
+            found = error_line(error)
         reports.append((node["NodeManagerAddress"], found))
     return reports
 
 
-def check_nodes(reports: NodeReports, plan: dict[str, Any], settings: dict[str, float]) -> Iterator[Result]:
+def check_nodes(
+    reports: NodeReports, plan: dict[str, Any], settings: dict[str, float], folders: list[str]
+) -> Iterator[Result]:
     for address, report in reports:
         if isinstance(report, str):
             yield "node", f"{address}: {report}", ""
@@ -178,13 +181,7 @@ def check_nodes(reports: NodeReports, plan: dict[str, Any], settings: dict[str, 
         )
         haproxy = report["haproxy"]
         yield "haproxy", haproxy and f"{address}: {haproxy}: {AGAIN}", f"{address} has HAProxy's wrapper"
-
-
-def _policies(reports: NodeReports, folders: list[str]) -> Iterator[Result]:
-    if not folders:
-        return
-    for address, report in reports:
-        if not isinstance(report, str):
+        if folders:
             missing = ", ".join(report["missing"])
             problem = f"{address}: {missing} is not there: replicas cannot start on this node" if missing else None
             yield "policies", problem, f"{address} has {', '.join(folders)}"
@@ -203,7 +200,7 @@ def _serve(dashboard: str | None) -> tuple[dict[str, Any], str | None]:
         details: dict[str, Any] = ServeSubmissionClient(f"http://{dashboard}").get_serve_details()
     except Exception as error:
         where = "run this on the head node, or look at its dashboard.log"
-        return {}, f"the dashboard at {dashboard} does not answer ({_sentence(error)}): {where}"
+        return {}, f"the dashboard at {dashboard} does not answer ({error_line(error)}): {where}"
     if not details["applications"]:
         return details, "nothing is deployed: serve deploy deploy/serve.yaml"
     return details, None
@@ -217,7 +214,7 @@ def _health(serve: dict[str, Any]) -> Iterator[Result]:
     for name, application in serve["applications"].items():
         bad = application["status"] != "RUNNING"
         parts = [application["message"], *(each["message"] for each in application["deployments"].values())]
-        why = _last_line(" ".join(filter(None, parts))) or "see serve status"
+        why = last_line(" ".join(filter(None, parts))) or "see serve status"
         state = f"'{name}' is {application['status']}"
         yield "application", f"{state}: {why}" if bad else None, state
 
@@ -281,15 +278,6 @@ def _end_with_parent() -> None:
     while os.read(0, 4096):
         pass
     os._exit(1)
-
-
-def _sentence(error: Exception) -> str:
-    return _last_line(str(error)) or type(error).__name__
-
-
-def _last_line(text: str) -> str:
-    """Return the line that says what went wrong: Ray puts the remote traceback before it."""
-    return text.strip().splitlines()[-1].strip()[:500] if text.strip() else ""
 
 
 if __name__ == "__main__":

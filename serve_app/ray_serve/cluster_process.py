@@ -21,7 +21,7 @@ from typing import Any
 
 from rlservo.serve_app.ray_serve import ray_parts
 from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, remove_folder
-from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, cut_log
+from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, cut_log, error_line
 from rlservo.serve_app.server.admin_key import remove_key
 
 CHECK_PERIOD_S = 0.5  # between checks of whether Ray's own processes live
@@ -40,6 +40,7 @@ def main() -> int:
     try:
         ray_parts.check()
         import ray
+        from ray import serve
 
         from rlservo.serve_app.ray_serve import app
 
@@ -66,7 +67,7 @@ def main() -> int:
             settings=plan["settings"],
         )
     except Exception as error:
-        _report(plan, {"error": _sentence(error)})
+        _report(plan, {"error": error_line(error)})
         raise
     started.set()
     _report(plan, {"ready": True})
@@ -79,7 +80,7 @@ def main() -> int:
         if time.monotonic() - log_checked > LOG_CHECK_PERIOD_S:
             log_checked = time.monotonic()
             cut_log(Path(plan["folder"]) / SERVER_LOG)
-    app.stop()
+    serve.shutdown()  # proxies first, then replicas, then the controller
     ray.shutdown()
     _leave_nothing(plan)
     return 0
@@ -101,7 +102,7 @@ def _leave_out_extras() -> None:
         parameter.RayParams = functools.partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
     services = ray_parts.find("ray._private.services")
     if ray_parts.is_there("ray._private.services:start_api_server"):
-        services.start_api_server = _no_api_server
+        services.start_api_server = lambda *_, **__: ("", None)  # address and process of none
     start: Any = services.start_ray_process
 
     def start_ray_process(command: list[str], process_type: str, *arguments: Any, **more: Any) -> Any:
@@ -142,11 +143,6 @@ def _ray_ended() -> str | None:
     return None
 
 
-def _no_api_server(*_: Any, **__: Any) -> tuple[str, None]:
-    """Return the address and the process of a dashboard that is not there."""
-    return "", None
-
-
 def _watch_input(stop: threading.Event, started: threading.Event, plan: dict[str, Any]) -> None:
     while os.read(0, 4096):
         pass
@@ -168,12 +164,6 @@ def _leave_nothing(plan: dict[str, Any]) -> None:
 
 def _report(plan: dict[str, Any], message: dict[str, Any]) -> None:
     os.write(plan["report_fd"], json.dumps(message).encode() + b"\n")
-
-
-def _sentence(error: Exception) -> str:
-    """Return the line that says what went wrong: the last one, since Ray puts the remote traceback before it."""
-    text = str(error).strip() or type(error).__name__
-    return text.splitlines()[-1].strip()[:500]
 
 
 if __name__ == "__main__":

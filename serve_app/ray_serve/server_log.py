@@ -37,3 +37,13 @@ def last_fault(file: Path) -> str:
         if faults:
             return f"its log says: {COLOURS.sub('', faults[-1])[:500]}"
     return "its log tells of no fault"
+
+
+def error_line(error: Exception) -> str:
+    """Return the line of an error that says what went wrong."""
+    return last_line(str(error)) or type(error).__name__
+
+
+def last_line(text: str) -> str:
+    """Return a text's last line: Ray puts the remote traceback before it."""
+    return text.strip().rpartition("\n")[2].strip()[:500]

@@ -6,6 +6,7 @@ The policy is anything that acts: in process or over HTTP. gymnasium is imported
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from rlservo.serve_app.recording.start import record_policy
 from rlservo.serve_app.rollout.environment import check_fit, control_rate_of, make_env
 from rlservo.serve_app.rollout.episode import Episode, EpisodeEnv, run_episode
 from rlservo.serve_app.rollout.fallback import LinkCounts, StoppedError, WithFallback
-from rlservo.serve_app.rollout.report import EpisodeRow, Link, Rate, RolloutReport, summarise
+from rlservo.serve_app.rollout.report import EpisodeRow, Link, Rate, RolloutReport, latency_of, wilson_interval
 from rlservo.serve_app.rollout.video import FilmedEnv, VideoFile
 
 if TYPE_CHECKING:
@@ -115,9 +116,11 @@ def rollout(
         except StoppedError as error:
             stopped = error.message
         wall_s = time.perf_counter() - began
-    return summarise(
-        rows,
-        paced.latencies_s,
+    latencies_s = paced.latencies_s
+    outcomes = [row.success for row in rows if row.success is not None]
+    returns = np.array([row.episode_return for row in rows])
+    deadline_s = None if control_rate_hz is None else 1 / control_rate_hz
+    return RolloutReport(
         env_id=env_id,
         policy=contract.name,
         version=contract.version,
@@ -125,9 +128,22 @@ def rollout(
         seed=seed,
         requested_episodes=episodes,
         interrupted=interrupted,
+        episodes=tuple(rows),
+        successes=sum(outcomes) if outcomes else None,
+        success_rate=sum(outcomes) / len(outcomes) if outcomes else None,
+        success_interval=wilson_interval(sum(outcomes), len(outcomes)) if outcomes else None,
+        return_mean=float(returns.mean()) if rows else None,
+        return_std=float(returns.std(ddof=1)) if len(rows) > 1 else None,
+        length_mean=float(np.mean([row.steps for row in rows])) if rows else None,
+        final_status=dict(Counter(row.final_status for row in rows if row.final_status is not None).most_common()),
+        steps=len(latencies_s),
         wall_s=wall_s,
+        steps_per_s=len(latencies_s) / wall_s if wall_s > 0 else 0.0,
+        latency_ms=latency_of(latencies_s),
         control_rate_hz=control_rate_hz,
-        overruns=pacer.overruns,
+        deadline_ms=None if deadline_s is None else 1e3 * deadline_s,
+        deadline_misses=None if deadline_s is None else sum(latency > deadline_s for latency in latencies_s),
+        overruns=pacer.overruns if rate == "real" else None,
         video=str(video_file.path) if video_file is not None and video_file.frames else None,
         link=_link_of(policy),
         stopped=stopped,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
@@ -80,62 +79,7 @@ class RolloutReport:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types."""
-        document = asdict(self)
-        document["episodes"] = [asdict(row) for row in self.episodes]
-        document["success_interval"] = None if self.success_interval is None else list(self.success_interval)
-        return document
-
-
-def summarise(
-    rows: Sequence[EpisodeRow],
-    latencies_s: Sequence[float],
-    *,
-    env_id: str,
-    policy: str,
-    version: str,
-    rate: Rate,
-    seed: int | None,
-    requested_episodes: int,
-    interrupted: bool,
-    wall_s: float,
-    control_rate_hz: float | None,
-    overruns: int,
-    video: str | None,
-    link: Link | None = None,
-    stopped: str | None = None,
-) -> RolloutReport:
-    """Return the report of what was recorded."""
-    outcomes = [row.success for row in rows if row.success is not None]
-    returns = np.array([row.episode_return for row in rows])
-    deadline_s = None if control_rate_hz is None else 1 / control_rate_hz
-    return RolloutReport(
-        env_id=env_id,
-        policy=policy,
-        version=version,
-        rate=rate,
-        seed=seed,
-        requested_episodes=requested_episodes,
-        interrupted=interrupted,
-        episodes=tuple(rows),
-        successes=sum(outcomes) if outcomes else None,
-        success_rate=sum(outcomes) / len(outcomes) if outcomes else None,
-        success_interval=wilson_interval(sum(outcomes), len(outcomes)) if outcomes else None,
-        return_mean=float(returns.mean()) if rows else None,
-        return_std=float(returns.std(ddof=1)) if len(rows) > 1 else None,
-        length_mean=float(np.mean([row.steps for row in rows])) if rows else None,
-        final_status=dict(Counter(row.final_status for row in rows if row.final_status is not None).most_common()),
-        steps=len(latencies_s),
-        wall_s=wall_s,
-        steps_per_s=len(latencies_s) / wall_s if wall_s > 0 else 0.0,
-        latency_ms=latency_of(latencies_s),
-        control_rate_hz=control_rate_hz,
-        deadline_ms=None if deadline_s is None else 1e3 * deadline_s,
-        deadline_misses=None if deadline_s is None else sum(latency > deadline_s for latency in latencies_s),
-        overruns=overruns if rate == "real" else None,
-        video=video,
-        link=link,
-        stopped=stopped,
-    )
+        return asdict(self)
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ActionError
-from rlservo.export.contract.spaces import LeafSpec, iter_elements
-from rlservo.serve_app.runtime.rounding import rounding_slack
+from rlservo.export.contract.spaces import LeafSpec
+from rlservo.serve_app.runtime.elements import first_element, rounding_slack
 
 SMALL_ACTION = 32  # elements up to which a Python loop checks bounds faster than numpy does
 
@@ -22,7 +22,6 @@ class ActionCheck:
         self._policy = policy
         self._name = name
         self._space = space
-        self._shape = space.shape
         self._dtype = np.dtype(space.dtype)
         low, high = space.bounds()
         if self._dtype.kind == "f":  # the largest finite number stands for unbounded: infinity is then outside as well
@@ -48,9 +47,7 @@ class ActionCheck:
         slack = rounding_slack(self._low, self._high)  # what unsquash may leave outside the space is clipped
         bad = ~((action >= self._low - slack) & (action <= self._high + slack))
         if bad.any():
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            flat = int(np.ravel_multi_index(index[1:], self._shape)) if self._shape else 0
-            label = dict(iter_elements(self._space))[flat] if self._shape else "0"
+            label, index = first_element(self._space, bad)
             low, high = self._low[index[1:]], self._high[index[1:]]
             value = action[index]
             why = f"not in [{low:g}, {high:g}]" if np.isfinite(value) else "not a finite number"

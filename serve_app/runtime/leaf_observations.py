@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, first_line
-from rlservo.export.contract.spaces import BoxSpec, LeafSpec, iter_elements
+from rlservo.export.contract.spaces import BoxSpec, LeafSpec
 from rlservo.serve_app.runtime.drift import EVERY, Drift
+from rlservo.serve_app.runtime.elements import first_element, rounding_slack
 from rlservo.serve_app.runtime.observation_faults import describe, describe_unequal, first_non_number, list_names
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
-from rlservo.serve_app.runtime.rounding import rounding_slack
 
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
 SMALL = 128  # elements up to which Python's own sum is faster than numpy's isfinite(...).all()
@@ -205,7 +205,7 @@ class LeafParser:
     def _check_range(self, array: NDArray[Any], low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         outside = np.asarray((array < low) | (array > high))
         if outside.any():
-            where = tuple(int(i) for i in np.argwhere(outside)[0])[1:]
+            where = first_element(self._space, outside)[1][1:]
             span = f"{int(low[where])}..{int(high[where])}"
             self._refuse_element(array, outside, f"outside the observation space's {span}")
 
@@ -256,9 +256,7 @@ class LeafParser:
 
     def _first(self, array: NDArray[Any], bad: NDArray[np.bool_]) -> tuple[str, tuple[int, ...]]:
         """Return (what the first bad element is called, where it is in the batch)."""
-        index = tuple(int(i) for i in np.argwhere(bad)[0])
-        flat = int(np.ravel_multi_index(index[1:], self._shape)) if self._shape else 0
-        label = dict(iter_elements(self._space))[flat]
+        label, index = first_element(self._space, bad)
         return f"{label} of observation {index[0]}" if len(array) > 1 else label, index
 
     def _refuse(self, why: str) -> NoReturn:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.bundle import CONTRACT_FILE, CONTRACT_KEY, GOLDEN_FILE, ONNX_FILE, Bundle
-from rlservo.export.contract.contract import REWARD, Contract, embedded_contract
+from rlservo.export.contract.contract import REWARD, Contract, parse_contract
 from rlservo.export.contract.errors import BundleError, BundleTamperedError, GoldenMismatchError, first_line
 from rlservo.export.contract.ort_session import open_ort_session
 from rlservo.export.contract.scores import split_scores
@@ -153,7 +153,7 @@ def check_copy(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> Non
     text = ort_session.get_modelmeta().custom_metadata_map.get(CONTRACT_KEY)
     if text is None:
         return  # a graph that another tool wrote; what of the contract can be seen in it has been compared
-    exported = embedded_contract(text, bundle.onnx)
+    exported = parse_contract(text, f"{bundle.onnx}: the contract inside it is malformed")
     now = bundle.contract.model_copy(update={"evaluations": exported.evaluations})  # `rlservo verify` adds to them
     if now != exported:
         changed = [name for name in Contract.model_fields if getattr(now, name) != getattr(exported, name)]

@@ -10,6 +10,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -85,6 +86,11 @@ class Step:
         """How many episodes it was a step of."""
         return self.batch or 1
 
+    @property
+    def own_state(self) -> State:
+        """The state in the observation's own form: without a batch axis where that came alone."""
+        return self.state if self.batch is not None else {name: leaf[0, ...] for name, leaf in self.state.items()}
+
 
 class Policy:
     """An exported policy, loaded and proven on this machine.
@@ -118,6 +124,7 @@ class Policy:
         """How the last exploring action came about, for a recording; None before the first."""
         self.last_notices: tuple[str, ...] = ()
         """What was out of bounds or beyond a limit at the last `act` and used all the same, for a recording."""
+        self.loaded_at = datetime.now(timezone.utc)
         self._unlogged = 0
         self._logged_at = -NOTICE_EVERY_S
         self.drift = Drift.of(contract)
@@ -141,7 +148,6 @@ class Policy:
         self._action_check = next(iter(self._action_checks.values()))
         self._input = contract.inputs[0].name
         self._action_only = ["action"]
-        self._dist_only = ["action_dist_inputs"]
 
     @classmethod
     def load(
@@ -205,8 +211,8 @@ class Policy:
         the reward, or remembers another number of episodes, and ActionError when what came out is not finite or not in
         the action space.
         """
-        if self._simple:
-            computed, _, batch, self.last_notices = self._compute(obs, explore, seed)
+        if self._simple and not explore:
+            computed, _, batch, self.last_notices = self._compute(obs)
             return computed if batch else computed[0, ...]
         step = self.step(obs, before=self._state, last=self._last, explore=explore, seed=seed, reward=reward)
         self._state = step.state or None
@@ -229,9 +235,7 @@ class Policy:
         None begins an episode. Raises RequestError when it does not fit the contract, and what `act` raises.
         """
         step = self.step(obs, state=state, explore=explore, seed=seed, reward=reward)
-        if step.batch is not None:
-            return step.action, step.state
-        return step.action, {name: leaf[0, ...] for name, leaf in step.state.items()}
+        return step.action, step.own_state
 
     def step(
         self,
@@ -251,8 +255,8 @@ class Policy:
         sends them, which is checked. None of a pair begins an episode. Raises RequestError when they do not fit, and
         what `act` raises.
         """
-        if self._simple and before is None and state is None and last is None and last_action is None:
-            computed, feed, batch, notices = self._compute(obs, explore, seed)
+        if self._simple and not explore and before is None and state is None and last is None and last_action is None:
+            computed, feed, batch, notices = self._compute(obs)
             leaves = {"action": computed}
             if batch:
                 return Step(computed, leaves, {}, len(computed), feed, notices)
@@ -299,7 +303,7 @@ class Policy:
         rows = len(next(iter(feed.values())))
         feed.update(self._state_tensors.inputs(before, rows, reward))
         explores = self._contract.distribution is not None
-        names = list(self._action_checks) + (self._dist_only if explores else []) + self._state_tensors.outputs
+        names = list(self._action_checks) + (["action_dist_inputs"] if explores else []) + self._state_tensors.outputs
         computed = dict(zip(names, self._run(names, feed), strict=True))
         action = {name: computed[name] for name in self._action_checks}
         for name, check in self._action_checks.items():
@@ -368,17 +372,11 @@ class Policy:
             _refuse_closed([], {})
         return self._ort_session
 
-    def _compute(
-        self, obs: Observation, explore: bool, seed: int | None
-    ) -> tuple[NDArray[Any], dict[str, NDArray[Any]], bool, tuple[str, ...]]:
+    def _compute(self, obs: Observation) -> tuple[NDArray[Any], dict[str, NDArray[Any]], bool, tuple[str, ...]]:
         """Return (action `[batch, ...]`, feed, whether `obs` is a batch, notices) of a simple policy."""
         array, batch, notice = self._leaf.parse(obs)
         feed = {self._input: array}
-        if explore:
-            self._check_explores()
-            action = self._sample(self._run(self._dist_only, feed)[0], seed)["action"]
-        else:
-            action = self._run(self._action_only, feed)[0]
+        action = self._run(self._action_only, feed)[0]
         self._action_check.check(action)
         notices: tuple[str, ...] = ()
         if notice:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rlservo.export.contract.contract import REWARD, Contract, StateSpec
 from rlservo.export.contract.errors import RequestError
 from rlservo.export.contract.spaces import DiscreteSpec
+from rlservo.serve_app.runtime.elements import parse_array
 
 State: TypeAlias = dict[str, NDArray[Any]]
 """Arrays `[batch, *shape]` by state name."""
@@ -67,11 +68,7 @@ class StateTensors:
         found: State = {}
         for name, spec in self._specs.items():
             expected = (rows, *spec.shape) if batch else spec.shape
-            try:
-                with np.errstate(over="ignore"):  # the infinity is refused below
-                    array = np.asarray(state[name], spec.dtype)
-            except (ValueError, TypeError, OverflowError) as error:
-                raise RequestError(f"state '{name}' of policy '{self._policy}' cannot be read: {error}") from error
+            array = parse_array(state[name], spec.dtype, f"state '{name}' of policy '{self._policy}'")
             if array.shape != expected:
                 raise RequestError(
                     f"policy '{self._policy}' expects state '{name}' of shape {expected}, got {array.shape}"
@@ -90,11 +87,7 @@ class StateTensors:
                 f"policy '{self._policy}' was trained to see the reward of its last action: give "
                 f"act(obs, reward=...), over a network 'reward'{start}"
             )
-        try:
-            with np.errstate(over="ignore"):
-                array = np.asarray(reward, np.float32).reshape(-1)
-        except (ValueError, TypeError, OverflowError) as error:
-            raise RequestError(f"the reward for policy '{self._policy}' cannot be read: {error}") from error
+        array = parse_array(reward, "float32", f"the reward for policy '{self._policy}'").reshape(-1)
         if len(array) != rows or not np.isfinite(array).all():
             raise RequestError(
                 f"policy '{self._policy}' expects {rows} finite reward{'s' if rows > 1 else ''}, got {reward!r:.80}"

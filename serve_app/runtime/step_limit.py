@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ActionError, RequestError, UsageError
-from rlservo.export.contract.spaces import BoxSpec, LeafSpec, iter_elements
+from rlservo.export.contract.spaces import BoxSpec, LeafSpec
+from rlservo.serve_app.runtime.elements import first_element, parse_array, rounding_slack
 from rlservo.serve_app.runtime.options import PolicyOptions
-from rlservo.serve_app.runtime.rounding import rounding_slack
 
 ROUNDING = 1e-6  # relative to the step: what float32 may add to a step that is allowed
 
@@ -43,11 +43,7 @@ class StepLimit:
         found: dict[str, NDArray[Any]] = {}
         for name, space in self._leaves.items():
             expected = (rows, *space.shape) if batch else space.shape
-            try:
-                with np.errstate(over="ignore"):  # the infinity is refused below
-                    array = np.asarray(last[name], space.dtype)
-            except (ValueError, TypeError, OverflowError) as error:
-                raise RequestError(f"last_action of policy '{self._policy}' cannot be read: {error}") from error
+            array = parse_array(last[name], space.dtype, f"last_action of policy '{self._policy}'")
             if not space.shape and array.shape == (*expected, 1):  # as RLlib, and so the graph, gives such an action
                 array = array.reshape(expected)
             low, high = space.bounds()
@@ -76,10 +72,8 @@ class StepLimit:
             beyond = np.abs(step) > steps * (1 + ROUNDING)
             if not beyond.any():
                 continue
-            index = tuple(int(i) for i in np.argwhere(beyond)[0])
             space = self._leaves[name]
-            flat = int(np.ravel_multi_index(index[1:], space.shape)) if space.shape else 0
-            label = dict(iter_elements(space))[flat] if space.shape else "0"
+            label, index = first_element(space, beyond)
             of = "" if name == "action" else f" of {name}"
             sentence = (
                 f"element {label}{of} of the action would step by {step[index]:.6g}, at most "

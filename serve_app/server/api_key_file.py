@@ -14,7 +14,7 @@ import weakref
 from pathlib import Path
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.server.api_keys import Key, Keys, read_key_file
+from rlservo.serve_app.server.api_keys import Keys, read_key_file
 from rlservo.serve_app.server.settings import ServerSettings
 
 logger = logging.getLogger(__name__)
@@ -49,10 +49,6 @@ class CurrentKeys:
         if self._settings.api_keys_file is None:
             return True
         return not self._refused and time.monotonic() - self._looked_at < STALE_S
-
-    def find(self, presented: bytes) -> Key | None:
-        """Return the key that was presented."""
-        return self.accepted.find(presented)
 
     def refresh(self) -> None:
         """Look at the file; use what it holds when this is the second look in a row to see the same."""

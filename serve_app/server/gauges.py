@@ -1,16 +1,14 @@
-"""Prometheus gauges sampled at scrape time: queue, sessions, micro-batches, observation drift.
-
-`Metrics.sources` takes functions such as these; shadows add their own.
-"""
+"""Prometheus' text: the requests' metrics, and gauges sampled when it is asked for (queue, sessions, drift, ...)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 
 import numpy as np
+from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
+from prometheus_client.registry import Collector
 
 from rlservo.serve_app.server.core import Core
 
@@ -18,25 +16,45 @@ MAX_ELEMENTS = 128  # an image's pixels are no series each: only the largest is 
 LARGEST = "largest"
 
 
-def gauges_of(core: Core) -> list[Callable[[], Iterator[Metric]]]:
-    """Return the gauges of a core, for its `metrics.sources`."""
-    return [partial(families, core, core.replica) for families in (queue, batches, drift, sessions, keys)]
+def exposition(core: Core) -> bytes:
+    """Return all metrics as Prometheus reads them."""
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(_Families(core))
+    return generate_latest(registry)
+
+
+class _Families(Collector):
+    def __init__(self, core: Core) -> None:
+        self._core = core
+
+    def collect(self) -> Iterator[Metric]:
+        core, replica = self._core, self._core.replica
+        yield from core.metrics.families(replica)
+        for families in (loaded, queue, batches, drift, sessions, keys):
+            yield from families(core, replica)
+        yield from core.shadows.families(replica)
+
+
+def loaded(core: Core, replica: str) -> Iterator[Metric]:
+    """Yield which versions are there, and which is the default."""
+    family = GaugeMetricFamily(
+        "rlservo_policy_loaded",
+        "1 for the default version, 0 for the others",
+        labels=["replica", "policy", "version"],
+    )
+    for name, version, _ in core.policies():
+        family.add_metric([replica, name, version], float(version == core.store().default(name)))
+    yield family
 
 
 def queue(core: Core, replica: str) -> Iterator[Metric]:
     """Yield what is known of the work before this replica."""
     admission = core.admission
-    labels = ["replica"]
-    for name, help_text, value in (
-        ("rlservo_queue_longest", "Most requests that waited for the processor at once, since the start",
-         admission.longest),
-        ("rlservo_requests_incoming", "Requests whose body is on its way", admission.incoming),
-    ):  # fmt: skip
-        gauge = GaugeMetricFamily(name, help_text, labels=labels)
-        gauge.add_metric([replica], value)
-        yield gauge
+    waited = "Most requests that waited for the processor at once, since the start"
+    yield _gauge("rlservo_queue_longest", waited, replica, admission.longest)
+    yield _gauge("rlservo_requests_incoming", "Requests whose body is on its way", replica, admission.incoming)
     turned_away = CounterMetricFamily(
-        "rlservo_turned_away", "Requests answered 503 before anything was read of them", labels=labels
+        "rlservo_turned_away", "Requests answered 503 before anything was read of them", labels=["replica"]
     )
     turned_away.add_metric([replica], admission.turned_away)
     yield turned_away
@@ -44,13 +62,8 @@ def queue(core: Core, replica: str) -> Iterator[Metric]:
 
 def keys(core: Core, replica: str) -> Iterator[Metric]:
     """Yield whether the API keys in use are those of their file."""
-    current = GaugeMetricFamily(
-        "rlservo_api_keys_current",
-        "1 while the API keys in use are those of their file; 0: the file cannot be used, and older keys stay",
-        labels=["replica"],
-    )
-    current.add_metric([replica], core.keys.current)
-    yield current
+    current = "1 while the API keys in use are those of their file; 0: the file cannot be used, and older keys stay"
+    yield _gauge("rlservo_api_keys_current", current, replica, core.keys.current)
 
 
 def batches(core: Core, replica: str) -> Iterator[Metric]:
@@ -84,13 +97,9 @@ def sessions(core: Core, replica: str) -> Iterator[Metric]:
         open_now.add_metric([replica, name], now[name])
         for family, (_, _, count) in zip(families, counted, strict=True):
             family.add_metric([replica, name], count[name])
-    remembered = GaugeMetricFamily(
-        "rlservo_episodes_remembered",
-        "Episodes in memory, in sessions and on streams; a batch is so many",
-        labels=["replica"],
-    )
-    remembered.add_metric([replica], kept.rows)
-    yield from (open_now, *families, remembered)
+    yield from (open_now, *families)
+    remembered = "Episodes in memory, in sessions and on streams; a batch is so many"
+    yield _gauge("rlservo_episodes_remembered", remembered, replica, kept.rows)
 
 
 def drift(core: Core, replica: str) -> Iterator[Metric]:
@@ -125,3 +134,9 @@ def drift(core: Core, replica: str) -> Iterator[Metric]:
             shift.add_metric([*who, element], mean)
             spread.add_metric([*who, element], deviation)
     yield from (shift, spread, looks)
+
+
+def _gauge(name: str, documentation: str, replica: str, value: float) -> Metric:
+    gauge = GaugeMetricFamily(name, documentation, labels=["replica"])
+    gauge.add_metric([replica], value)
+    return gauge

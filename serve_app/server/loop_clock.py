@@ -7,25 +7,13 @@ HAProxy's: frames of streams, and clients that ask a replica directly.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import time
-from pathlib import Path
 
 logger = logging.getLogger(__name__)
 
-STAMP = "x-rlservo-received"  # HAProxy's header: [ms since 1970] when it had the request, and on which machine's clock
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # the same in two processes that read the same clock
-
 TICK_S = 0.05
 SETTLE_S = 0.1  # of a loop that turns again, in which it reads what had waited
-
-
-def clock_id() -> str:
-    """Return whose clock this process reads: that of the kernel it runs on."""
-    with contextlib.suppress(OSError):
-        return BOOT_ID.read_text().strip()
-    return "unknown"
 
 
 class LoopClock:

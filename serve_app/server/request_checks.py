@@ -91,45 +91,37 @@ class Hosts:
         return address.is_loopback or not self._local
 
 
-class Authorizer:
-    """Decides by the key that a request presents whether it may use what its route, or its method, grants."""
+def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key | None:
+    """Return the key that opens what a route, or a method, grants, None where it needs none.
 
-    def __init__(self, keys: CurrentKeys) -> None:
-        self._keys = keys
-
-    @property
-    def needs_keys(self) -> bool:
-        """Whether whoever wants actions needs a key."""
-        return bool(self._keys.accepted.keys)
-
-    def authorize(self, presented: bytes | None, access: Access) -> Key | None:
-        """Return the key that opens this, None where it needs none. Raises UnauthenticatedError or ForbiddenError."""
-        if access is Access.open:
-            return None
-        admin, accepted = access is not Access.act, self._keys.accepted
-        if not accepted.keys and not (admin and accepted.operator):
-            if admin:
-                raise ForbiddenError(
-                    "administration needs an admin key, and this server has none: see 'rlservo key --help'"
-                )
-            return None
-        if presented is None:
-            what = "administration needs an admin" if admin else "this server wants an API"
-            raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
-        key = accepted.find(presented)
-        if key is None:
-            raise UnauthenticatedError("this API key is not known to the server")
-        if admin and key.role is not Role.admin:
-            raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key")
-        return key
+    Raises UnauthenticatedError or ForbiddenError.
+    """
+    if access is Access.open:
+        return None
+    admin, accepted = access is not Access.act, keys.accepted
+    if not accepted.keys and not (admin and accepted.operator):
+        if admin:
+            raise ForbiddenError(
+                "administration needs an admin key, and this server has none: see 'rlservo key --help'"
+            )
+        return None
+    if presented is None:
+        what = "administration needs an admin" if admin else "this server wants an API"
+        raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
+    key = accepted.find(presented)
+    if key is None:
+        raise UnauthenticatedError("this API key is not known to the server")
+    if admin and key.role is not Role.admin:
+        raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key")
+    return key
 
 
 class RequestChecks:
     """Refuses, by their headers, HTTP requests and WebSockets that no client of ours sends or that have no key."""
 
-    def __init__(self, hosts: Hosts, authorizer: Authorizer) -> None:
+    def __init__(self, hosts: Hosts, keys: CurrentKeys) -> None:
         self._hosts = hosts
-        self._authorizer = authorizer
+        self._keys = keys
 
     def check(self, scope: Scope, headers: Mapping[bytes, bytes], access: Access) -> Key | None:
         """Return the key that opens what `access` says; `headers` are the scope's (`fold_headers`).
@@ -149,7 +141,7 @@ class RequestChecks:
             scope["type"] == "websocket" or scope["method"] not in READING
         ):
             _check_page(headers.get(b"origin"), headers.get(b"sec-fetch-site"), host)
-        key = self._authorizer.authorize(presented_key(headers), access)
+        key = authorize(self._keys, presented_key(headers), access)
         if UNREADABLE in headers or not all(map(bytes.isascii, headers.values())):
             _check_readable(headers)
         return key

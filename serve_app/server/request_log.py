@@ -71,54 +71,35 @@ class RequestLog:
 
     def write_answer(self, request: Request, decision: Decision, seconds: float) -> None:
         """Write a request that got its action; ask `every` before."""
-        fields: dict[str, Any] = {
-            "request_id": _shorten(request.request_id),
-            "protocol": request.protocol,
-            "policy": decision.name,
-            "version": decision.version,
-            "code": "ok",
-            "ms": round(seconds * 1e3, 3),
-            "batch": decision.batch or 1,
-        }
-        if request.on_websocket and request.seq is not None:
-            fields["seq"] = request.seq
+        fields = _fields(request, decision.name, decision.version, "ok", seconds)
+        fields["batch"] = decision.batch or 1
         _requests.info("answered", extra={FIELDS: fields})
 
-    def write_failure(self, request: Request, code: str, sentence: str) -> None:
-        """Write a request that got none."""
+    def write_failure(self, request: Request, code: str, sentence: str, *, peer: str | None = None) -> None:
+        """Write a request that got none; `peer` is the client's address, of one that was not routed."""
         if not _requests.isEnabledFor(logging.INFO):
             return
-        fields: dict[str, Any] = {
-            "request_id": _shorten(request.request_id),
-            "protocol": request.protocol,
-            "policy": request.policy[:64],
-            "version": request.version and request.version[:32],
-            "code": code,
-            "ms": round((time.perf_counter() - request.received) * 1e3, 3),
-        }
-        if request.on_websocket and request.seq is not None:
-            fields["seq"] = request.seq
-        self._write_refusal(fields, sentence)
-
-    def write_unread(
-        self, protocol: str, code: str, sentence: str, *, request_id: str | None, peer: str | None
-    ) -> None:
-        """Write a request that was refused before it was routed; `peer` is its client's address."""
-        fields: dict[str, Any] = {
-            "request_id": _shorten(request_id),
-            "protocol": protocol,
-            "policy": "",
-            "version": None,
-            "code": code,
-        }
+        version = request.version and request.version[:32]
+        fields = _fields(request, request.policy[:64], version, code, time.perf_counter() - request.received)
         if peer is not None:
             fields["peer"] = peer
-        self._write_refusal(fields, sentence)
-
-    def _write_refusal(self, fields: dict[str, Any], sentence: str) -> None:
         if self._values:
             fields["error"] = sentence
         _requests.info("refused", extra={FIELDS: fields})
+
+
+def _fields(request: Request, policy: str, version: str | None, code: str, seconds: float) -> dict[str, Any]:
+    fields: dict[str, Any] = {
+        "request_id": _shorten(request.request_id),
+        "protocol": request.protocol,
+        "policy": policy,
+        "version": version,
+        "code": code,
+        "ms": round(seconds * 1e3, 3),
+    }
+    if request.on_websocket and request.seq is not None:
+        fields["seq"] = request.seq
+    return fields
 
 
 def write_change(

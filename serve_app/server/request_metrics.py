@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
-from prometheus_client.registry import Collector
 
 from rlservo.serve_app.versions.policy_store import Decision
 
@@ -75,13 +73,10 @@ class Totals:
 class Metrics:
     """The counts of one replica."""
 
-    def __init__(self, replica: str = "") -> None:
-        """Start from zero; `replica` tells the replicas' series apart."""
-        self._replica = replica
+    def __init__(self) -> None:
         self._answered: dict[tuple[str, str, str], _Series] = {}
         self._failed: dict[tuple[str, str, str, str], int] = {}
         self._streams: dict[str, int] = {}
-        self.sources: list[Callable[[], Iterable[Metric]]] = []  # further families, asked for when somebody looks
 
     def record_answer(self, protocol: str, decision: Decision, seconds: float) -> None:
         """Count a request that got its action `seconds` after it arrived."""
@@ -122,14 +117,8 @@ class Metrics:
             last_answer_ms=round(1e3 * max((series.last_answer_s for series in found), default=0.0)),
         )
 
-    def exposition(self, policies: dict[str, tuple[str, ...]]) -> bytes:
-        """Return the text Prometheus reads; `policies` are the versions by name, the default last."""
-        registry = CollectorRegistry(auto_describe=False)
-        registry.register(_Snapshot(self, policies))
-        return generate_latest(registry)
-
-    def families(self, policies: dict[str, tuple[str, ...]]) -> Iterator[Metric]:
-        """Yield the families as they are now."""
+    def families(self, replica: str) -> Iterator[Metric]:
+        """Yield the families as they are now; `replica` tells the replicas' series apart."""
         names = ["replica", "policy", "version", "protocol"]
         requests = CounterMetricFamily("rlservo_requests", "Requests by outcome", labels=[*names, "code"])
         families = {
@@ -145,36 +134,16 @@ class Metrics:
             "batch": HistogramMetricFamily("rlservo_batch_size", "Observations per request", labels=names),
         }
         for key, series in self._answered.items():
-            labels = [self._replica, *key]
+            labels = [replica, *key]
             requests.add_metric([*labels, "ok"], sum(series.latency.counts))
             for name, family in families.items():
                 histogram: Histogram = getattr(series, name)
                 family.add_metric(labels, histogram.cumulative(), histogram.total)
         for (policy, version, protocol, code), count in self._failed.items():
-            requests.add_metric([self._replica, policy, version, protocol, code], count)
+            requests.add_metric([replica, policy, version, protocol, code], count)
         yield requests
         yield from families.values()
         streams = GaugeMetricFamily("rlservo_streams", "Open WebSockets", labels=["replica", "policy"])
         for policy, count in self._streams.items():
-            streams.add_metric([self._replica, policy], count)
+            streams.add_metric([replica, policy], count)
         yield streams
-        loaded = GaugeMetricFamily(
-            "rlservo_policy_loaded",
-            "1 for the default version, 0 for the others",
-            labels=["replica", "policy", "version"],
-        )
-        for policy, versions in policies.items():
-            for version in versions:
-                loaded.add_metric([self._replica, policy, version], float(version == versions[-1]))
-        yield loaded
-        for source in self.sources:
-            yield from source()
-
-
-class _Snapshot(Collector):
-    def __init__(self, metrics: Metrics, policies: dict[str, tuple[str, ...]]) -> None:
-        self._metrics = metrics
-        self._policies = policies
-
-    def collect(self) -> Iterator[Metric]:
-        return self._metrics.families(self._policies)

@@ -18,6 +18,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
+
 from rlservo.export.contract.errors import (
     DeadlineError,
     InternalError,
@@ -29,15 +31,16 @@ from rlservo.export.contract.errors import (
     TooLargeError,
     UnavailableError,
 )
+from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.server.batch_limit import count_rows, most_rows
-from rlservo.serve_app.server.loop_clock import LoopClock, clock_id
+from rlservo.serve_app.server.loop_clock import LoopClock
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
 from rlservo.serve_app.server.request_metrics import Metrics
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 from rlservo.serve_app.versions.shadow import Shadows
+from rlservo.serve_app.wire.request_stamp import clock_id
 
 logger = logging.getLogger(__name__)
 
@@ -73,12 +76,12 @@ class Codec(Protocol[Source, Reply]):
 class Admission:
     """Refuses what came too late, or what is too much for one event loop."""
 
-    def __init__(self, *, max_queued: int, max_queue_ms: float, max_incoming: int, max_streams: int) -> None:
-        """Set the limits: of a burst, of the wait before and in it, of bodies half sent, of streams."""
-        self._max_queued = max_queued
-        self.max_wait_s = max_queue_ms / 1e3
-        self._max_incoming = max_incoming
-        self._max_streams = max_streams
+    def __init__(self, settings: ServerSettings) -> None:
+        """Take the limits: of a burst, of the wait before and in it, of bodies half sent, of streams."""
+        self._max_queued = settings.max_ongoing_requests
+        self.max_wait_s = settings.max_queue_ms / 1e3
+        self._max_incoming = settings.max_incoming
+        self._max_streams = settings.max_streams
         self.loop_clock = LoopClock(self.max_wait_s)
         self._clock_id = clock_id().encode()
         self._burst = 0
@@ -175,24 +178,16 @@ class Admission:
 class RequestPath:
     """Answers requests, and is the one place that admits, counts, logs and times them."""
 
-    def __init__(
-        self,
-        store_provider: StoreProvider,
-        settings: ServerSettings,
-        *,
-        admission: Admission,
-        episodes: Episodes,
-        metrics: Metrics,
-        log: RequestLog,
-        shadows: Shadows,
-    ) -> None:
+    def __init__(self, store_provider: StoreProvider, settings: ServerSettings, *, alone: Callable[[], bool]) -> None:
+        """`store_provider` gives None for as long as the policies are being loaded; `alone` is for `Episodes`."""
         self._store_provider = store_provider
         self._max_batch = settings.max_batch
-        self._admission = admission
-        self._episodes = episodes
-        self._metrics = metrics
-        self._log = log
-        self._shadows = shadows
+        self.settings = settings
+        self.admission = Admission(settings)
+        self.episodes = Episodes(max_sessions=settings.max_sessions, idle_s=settings.session_idle_s, alone=alone)
+        self.metrics = Metrics()
+        self.log = RequestLog(settings)
+        self.shadows = Shadows()
 
     def store(self) -> PolicyStore:
         """Return the policies. Raises UnavailableError while they are being loaded."""
@@ -225,9 +220,9 @@ class RequestPath:
             self.record_bug(request)
             raise InternalError(BUG) from error
         taken = time.perf_counter() - request.received
-        self._metrics.record_answer(request.protocol, decision, taken)
-        if self._log.every:
-            self._log.write_answer(request, decision, taken)
+        self.metrics.record_answer(request.protocol, decision, taken)
+        if self.log.every:
+            self.log.write_answer(request, decision, taken)
         return reply
 
     async def decide(self, request: Request) -> Decision:
@@ -243,9 +238,9 @@ class RequestPath:
         if (len(obs) if single else most_rows(obs)) > self._max_batch:
             self._check_batch(store, request)
         if request.episode is not None or request.stream is not None:
-            decision = self._episodes.act(store, request)
+            decision = self.episodes.act(store, request)
         elif store.batches and not request.explore:
-            check = partial(_check_again, request, time.perf_counter(), self._admission.max_wait_s)
+            check = partial(_check_again, request, time.perf_counter(), self.admission.max_wait_s)
             decision = await store.act_together(name, request.version, obs, label=request.label, check=check)
         else:
             decision = store.act(
@@ -253,51 +248,49 @@ class RequestPath:
             )
         shadow = store.shadow(name)
         if shadow is not None and decision.version == shadow.of and not request.explore:
-            self._shadows.offer(shadow, obs, decision)
+            self.shadows.offer(shadow, obs, decision)
         return decision
 
-    def record_failure(self, request: Request, code: str, sentence: str) -> None:
-        """Count and log a request that got no action; names that are not loaded are not told apart."""
+    def record_failure(self, request: Request, code: str, sentence: str, *, peer: str | None = None) -> None:
+        """Count and log a request that got no action; names that are not loaded are not told apart.
+
+        `peer` is the address it came from, for the log of what was refused before it was routed.
+        """
         name, version = request.policy, request.version
         store = self._store_provider()
         if store is None or name not in store.names:
             name = version = ""
         else:  # an alias is counted as the version it leads to, no version as the default
             version = store.default(name) if version is None else store.version_of(name, version)
-        self._metrics.count_failure(request.protocol, name, version, code)
-        self._log.write_failure(request, code, sentence)
+        self.metrics.count_failure(request.protocol, name, version, code)
+        self.log.write_failure(request, code, sentence, peer=peer)
 
     def record_bug(self, request: Request) -> None:
         """Count a request that failed by the exception that is being handled, and log that with its traceback."""
         logger.exception("a request failed", extra={FIELDS: {"request_id": request.request_id}})
-        self._metrics.count_failure(request.protocol, "", "", InternalError.code)  # what failed may be the policies
-
-    def record_refusal(self, protocol: str, error: RlservoError, request_id: str | None, *, peer: str | None) -> None:
-        """Count and log a request that was refused before it was routed, and the address it came from."""
-        self._metrics.count_failure(protocol, "", "", error.code)
-        self._log.write_unread(protocol, error.code, error.message, request_id=request_id, peer=peer)
+        self.metrics.count_failure(request.protocol, "", "", InternalError.code)  # what failed may be the policies
 
     def open_stream(self, request: Request) -> None:
         """Count a stream that opens, from whose opening `request` is. Raises OverloadedError."""
         try:
-            self._admission.open_stream()
+            self.admission.open_stream()
         except OverloadedError as error:
             self.record_failure(request, error.code, error.message)
             raise
-        self._metrics.count_stream(request.policy, 1)
+        self.metrics.count_stream(request.policy, 1)
 
     def close_stream(self, request: Request) -> None:
         """Count it no longer."""
-        self._admission.close_stream()
-        self._metrics.count_stream(request.policy, -1)
+        self.admission.close_stream()
+        self.metrics.count_stream(request.policy, -1)
 
     def _admit(self, request: Request) -> None:
         """Raise OverloadedError or LateError; a wait before `received` begins to count."""
         if request.on_websocket:  # request and reply alternate there, so that the streams' number is the bound
-            self._admission.check_age(request.waited)
+            self.admission.check_age(request.waited)
             return
         # Only now, when the body is here: one that is slow to come waits for itself.
-        request.received = min(request.received, self._admission.enter(request.waited))
+        request.received = min(request.received, self.admission.enter(request.waited))
         if request.waited is not None and request.waited > LEAST_WAIT_S:
             request.received -= request.waited
 
@@ -331,3 +324,41 @@ def _check_deadline(request: Request) -> None:
             f"the deadline of {request.deadline_ms:g} ms passed before the policy was asked: nothing computed",
             {"deadline_ms": request.deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": request.seq},
         )
+
+
+# Number of observations in a request, before anything is computed of it.
+
+
+def most_rows(obs: Any) -> int:
+    """Return how many observations there are at most, whatever the space is: `count_rows` looks closer."""
+    most, parts = 0, [obs]
+    while parts:
+        part = parts.pop()
+        if type(part) is dict:
+            parts += part.values()
+        else:
+            most = max(most, _length(part))
+            if type(part) in (list, tuple) and part and type(part[0]) in (dict, list, tuple, np.ndarray):
+                parts.append(part[0])  # the parts of a Tuple are of one batch
+    return most
+
+
+def count_rows(space: SpaceSpec, obs: Any) -> int:
+    """Return how many observations a large `obs` holds; an array as long as the space's own is one."""
+    if isinstance(space, DictSpec | TupleSpec):
+        if isinstance(space, DictSpec) and type(obs) is list:
+            return len(obs)  # of single observations
+        inside = space.spaces.items() if isinstance(space, DictSpec) else enumerate(space.spaces)
+        parts = obs if type(obs) in (dict, list, tuple) else {}
+        found: dict[Any, Any] = dict(parts) if type(parts) is dict else dict(enumerate(parts))
+        return max((count_rows(child, found[key]) for key, child in inside if key in found), default=0)
+    if type(obs) is dict:  # element names and values
+        return max((_length(value) for value in obs.values()), default=0)
+    rows = _length(obs)
+    return rows if rows != (space.shape or (0,))[0] else 1
+
+
+def _length(value: Any) -> int:
+    if type(value) is np.ndarray:
+        return len(value) if value.ndim else 0
+    return len(value) if type(value) in (list, tuple) else 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -9,12 +10,11 @@ from pathlib import Path
 from rlservo.export.contract.errors import BundleError, RlservoError
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
 from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.versions.plan_changes import plan_of
 from rlservo.serve_app.versions.policy_store import PolicyStore, load_policy
 from rlservo.serve_app.versions.repository import Repository, raise_all
+from rlservo.serve_app.versions.version_loader import VersionLoader
 
 
 def load_served(
@@ -25,21 +25,25 @@ def load_served(
     Raises UsageError or BundleError, and UnavailableError where the file system hangs.
     """
     settings = settings or ServerSettings.from_environment(environment={})
-    calls, limits = BlockingCalls(), settings.bundle_limits
+    limits = settings.bundle_limits
     load = partial(load_policy, threads=settings.threads, options=settings.policy_options, limits=limits)
-    library = LoadedPolicies(Repository(paths, limits), load)
-    available = calls.wait(
-        library.repository.available, config, timeout_s=settings.scan_timeout_s, what="looking through the folders"
+    loader = VersionLoader(
+        Repository(paths, limits),
+        load,
+        scan_timeout_s=settings.scan_timeout_s,
+        load_timeout_s=settings.load_timeout_s,
     )
-    plans = plan_of(config, available, None)
+    return asyncio.run(_load_all(loader, config))
+
+
+async def _load_all(loader: VersionLoader, config: ServedConfig) -> PolicyStore:
+    plans = plan_of(config, await loader.available(config), None)
     policies: list[Policy] = []
     errors: list[RlservoError] = []
     for name, plan in plans.items():
         for version, digest in plan.versions.items():
-            what = f"loading policy '{name}' version {version}"
             try:
-                loaded = calls.wait(library.load, name, version, digest, timeout_s=settings.load_timeout_s, what=what)
-                policies.append(loaded.policy)
+                policies.append(await loader.load(name, version, digest))
             except BundleError as error:
                 errors.append(error)
     raise_all(errors)

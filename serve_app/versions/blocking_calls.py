@@ -8,11 +8,10 @@ ends when the file system comes back, or with the process. There are never more 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, TimeoutError
+from concurrent.futures import Future
 from typing import Any, TypeVar
 
 from rlservo.export.contract.errors import UnavailableError
@@ -43,34 +42,16 @@ class BlockingCalls:
                     "from the file system"
                 )
             await asyncio.sleep(POLL_S)
-        loop = asyncio.get_running_loop()
-        returned: asyncio.Future[None] = loop.create_future()
-
-        def wake() -> None:
-            if not returned.done():
-                returned.set_result(None)
-
-        def wake_loop(_future: Future[Result]) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop has ended: nobody waits
-                loop.call_soon_threadsafe(wake)
-
-        future = self._start(function, arguments)
-        future.add_done_callback(wake_loop)
+        returned = asyncio.wrap_future(self._start(function, arguments))
         try:
-            await asyncio.wait_for(returned, deadline - time.monotonic())
-        except asyncio.TimeoutError:
-            raise _timeout_error(what, timeout_s) from None
-        return future.result()
-
-    def wait(self, function: Callable[..., Result], *arguments: Any, timeout_s: float, what: str) -> Result:
-        """Do as `run` where there is no event loop."""
-        future = self._start(function, arguments)
-        try:
-            return future.result(timeout_s)
-        except TimeoutError:
-            if future.done():  # the function's own
-                raise
-            raise _timeout_error(what, timeout_s) from None
+            done, _ = await asyncio.wait([returned], timeout=deadline - time.monotonic())
+        finally:
+            returned.cancel()  # if it has not returned: nobody waits for it any more
+        if not done:
+            raise UnavailableError(
+                f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?"
+            )
+        return returned.result()
 
     def _running(self) -> int:
         self._threads = {thread for thread in self._threads if thread.is_alive()}
@@ -78,6 +59,7 @@ class BlockingCalls:
 
     def _start(self, function: Callable[..., Result], arguments: tuple[Any, ...]) -> Future[Result]:
         future: Future[Result] = Future()
+        future.set_running_or_notify_cancel()  # from now on it cannot be cancelled, only left alone
 
         def call() -> None:
             try:
@@ -92,7 +74,3 @@ class BlockingCalls:
         thread.start()
         self._threads.add(thread)
         return future
-
-
-def _timeout_error(what: str, timeout_s: float) -> UnavailableError:
-    return UnavailableError(f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?")

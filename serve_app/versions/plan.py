@@ -185,8 +185,13 @@ class Plan(_Model):
 
 
 def now() -> str:
-    """Return the time as plans and statuses write it: UTC, ISO 8601."""
-    return datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+    """Return the time as plans and statuses write it."""
+    return timestamp(datetime.now(timezone.utc))
+
+
+def timestamp(time: datetime) -> str:
+    """Return a time in UTC as ISO 8601."""
+    return time.isoformat(timespec="milliseconds")
 
 
 def config_hash(document: Any) -> str:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol, TypeVar
+from typing import Protocol
 
 from rlservo.export.contract.errors import UnavailableError
 from rlservo.serve_app.versions.plan import Plan
 
 ATTEMPTS = 10  # at a number in the ledger, before a change gives up
-
-Result = TypeVar("Result")
 
 
 class Ledger(Protocol):
@@ -36,11 +32,10 @@ class PlanLedger:
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="ledger")
 
     async def newest_generation(self) -> int:
         """Return the highest number, 0 when there is no plan."""
-        return await self._in_thread(self._ledger.newest)
+        return await asyncio.to_thread(self._ledger.newest)
 
     async def newest(self) -> Plan | None:
         """Return the newest plan, if there is one. Raises UnavailableError."""
@@ -48,18 +43,11 @@ class PlanLedger:
             generation = await self.newest_generation()
             if generation == 0:
                 return None
-            content = await self._in_thread(self._ledger.fetch, generation)
+            content = await asyncio.to_thread(self._ledger.fetch, generation)
             if content is not None:
                 return Plan.model_validate_json(content)
         raise UnavailableError("the ledger of policies changes faster than it can be read")
 
     async def append(self, plan: Plan) -> bool:
         """Write a plan under its number; return False when that is taken."""
-        return await self._in_thread(self._ledger.append, plan.generation, plan.model_dump_json().encode())
-
-    def close(self) -> None:
-        """End the thread."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
-
-    async def _in_thread(self, function: Callable[..., Result], *arguments: Any) -> Result:
-        return await asyncio.get_running_loop().run_in_executor(self._thread, function, *arguments)
+        return await asyncio.to_thread(self._ledger.append, plan.generation, plan.model_dump_json().encode())

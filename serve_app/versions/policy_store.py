@@ -24,7 +24,7 @@ from rlservo.export.contract.errors import (
 from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.micro_batching import Batcher
 from rlservo.serve_app.versions.plan import PolicyPlan
 
@@ -54,13 +54,6 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True)
-class _Canary:
-    policy: Policy
-    share: float
-    needs_label: bool  # a stateful policy cannot change in the middle of an episode
-
-
-@dataclass(frozen=True, slots=True)
 class Shadow:
     """A version that computes along with the default one."""
 
@@ -76,7 +69,8 @@ class _Served:
     plan: PolicyPlan
     versions: Mapping[str, Policy]  # oldest first
     default: Policy
-    canary: _Canary | None
+    canary: Policy | None
+    canary_share: float
     shadow: Shadow | None
 
 
@@ -179,9 +173,9 @@ class PolicyStore:
         share keeps those it had. Raises what `get` raises.
         """
         if version is None:
-            canary = self._find(name).canary
-            if canary is not None and _draw(name, label, canary.needs_label) < canary.share:
-                return canary.policy
+            served = self._find(name)
+            if served.canary is not None and _draw(name, label, served.canary) < served.canary_share:
+                return served.canary
         return self.get(name, version)
 
     def shadow(self, name: str) -> Shadow | None:
@@ -206,7 +200,7 @@ class PolicyStore:
 
         Raises UnknownPolicyError, UnknownVersionError and what `Policy.act` raises.
         """
-        return _act(self._stateless(name, version, label), obs, explore, seed)
+        return take_step(self._stateless(name, version, label), obs, explore=explore, seed=seed)[0]
 
     async def act_together(
         self,
@@ -224,7 +218,7 @@ class PolicyStore:
         policy = self._stateless(name, version, label)
         batcher = self._batchers.get(policy)
         if batcher is None:
-            return _act(policy, obs)
+            return take_step(policy, obs)[0]
         started = time.perf_counter()
         feed, batch, notices = policy.parse(obs)
         parse_ms = (time.perf_counter() - started) * 1e3
@@ -264,16 +258,15 @@ def _serve(name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> _Serv
     default = versions.get(plan.default or "")
     if default is None:
         raise UsageError(f"policy '{name}' is to be served as version {plan.default}, which is not loaded")
-    canary: _Canary | None = None
+    canary, share = None, 0.0
     if plan.canary is not None:
-        policy = versions.get(plan.version_of(plan.canary.version) or "")
-        canary = None if policy is None else _Canary(policy, plan.canary.share, policy.is_stateful)
+        canary, share = versions.get(plan.version_of(plan.canary.version) or ""), plan.canary.share
     shadow: Shadow | None = None
     if plan.shadow is not None:
         policy = versions.get(plan.version_of(plan.shadow) or "")
         if policy is not None and policy is not default:
             shadow = Shadow(default.contract.version, policy.contract.version, policy.clone())
-    return _Served(plan, versions, default, canary, shadow)
+    return _Served(plan, versions, default, canary, share, shadow)
 
 
 def _wants_batches(policy: Policy) -> bool:
@@ -283,18 +276,19 @@ def _wants_batches(policy: Policy) -> bool:
     return policy.options.micro_batch > 1 and not policy.is_stateful and len(contract.inputs) == len(observed)
 
 
-def _act(policy: Policy, obs: Observation, explore: bool = False, seed: int | None = None) -> Decision:
+def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision, Step]:
+    """Decide by one step of a policy, `given` what `Policy.step` takes beside the observation; return the step, too."""
     started = time.perf_counter()
-    step = policy.step(obs, explore=explore, seed=seed)
+    step = policy.step(obs, **given)
     infer_ms = (time.perf_counter() - started) * 1e3
     contract = policy.contract
-    return Decision(step.action, contract.name, contract.version, infer_ms, step.batch, step.notices)
+    return Decision(step.action, contract.name, contract.version, infer_ms, step.batch, step.notices), step
 
 
-def _draw(name: str, label: str | None, needs_label: bool) -> float:
-    """Return a number in [0, 1): the label's own, or without one a random one."""
-    if label is None:
-        return 1.0 if needs_label else random.random()
+def _draw(name: str, label: str | None, canary: Policy) -> float:
+    """Return a number in [0, 1]: the label's own, or without one a random one."""
+    if label is None:  # a stateful policy cannot change in the middle of an episode
+        return 1.0 if canary.is_stateful else random.random()
     digest = hashlib.blake2b(f"{name}/{label}".encode("utf-8", "surrogatepass"), digest_size=8).digest()
     return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
 

@@ -25,8 +25,8 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
+from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions import plan_changes
-from rlservo.serve_app.versions.loaded_policies import Loadable, LoadedPolicies, LoadedPolicy
 from rlservo.serve_app.versions.plan import (
     FailedVersion,
     Plan,
@@ -35,12 +35,12 @@ from rlservo.serve_app.versions.plan import (
     ServedConfig,
     config_hash,
     now,
+    timestamp,
 )
 from rlservo.serve_app.versions.plan_ledger import ATTEMPTS, Ledger, PlanLedger
-from rlservo.serve_app.versions.plan_proof import prove
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.repository import Key
-from rlservo.serve_app.versions.version_loader import VersionLoader
+from rlservo.serve_app.versions.version_loader import Loadable, VersionLoader
 
 logger = logging.getLogger(__name__)
 
@@ -79,33 +79,29 @@ class ReplicaVersions:
 
     def __init__(
         self,
-        policies: LoadedPolicies,
+        loader: VersionLoader,
         ledger: Ledger,
         *,
         replica: str = "",
         broadcast: Broadcast | None = None,
         gather: Gather | None = None,
         is_current: IsCurrent | None = None,
-        scan_timeout_s: float = 10.0,
-        load_timeout_s: float = 30.0,
     ) -> None:
         """`broadcast` tells every replica of a number and returns what they answer, `gather` returns every replica's
         listing, and `is_current` says whether a configuration is the one that the deployment has now, since a replica
-        may be started with the one before. Without them this replica is the only one. The time-outs are for one look
-        through the repository, and for loading and proving one version.
+        may be started with the one before. Without them this replica is the only one.
         """
         self.store: PolicyStore | None = None
         self.plan: Plan | None = None
         self.replica = replica
         self.gather = gather
-        self._loader = VersionLoader(policies, scan_timeout_s=scan_timeout_s, load_timeout_s=load_timeout_s)
+        self._loader = loader
         self._ledger = PlanLedger(ledger)
         self._broadcast = broadcast
         self._is_current = is_current
         self._served: dict[str, set[str]] = {}  # every identity that was ever served here, by name
         self._proposed: list[set[Loadable]] = []  # what changes that are under way have loaded, and no plan has yet
-        self._failed: dict[Key, str] = {}
-        self._behind: tuple[str, ...] = ()
+        self._failed: dict[Key, str] = {}  # why this replica serves something older than the plan says
         self._tried_at = 0.0
         self._writing = asyncio.Lock()  # held while a change that has been proven is written down
 
@@ -153,7 +149,7 @@ class ReplicaVersions:
         self._proposed.append(proposed)
         try:
             try:
-                await prove(self._loader, policies, before.policies)  # meanwhile others may change what they want
+                await self._loader.prove(policies, before.policies)  # meanwhile others may change what they want
                 plan = await self._write(change, what)
             except REFUSALS as error:
                 await self._refuse(what, error)
@@ -182,7 +178,7 @@ class ReplicaVersions:
                 else:
                     policies = change(before)
                     # Loaded by now, unless others changed the same policy.
-                    await prove(self._loader, policies, before.policies)
+                    await self._loader.prove(policies, before.policies)
                     plan = before.after(policies, what)
                 if await self._ledger.append(plan):
                     return plan
@@ -198,16 +194,20 @@ class ReplicaVersions:
 
     async def follow(self, generation: int = 0, *, again: bool = False) -> ReplicaProgress:
         """Serve the newest plan; return whether this replica could. `again`: try also what was given up before."""
-        reached = self.plan.generation if self.plan is not None else 0
-        if self._behind or reached < generation or reached < await self._ledger.newest_generation():
+        if self._failed or self._generation < generation or self._generation < await self._ledger.newest_generation():
             plan = await self._ledger.newest()
             if plan is not None:
                 await self._apply(plan, again=again)
         return self.progress()
 
+    @property
+    def _generation(self) -> int:
+        return self.plan.generation if self.plan is not None else 0
+
     def progress(self) -> ReplicaProgress:
         """Return where this replica stands."""
-        return ReplicaProgress(self.replica, self.plan.generation if self.plan is not None else 0, self._behind)
+        behind = tuple(self._failed.values())
+        return ReplicaProgress(self.replica, self._generation, behind)
 
     async def poll_ledger(self) -> None:
         """Follow plans that this replica was not told of (it was starting, or cut off), until cancelled."""
@@ -215,8 +215,8 @@ class ReplicaVersions:
             await asyncio.sleep(LEDGER_POLL_S)
             try:
                 newest = await self._ledger.newest_generation()
-                late = bool(self._behind) and time.monotonic() - self._tried_at > RETRY_PERIOD_S
-                if late or newest > (self.plan.generation if self.plan is not None else 0):
+                late = bool(self._failed) and time.monotonic() - self._tried_at > RETRY_PERIOD_S
+                if late or newest > self._generation:
                     await self.follow(again=late)
             except Exception as error:  # the ledger may be out of reach for a while; what is served goes on
                 logger.warning("the ledger of policies could not be followed: %s", error)
@@ -230,19 +230,15 @@ class ReplicaVersions:
         states.update({key: VersionState("failed", reason) for key, reason in self._failed.items()})
         for name, policy in ({} if self.store is None else self.store.plans).items():
             for version, digest in policy.versions.items():
-                loaded = self._loader.policies.get(name, version, digest)
+                loaded = self._loader.get(name, version, digest)
                 if loaded is not None:
                     reason = states[name, version].reason if (name, version) in states else ""
-                    states[name, version] = VersionState("ready", reason, loaded.loaded_at)
+                    states[name, version] = VersionState("ready", reason, timestamp(loaded.loaded_at))
         states.update({key: VersionState("loading") for key in self._loader.loading if key not in states})
         by_name: dict[str, dict[str, VersionState]] = {}
         for (name, version), state in sorted(states.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
             by_name.setdefault(name, {})[version] = state
         return by_name
-
-    def close(self) -> None:
-        """End the ledger's thread."""
-        self._ledger.close()
 
     async def _configured(self, document: Any, digest: str, before: Plan | None) -> Plan:
         """Return the plan that a configuration means, or the one that refuses it."""
@@ -250,7 +246,7 @@ class ReplicaVersions:
             config = ServedConfig.parse(document)
             available = await self._loader.available(config)
             policies = plan_changes.plan_of(config, available, before)
-            await prove(self._loader, policies, {} if before is None else before.policies)
+            await self._loader.prove(policies, {} if before is None else before.policies)
         except RlservoError as error:
             if before is None:
                 raise
@@ -266,7 +262,7 @@ class ReplicaVersions:
         Raises BundleError when this replica serves nothing yet and a default version cannot be loaded.
         """
         self._tried_at = time.monotonic()
-        found: dict[Loadable, LoadedPolicy | RlservoError] = {}
+        found: dict[Loadable, Policy | RlservoError] = {}
         for name, wanted in plan.policies.items():
             for version, digest in wanted.versions.items():
                 try:
@@ -275,16 +271,15 @@ class ReplicaVersions:
                     found[name, version, digest] = error
         self._arrange(plan, found)
 
-    def _arrange(self, plan: Plan, found: Mapping[Loadable, LoadedPolicy | RlservoError]) -> None:
+    def _arrange(self, plan: Plan, found: Mapping[Loadable, Policy | RlservoError]) -> None:
         """Serve a plan with what of it could be loaded. Nothing waits here: who asks sees all of the old or the new."""
         if self.plan is not None and plan.generation < self.plan.generation:
             return  # while this one was being loaded, a later one has been served
         serving: dict[str, PolicyPlan] = {}
-        kept: dict[Loadable, LoadedPolicy] = {}
+        kept: dict[Loadable, Policy] = {}
         failed: dict[Key, str] = {}
-        behind: list[str] = []
         for name, wanted in plan.policies.items():
-            loaded: dict[Loadable, LoadedPolicy] = {}
+            loaded: dict[Loadable, Policy] = {}
             errors: dict[str, RlservoError] = {}
             for version, digest in wanted.versions.items():
                 one = found[name, version, digest]
@@ -293,31 +288,28 @@ class ReplicaVersions:
                     failed[name, version] = one.message
                 else:
                     loaded[name, version, digest] = one
-            behind += [error.message for error in errors.values()]
             was = None if self.store is None else self.store.plans.get(name)
             if errors and was is not None:
                 wanted = was
                 keys = [(name, version, digest) for version, digest in was.versions.items()]
-                loaded = {key: each for key in keys if (each := self._loader.policies.get(*key)) is not None}
+                loaded = {key: each for key in keys if (each := self._loader.get(*key)) is not None}
             elif errors and wanted.default in errors:
                 if self.store is not None:
-                    continue  # not served here rather than as another version; `behind` says so
+                    continue  # not served here rather than as another version; `failed` says so
                 raise BundleError(
                     f"policy '{name}' cannot be served as version {wanted.default}, its default: "
                     f"{errors[wanted.default].message}"
                 )
             serving[name] = wanted
             kept.update(loaded)
-        self._loader.policies.keep(kept, set().union(*self._proposed))
-        policies = [loaded.policy for loaded in kept.values()]
-        for policy in policies:
+        self._loader.keep(kept, found, set().union(*self._proposed))
+        for policy in kept.values():
             self._served.setdefault(policy.contract.name, set()).add(policy.identity)
         changed = [name for name, identities in self._served.items() if len(identities) > 1]
-        self.store = PolicyStore(policies, serving, changed=changed, replaces=self.store)
-        self._loader.forget_others(found)
-        self.plan, self._failed, self._behind = plan, failed, tuple(behind)
-        if behind:
-            logger.error("generation %d cannot be served as it should: %s", plan.generation, "; ".join(behind))
+        self.store = PolicyStore(kept.values(), serving, changed=changed, replaces=self.store)
+        self.plan, self._failed = plan, failed
+        if failed:
+            logger.error("generation %d cannot be served as it should: %s", plan.generation, "; ".join(failed.values()))
         else:
             logger.info("serving generation %d (%s)", plan.generation, plan.changed_by)
 

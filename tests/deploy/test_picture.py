@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rlservo.deploy.demo import picture
+from rlservo.serve_app.rollout import video
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.rollout.environment import make_env
 from rlservo.serve_app.runtime.policy import Policy
@@ -24,9 +25,9 @@ def test_only_the_first_middle_and_last_picture_of_an_episode_are_drawn(
         (episode,) = rollout(policy, MIR100, episodes=1, seed=10_000).episodes
         actions: list[Any] = []
         act = policy.act
-        monkeypatch.setattr(policy, "act", lambda obs: actions.append(act(obs)) or actions[-1])
+        monkeypatch.setattr(policy, "act", lambda obs, **options: actions.append(act(obs, **options)) or actions[-1])
         monkeypatch.setattr(picture, "make_env", lambda env_id, kwargs, render: make_env(env_id, kwargs, render=False))
-        monkeypatch.setattr(picture, "rgb_frame", lambda env: np.array(len(actions)))
+        monkeypatch.setattr(video, "rgb_frame", lambda env: np.array(len(actions)))
         notes: list[object] = []
         frames = picture.film(policy, MIR100, seed=10_000, steps=episode.steps, note=notes.append)
     assert [int(frame) for frame in frames] == [0, episode.steps // 2, episode.steps] and episode.steps > 3

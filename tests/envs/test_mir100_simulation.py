@@ -13,6 +13,7 @@ from rlservo.envs.mir100.simulation import Mir100Simulation
 
 # The lab's inner faces, from the world file: walls 0.15 m thick round 6 x 8 m, all of it moved by (-0.027, 0.014).
 EAST, WEST, NORTH, SOUTH = 2.85 - 0.027, -2.85 - 0.027, 3.85 + 0.014, -3.85 + 0.014
+FRONT, BACK = slice(FRONT_SCANNER.count), slice(FRONT_SCANNER.count, None)  # of a scan
 MIDDLE = (-0.027, 0.014, 0.0)
 CYCLE = 0.1
 AWAY = [(50.0, 0.0, 0.0), (52.0, 0.0, 0.0), (54.0, 0.0, 0.0)]  # cubes out of the room
@@ -42,7 +43,7 @@ def slip(sim: Mir100Simulation) -> float:
 
 def test_beams_straight_at_the_walls_read_the_hand_computed_distances() -> None:
     sim = lab()
-    front, back = sim.front_scan, sim.back_scan
+    front, back = sim.scan[FRONT], sim.scan[BACK]
     # Front scanner at (0.4288, 0.2358); its beam i points to -75 + i/2 degrees.
     assert front[150] == pytest.approx(2.85 - 0.4288, abs=1e-9)  # 0 degrees, east
     assert front[330] == pytest.approx(3.85 - 0.2358, abs=1e-9)  # 90 degrees, north
@@ -86,7 +87,7 @@ def test_a_cube_to_the_left_shortens_the_beams_to_the_left_only() -> None:
     empty = sim.scan.copy()
     x, y, _ = MIDDLE
     sim.place(MIDDLE, cubes=[(x + 0.4288, y + 0.2358 + 1.25, 0.0), *AWAY[1:]])  # its near face 1 m left of the scanner
-    front = sim.front_scan
+    front = sim.scan[FRONT]
     assert front[330] == pytest.approx(1.0, abs=1e-9)
     changed = np.flatnonzero(np.abs(sim.scan - empty) > 1e-9)
     half_width = math.degrees(math.atan2(0.25, 1.0))  # the near face is 0.5 m wide
@@ -106,7 +107,7 @@ def test_the_robot_does_not_see_itself_the_floor_or_the_target() -> None:
     sim = Mir100Simulation("lab_6x8", laser_noise=0.0)
     x, y, _ = MIDDLE
     sim.place(MIDDLE, target=(x + 1.0, y + 0.2358, 0.0), cubes=AWAY)  # right in front of the front scanner
-    assert sim.front_scan[150] == pytest.approx(2.85 - 0.4288, abs=1e-9)
+    assert sim.scan[FRONT][150] == pytest.approx(2.85 - 0.4288, abs=1e-9)
     assert sim.scan.min() > 2.0
 
 
@@ -277,12 +278,12 @@ def test_a_move_is_refused_while_something_is_within_4_cm_of_a_scanner() -> None
 
     place_cube(0.039)
     assert sim.is_blocked
-    assert sim.front_scan.min() == 0.05  # a reading is clipped to the scanner's range
+    assert sim.scan[FRONT].min() == 0.05  # a reading is clipped to the scanner's range
     assert not sim.command(0.5, 0.0)
     sim.advance()
     assert sim.pose[0] <= x + 1e-9
     place_cube(0.045)
-    assert sim.front_scan.min() == 0.05
+    assert sim.scan[FRONT].min() == 0.05
     assert not sim.is_blocked
     sim.place(MIDDLE, cubes=AWAY)
     assert sim.command(0.5, 0.0)
@@ -304,8 +305,8 @@ def test_state_is_laid_out_as_the_robot_servers() -> None:
     assert state[3:6].tolist() == list(sim.pose)
     assert -math.pi <= state[5] < math.pi
     assert state[6:8] == pytest.approx([0.4, 0.3], abs=0.02)
-    assert (state[8:509] == sim.front_scan).all()
-    assert (state[509:1020] == sim.back_scan).all()
+    assert (state[8:509] == sim.scan[FRONT]).all()
+    assert (state[509:1020] == sim.scan[BACK]).all()
     assert state[1020] == 0.0
     assert state[1021:1030].reshape(3, 3).tolist() == [list(cube) for cube in cubes]
     drive(sim, 0.5, 0.0, 80)

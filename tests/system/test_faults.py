@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-from rlservo.serve_app.protocols import oip_messages as messages
+from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
 from rlservo.serve_app.ray_serve.haproxy.process_table import command_of, process_ids
 from rlservo.serve_app.ray_serve.processes import check_port, port_holder

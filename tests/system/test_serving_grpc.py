@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.oip_grpc import Grpc, is_local
+from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.ray_serve.launcher import serve_policies
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.runtime.policy import Policy
@@ -149,7 +149,7 @@ def test_discrete_policies_take_and_give_integers(call: Call, policies: Path) ->
         (lambda m: m.inputs[0].contents.int_contents.extend([1] * 135), "belongs into 'fp32_contents'"),
         (lambda m: setattr(m.inputs[0], "datatype", "BYTES"), "a policy reads numbers"),
         (lambda m: setattr(m.inputs[0], "datatype", "FP12"), "must be one of"),
-        (lambda m: m.inputs[0].shape.__setitem__(0, -1), "must be sizes"),
+        (lambda m: m.inputs[0].shape.__setitem__(0, -1), "must be a list of sizes"),
         (lambda m: m.inputs.pop(), "at least one tensor"),
         (lambda m: m.inputs.append(m.inputs[0]), "there twice"),
     ],

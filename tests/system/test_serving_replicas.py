@@ -18,7 +18,7 @@ import pytest
 from rlservo.export.contract.errors import SessionError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.protocols import oip_messages as messages
+from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from servers import Run, launched

@@ -22,7 +22,6 @@ What Ray's (2.60, `haproxy_templates.py` there) lacks:
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
@@ -39,9 +38,8 @@ from rlservo.serve_app.ray_serve.haproxy.error_replies import (
     TOO_SLOW_REPLICA,
     UNREACHABLE,
 )
+from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
 
-STAMP = "x-rlservo-received"  # [ms since 1970] when HAProxy had the request, and on which machine's clock
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # the same in two processes that read the same clock
 ACTING = "{ path_end /act /infer /ModelInfer }"
 CONNECT_TIMEOUT_MS = 250
 FIN_TIMEOUT_S = 5  # for a connection that one side has closed
@@ -120,7 +118,7 @@ def bridge_configuration(text: str, *, hung_since: float | None = None) -> str:
     What comes in the beginning may have waited since a HAProxy hung (`hung_since`, `time.time`).
     """
     if hung_since is not None:
-        stamp = f"http-request set-header {STAMP} {hung_since * 1e3:.0f}-{clock()}"
+        stamp = f"http-request set-header {STAMP} {hung_since * 1e3:.0f}-{clock_id()}"
         until = f"if {{ date(0,ms) -m int lt {time.time() * 1e3 + SETTLE_MS:.0f} }}"
         own = rf"^( *)http-request set-header {STAMP} .*$"
         text = _replace(text, own, rf"\g<0>\n\1{stamp} {until}", "the stamp", times=1 + _has_grpc(text))
@@ -153,13 +151,6 @@ def admin_socket(text: str) -> str | None:
 def knows_replicas(text: str) -> bool:
     """Whether requests can be passed on to anybody."""
     return _count(_REPLICA, text) > 0
-
-
-def clock() -> str:
-    """Return whose clock this process reads: that of the kernel it runs on."""
-    with contextlib.suppress(OSError):
-        return BOOT_ID.read_text().strip()
-    return "unknown"
 
 
 def _replace(text: str, pattern: str, new: str | Callable[[re.Match[str]], str], what: str, *, times: int = 1) -> str:
@@ -222,7 +213,7 @@ def _leave_hung_replicas(text: str) -> str:
 
 def _stamp(text: str) -> str:
     """Note on every request when it came. A body that is slow to come waits for itself, so only after it."""
-    stamp = f"    http-request set-header {STAMP} %[date(0,ms)]-{clock()}"
+    stamp = f"    http-request set-header {STAMP} %[date(0,ms)]-{clock_id()}"
     text = _insert(text, "http", f"    http-request wait-for-body time {REQUEST_TIMEOUT_S}s\n{stamp}")
     if not _has_grpc(text):
         return text

@@ -36,9 +36,9 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.versions.version_loader import VersionLoader
 from rlservo.serve_app.wire.admin_key_file import key_file, read_key
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
@@ -82,7 +82,7 @@ def key_path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def port(folder: Path, key_path: Path, served: Serve) -> Iterator[int]:
     """A server whose operator has a key and which asks nobody else for one; ur5 in 1 and 2, production 1."""
     digest = "sha256:" + hashlib.sha256(read_key(key_path).encode()).hexdigest()
-    control = ReplicaVersions(LoadedPolicies(Repository([folder])), Shelf(), replica="only")
+    control = ReplicaVersions(VersionLoader(Repository([folder])), Shelf(), replica="only")
     config = {"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}},
                            "gridworld": {"versions": ["1"]}}, "unlisted": "ignore"}  # fmt: skip
     asyncio.run(control.configure(config))
@@ -90,7 +90,6 @@ def port(folder: Path, key_path: Path, served: Serve) -> Iterator[int]:
         create_app(lambda: control.store, ServerSettings(operator_key=digest), replica="only", control=control)
     ) as port:
         yield port
-    control.close()
 
 
 @pytest.fixture
@@ -179,12 +178,11 @@ def started(policies: Path, key_path: Path, served: Serve, tmp_path: Path) -> It
     for version in ("1", "2"):
         shutil.copytree(policies / "ur5" / version, root / "ur5" / version)
     digest = "sha256:" + hashlib.sha256(read_key(key_path).encode()).hexdigest()
-    control = ReplicaVersions(LoadedPolicies(Repository([root])), Shelf(), replica="only")
+    control = ReplicaVersions(VersionLoader(Repository([root])), Shelf(), replica="only")
     asyncio.run(control.configure({}))
     app = create_app(lambda: control.store, ServerSettings(operator_key=digest), replica="only", control=control)
     with served(app) as port, AdminClient(f"http://127.0.0.1:{port}", api_key=read_key(key_path)) as client:
         yield client, port, root
-    control.close()
 
 
 def test_from_the_default_start_on_a_load_changes_no_reply_and_a_rollback_leads_back(
@@ -240,7 +238,7 @@ def test_administration_needs_the_key_and_acting_does_not(port: int) -> None:
 
 
 def test_a_server_without_an_operator_lets_nobody_administer(folder: Path, served: Serve) -> None:
-    control = ReplicaVersions(LoadedPolicies(Repository([folder / "ur5" / "1"])), Shelf())
+    control = ReplicaVersions(VersionLoader(Repository([folder / "ur5" / "1"])), Shelf())
     asyncio.run(control.configure({}))
     with served(create_app(lambda: control.store, ServerSettings(), control=control)) as open_port:
         with (

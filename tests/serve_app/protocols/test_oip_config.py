@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_config import model_config, statistics
 from rlservo.serve_app.protocols.oip_grpc import _numbered
+from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan import PolicyPlan
@@ -172,7 +172,7 @@ def test_a_run_that_several_requests_share_is_one_execution(store: PolicyStore) 
         batcher._several = True  # as if several had come in the turn before
         obs = np.zeros(27, np.float32)
         requests = [Request("oip", "gathered", None, time.perf_counter(), obs=obs) for _ in range(6)]
-        return await asyncio.gather(*map(core.request_path.decide, requests))
+        return await asyncio.gather(*map(core.decide, requests))
 
     ran = batcher.runs
     for decision in asyncio.run(crowd()):

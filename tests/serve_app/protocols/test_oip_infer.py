@@ -213,7 +213,7 @@ def test_an_empty_tensor_that_numpy_cannot_make_is_refused(ask: Ask, more: dict[
 def test_over_grpc_it_is_refused_too() -> None:
     from rlservo.export.contract.errors import RequestError
     from rlservo.serve_app.protocols import oip_grpc
-    from rlservo.serve_app.protocols import oip_messages as messages
+    from rlservo.serve_app.protocols.oip_messages import messages
 
     grpc: Any = oip_grpc
     for raw in ([b""], []):

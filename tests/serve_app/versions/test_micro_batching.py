@@ -26,9 +26,9 @@ from rlservo.export.contract.bundle import load_bundle, write_contract, write_go
 from rlservo.export.contract.errors import ActionError, BundleError, DeadlineError, UsageError
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.protocols import oip_messages as messages
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_grpc import OipGrpcCodec
+from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
@@ -224,7 +224,7 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
 
     async def calls() -> list[Any]:
         core = create_app(lambda: store, ServerSettings()).state.core
-        codec, answer = OipGrpcCodec(core), core.request_path.answer
+        codec, answer = OipGrpcCodec(core), core.answer
         asked = messages.ModelInferRequest(model_name="ur5")
         asked.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
         requests = []
@@ -273,8 +273,9 @@ def test_exploring_requests_draw_for_themselves(port: int, store: PolicyStore) -
 
 
 def test_a_warning_is_in_the_reply_to_what_it_is_about(bounded: Path) -> None:
+    store = load_store(bounded, options=TOGETHER)
+
     async def main() -> list[Decision]:
-        store = load_store(bounded, options=TOGETHER)
         in_a_crowd(store)
         rows = OBS[:4].copy()
         rows[1, 5], rows[3, 6] = 9.0, -10.0
@@ -295,7 +296,7 @@ def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(s
         now = time.perf_counter()
         hurried = Request("json", "ur5", None, now, obs=OBS[0], deadline_ms=30.0)
         patient = Request("json", "ur5", None, now, obs=OBS[1], deadline_ms=30_000.0)
-        decide = core.request_path.decide
+        decide = core.decide
         return await asyncio.gather(decide(hurried), decide(patient), slow(), return_exceptions=True)
 
     with watched(store, store.get("ur5")) as sizes:

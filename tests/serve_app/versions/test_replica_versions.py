@@ -21,10 +21,10 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions import plan_changes
-from rlservo.serve_app.versions.loaded_policies import LoadedPolicies
 from rlservo.serve_app.versions.plan import Canary
 from rlservo.serve_app.versions.replica_versions import Change, ReplicaProgress, ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.versions.version_loader import VersionLoader
 
 OBS = np.zeros(27, np.float32) + 0.1
 
@@ -54,8 +54,8 @@ class Fleet:
         self.controls = [self.start(folder, f"r{n}") for n, folder in enumerate(folders)]
 
     def start(self, folder: Path, name: str) -> ReplicaVersions:
-        library = LoadedPolicies(Repository([folder]))
-        return ReplicaVersions(library, self.shelf, replica=name, broadcast=self.tell, is_current=self.is_current)
+        loader = VersionLoader(Repository([folder]))
+        return ReplicaVersions(loader, self.shelf, replica=name, broadcast=self.tell, is_current=self.is_current)
 
     async def tell(self, generation: int) -> Sequence[ReplicaProgress]:
         return [await control.follow(generation) for control in self.controls]
@@ -295,7 +295,7 @@ def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folde
         return Policy.load(bundle)
 
     async def run() -> None:
-        control = ReplicaVersions(LoadedPolicies(Repository([folder]), slowly), Shelf(), replica="slow")
+        control = ReplicaVersions(VersionLoader(Repository([folder]), slowly), Shelf(), replica="slow")
         await control.configure(config("1", production="1"))
         change = asyncio.create_task(control.load("ur5", "2", what="load"))
         while not began.is_set():
