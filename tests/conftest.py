@@ -11,6 +11,7 @@ pytest_plugins = ["checkpoints", "bundles", "clusters", "environments", "servers
 
 # Tests that share what is costly to make, by the beginning of their id. All others share their file's own.
 TOGETHER = {
+    "tests/envs/robot_server/": "ports of server managers",
     "tests/system/test_serving.py": "live server",
     "tests/system/test_serving_fuzz.py": "live server",
     "tests/system/test_serving_grpc.py": "live server",

@@ -59,8 +59,7 @@ class JsonCodec:
 
     def encode(self, request: Request, decision: Decision) -> tuple[bytes, Headers]:
         """Return the reply's body and headers."""
-        fields = reply_fields(request, decision)
-        fields["action"] = _plain(decision.action)
+        fields = {"action": _plain(decision.action), **reply_fields(request, decision)}
         if "state" in fields:
             fields["state"] = _plain(fields["state"])
         return orjson.dumps(fields, option=orjson.OPT_SERIALIZE_NUMPY), JSON_HEADERS

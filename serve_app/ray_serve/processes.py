@@ -75,13 +75,17 @@ def _is_orphan(pid: int) -> bool:
 
 
 def port_holder(port: int) -> tuple[int, str] | None:
-    """Return (pid, command name) of a process that listens on a TCP port, where the system shows it to this user."""
-    for connection in psutil.net_connections("tcp"):
-        is_there = connection.status == psutil.CONN_LISTEN and connection.laddr and connection.laddr.port == port
-        if is_there and connection.pid is not None:
-            with contextlib.suppress(psutil.Error):
-                return connection.pid, psutil.Process(connection.pid).name()
-    return None
+    """Return (pid, command name) of a process that listens on a TCP port, where the system shows it to this user.
+
+    HAProxy, where it is one of several: its listening sockets are its wrapper's, too.
+    """
+    holders: list[tuple[int, str]] = []
+    for process in psutil.process_iter():  # psutil.net_connections names one process for each socket
+        with contextlib.suppress(psutil.Error):
+            listening = (each for each in process.net_connections("tcp") if each.status == psutil.CONN_LISTEN)
+            if any(each.laddr and each.laddr.port == port for each in listening):
+                holders.append((process.pid, process.name()))
+    return min(holders, key=lambda holder: holder[1] != "haproxy", default=None)
 
 
 def free_ports(count: int) -> list[int]:

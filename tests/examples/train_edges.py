@@ -90,7 +90,7 @@ def train_with_tune(config: Any, run: Any, storage: Path, stop: dict[str, float]
 
 
 def train_here(config: Any, run: Any, storage: Path, stop: dict[str, float]) -> tuple[Path, int]:
-    with training_run.built(training_run.build(config)) as algorithm:
+    with training_run.stopping(training_run.build(config)) as algorithm:
         result = algorithm.train()
         while all(result[name] < limit for name, limit in stop.items()):
             result = algorithm.train()

@@ -20,8 +20,11 @@ sys.path.insert(0, str(EXAMPLES))
 
 import shared.training_run as training_run  # noqa: E402
 
+from rlservo.deploy.serve_commands import choose_gl_backend  # noqa: E402
+
 
 def main() -> None:
+    choose_gl_backend()  # before the first script imports mujoco
     with training_run.ray_session(num_cpus=1):
         training_run.ray_session = lambda **_: contextlib.nullcontext()  # the scripts' own
         for line in sys.stdin:

@@ -33,6 +33,7 @@ from rlservo.serve_app.ray_serve.haproxy import (
 )
 from rlservo.serve_app.ray_serve.processes import free_ports, is_free
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.wire import request_stamp
 from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
 
 BINARY = installation.find_binary() or ""
@@ -723,6 +724,8 @@ def test_a_replica_that_takes_too_long_is_not_waited_for(node: Node) -> None:
     # The program runs in a process of its own: a copy of its files is given a shorter time.
     copy = node.folder / "serve_app/ray_serve/haproxy"
     shutil.copytree(installation.PROGRAM.parent, copy)
+    (copy.parents[1] / "wire").mkdir()
+    shutil.copy(request_stamp.__file__, copy.parents[1] / "wire")
     replies = copy / "error_replies.py"
     replies.write_text(replies.read_text().replace(f"ACTION_TIMEOUT_S = {seconds}", "ACTION_TIMEOUT_S = 1"))
     program = str(copy / installation.PROGRAM.name)
