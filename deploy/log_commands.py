@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rlservo.serve_app.replay.estimate import EstimateReport
     from rlservo.serve_app.replay.replay import ReplayReport
 
-log = typer.Typer(no_args_is_help=True, help="Recordings: what is in them, as other formats, as pictures.")
+log = typer.Typer(no_args_is_help=True, help="Show, convert and draw recordings.")
 
 Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), or folders of them.")]
 Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder: its newest version.")]
@@ -37,7 +37,7 @@ class Format(str, Enum):
 
 @log.command()
 def info(files: Files, as_json: Json = False) -> None:
-    """Show what is in recordings: policies, episodes, decisions, what is missing.
+    """Show what is in recordings, and what is missing.
 
     Example: `rlservo log info recordings`
     """
@@ -60,7 +60,7 @@ def export(
     policy: PolicyName = None,
     task: Annotated[str | None, typer.Option(help="For LeRobot: a sentence that says what the robot does.")] = None,
 ) -> None:
-    """Convert recordings to Parquet, a LeRobotDataset v3.0 or a Minari dataset.
+    """Convert recordings to Parquet, LeRobotDataset v3.0 or Minari.
 
     Example: `rlservo log export run.mcap --to parquet --out run.parquet`
     """
@@ -88,7 +88,9 @@ def plot(
     episode: Annotated[int, typer.Option(min=0, help="Which episode, from 0, in the order they ended.")] = 0,
     out: Annotated[Path, typer.Option(help="The picture: .png, .svg, .pdf.")] = Path("episode.png"),
 ) -> None:
-    """Draw one recorded episode: observations and actions by name, rewards, latency, warnings.
+    """Draw one recorded episode.
+
+    Observations and actions by name, rewards, latency and warnings.
 
     Example: `rlservo log plot run.mcap --episode 3 --out episode.png`
     """
@@ -109,7 +111,7 @@ def replay(
     policy: PolicyName = None,
     as_json: Json = False,
 ) -> None:
-    """Put recorded episodes through a bundle and show what it would have done otherwise.
+    """Compare what a bundle would have done with what was recorded.
 
     Exit code 0: no action would change; 1: some would; 2: the recording does not fit the bundle.
 
@@ -139,7 +141,7 @@ def estimate(
     seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Estimate the return a bundle would have earned, from recordings of another version.
+    """Estimate a bundle's return from recordings of another.
 
     Recordings that did not explore have fitted Q evaluation alone. It is experimental: how often its interval holds
     was counted in a one-dimensional simulation only. Drive nothing because of it.

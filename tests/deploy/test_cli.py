@@ -258,7 +258,7 @@ def test_help_imports_nothing_that_takes_time(policies: Path) -> None:
 
 
 def test_lists_of_commands_are_whole_sentences() -> None:
-    for group in ((), ("policy",), ("robot-server",), ("cluster",)):
+    for group in ((), ("policy",), ("robot-server",), ("cluster",), ("log",)):
         listed = rlservo(*group, "--help").stdout.partition("Commands:")[2].splitlines()
         assert len(listed) > 1 and all(line.endswith(".") and "..." not in line for line in listed if line), listed
 
