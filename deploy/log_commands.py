@@ -111,7 +111,7 @@ def replay(
     policy: PolicyName = None,
     as_json: Json = False,
 ) -> None:
-    """Compare what a bundle would have done with what was recorded.
+    """Compare a bundle's actions with the recorded ones.
 
     Exit code 0: no action would change; 1: some would; 2: the recording does not fit the bundle.
 
