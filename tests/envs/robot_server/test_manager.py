@@ -332,14 +332,19 @@ def test_manager_takes_the_first_free_port_of_robo_gyms_range(command: Any) -> N
     check_port("127.0.0.1", first_port)  # it is free again
 
 
-def test_manager_says_so_when_every_port_is_taken() -> None:
-    with contextlib.ExitStack() as stack:
-        for port in MANAGER_PORTS:
-            stack.enter_context(hold(port))
+def test_manager_says_so_when_every_port_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert range(50100, 50200) == MANAGER_PORTS  # robo-gym's; some may be outgoing connections' that end meanwhile
+    with socket.create_server(("127.0.0.1", 0)) as first, socket.create_server(("127.0.0.1", 0)) as last:
+        ports = (first.getsockname()[1], last.getsockname()[1])
+        monkeypatch.setattr("rlservo.envs.robot_server.manager.MANAGER_PORTS", ports)
         servers = RobotServers()
-        stack.callback(servers.close)
-        with pytest.raises(PortInUseError, match=r"every port from 50100 to 50199 on 127.0.0.1 is taken"):
-            ServerManager(servers=servers)
+        try:
+            with pytest.raises(
+                PortInUseError, match=rf"every port from {ports[0]} to {ports[1]} on 127.0.0.1 is taken"
+            ):
+                ServerManager(servers=servers)
+        finally:
+            servers.close()
 
 
 def test_robot_server_command_serves_and_ends_on_ctrl_c(command: Any) -> None:
@@ -410,22 +415,3 @@ def test_robot_server_without_a_client_ends_itself_called_or_not_and_one_with_a_
         assert wait_for(lambda: kept not in servers.running, 20.0)
     finally:
         servers.close()
-
-
-def hold(port: int) -> contextlib.AbstractContextManager[object]:
-    """Listen on a port, whatever connections linger there; where somebody else holds it for good, that will do."""
-    deadline = time.monotonic() + 20
-    while True:
-        taken = socket.socket()
-        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            taken.bind(("127.0.0.1", port))
-            taken.listen()
-            return taken
-        except OSError:  # it may be an outgoing connection's, which is soon gone
-            taken.close()
-            with contextlib.suppress(OSError):
-                return socket.create_connection(("127.0.0.1", port), timeout=1)
-            if time.monotonic() > deadline:  # somebody's that lasts: taken, for the manager too
-                return contextlib.nullcontext()
-            time.sleep(0.1)
