@@ -4,9 +4,11 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-# Unit tests: what starts no Ray and no robot server or proxy, trains nothing and runs no command line.
-UNITS := tests/envs tests/serve_app tests/export/checkpoints/test_experiment.py tests/test_layout.py tests/test_package.py
-NOT_UNITS := --ignore=tests/envs/robot_server/test_manager.py --ignore=tests/serve_app/ray_serve/test_haproxy_wrapper.py
+# Unit tests: what starts no Ray, simulator, robot server or proxy, trains nothing, and does not wait for time to pass.
+UNITS := tests/serve_app tests/envs/test_registration.py tests/export/checkpoints/test_experiment.py \
+	tests/test_layout.py tests/test_package.py
+NOT_UNITS := $(addprefix --ignore=tests/serve_app/, ray_serve/test_haproxy_wrapper.py \
+	ray_serve/test_http_connections.py client/test_bad_line.py client/test_client_faults.py replay)
 
 .PHONY: demo test quick check bench soak faults wheel setup clean
 
@@ -17,7 +19,7 @@ test: setup  ## All tests, in two processes
 	$(BIN)/python -m pytest -n 2
 
 quick: setup  ## Unit tests, in under a minute
-	$(BIN)/python -m pytest -n 2 -m "not slow and not serve and not trained" $(NOT_UNITS) $(UNITS)
+	$(BIN)/python -m pytest -n 4 -m "not slow and not serve and not trained" $(NOT_UNITS) $(UNITS)
 
 check: setup  ## Lint, format and types, as CI runs them
 	$(BIN)/python .ci/alias_stubs.py
