@@ -1,4 +1,4 @@
-"""How often an estimate's interval covers the truth: repeated recordings, estimated and counted.
+"""Coverage of estimates' intervals: repeated recordings, estimated, and counted against the true return.
 
 Each repetition records so many episodes with one policy and estimates the return of others, whose true returns come
 from many episodes of their own. `--world linear` is a point pulled to 0, for fitted Q evaluation alone. Repetition i

@@ -29,7 +29,7 @@ from rlservo.serve_app.ray_serve.processes import check_port, free_ports, port_h
 from rlservo.serve_app.server.api_keys import new_key
 
 ROOT = Path(__file__).resolve().parents[1]
-SPOOR = "RLSERVO_TEST"  # inherited by every process a test starts, however far down
+RUN_ID = "RLSERVO_TEST"  # inherited by every process a test starts, however far down
 STREAM_IDLE_S = 8.0  # of the live server
 CONNECTIONS_PER_ADDRESS = 300
 
@@ -106,7 +106,7 @@ class Run:
 
     process: subprocess.Popen[str]
     port: int
-    spoor: str
+    run_id: str
     grpc_port: int | None = None
     key_file: Path | None = None
 
@@ -118,15 +118,15 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        return _folder(self.spoor)
+        return _folder(self.run_id)
 
     def processes(self, part: str = "") -> list[int]:
         """Return those of its processes whose command line has this in it."""
-        return [pid for pid, name in trail(self.spoor).items() if part in name]
+        return [pid for pid, name in processes_of(self.run_id).items() if part in name]
 
     def left(self) -> list[str]:
         """Return the command lines of processes this run started that still live."""
-        return [name for pid, name in trail(self.spoor).items() if pid != self.process.pid]
+        return [name for pid, name in processes_of(self.run_id).items() if pid != self.process.pid]
 
     def end(self, *signals: signal.Signals, folders: bool = True) -> int:
         """Send signals, wait for the end, assert that nothing is left; return the exit code."""
@@ -151,29 +151,29 @@ class Run:
         check_port("127.0.0.1", self.port)
 
 
-def trail(spoor: str) -> dict[int, str]:
+def processes_of(run_id: str) -> dict[int, str]:
     """Return the command lines of the processes that carry a mark."""
     found = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():
             with contextlib.suppress(OSError):
-                if f"{SPOOR}={spoor}".encode() in (entry / "environ").read_bytes().split(b"\0"):
+                if f"{RUN_ID}={run_id}".encode() in (entry / "environ").read_bytes().split(b"\0"):
                     found[int(entry.name)] = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
     return found
 
 
-def _folder(spoor: str) -> Path:
-    return Path(tempfile.gettempdir()) / f"t{spoor}"
+def _folder(run_id: str) -> Path:
+    return Path(tempfile.gettempdir()) / f"t{run_id}"
 
 
 @contextlib.contextmanager
 def running(arguments: Sequence[str], port: int, **environment: str) -> Iterator[Run]:
     """Start a program with a temporary folder of its own, and end whatever is left of it in the end."""
-    spoor = secrets.token_hex(2)
-    temporary = _folder(spoor)
+    run_id = secrets.token_hex(2)
+    temporary = _folder(run_id)
     temporary.mkdir()
     variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    variables.update({SPOOR: spoor, "TMPDIR": str(temporary), **environment})
+    variables.update({RUN_ID: run_id, "TMPDIR": str(temporary), **environment})
     process = subprocess.Popen(
         arguments,
         stdout=subprocess.PIPE,
@@ -185,9 +185,9 @@ def running(arguments: Sequence[str], port: int, **environment: str) -> Iterator
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
-        yield Run(process, port, spoor)
+        yield Run(process, port, run_id)
     finally:
-        for pid in trail(spoor):
+        for pid in processes_of(run_id):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         process.wait()

@@ -1,9 +1,10 @@
-"""What the HTTP and the WebSocket client of a policy have in common: contract, episode, arguments of a request."""
+"""Base of the HTTP and the WebSocket client of a policy: contract, episode, recording, arguments of a request."""
 
 from __future__ import annotations
 
 import itertools
 import time
+from abc import abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -139,16 +140,20 @@ class RemotePolicy(ActingPolicy):
                     ) from error
                 time.sleep(POLL_S)
 
+    @abstractmethod
     def _act(self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None = None) -> Any:
         """Ask the server for the action, and keep its reply as `last_reply`."""
-        raise NotImplementedError
+        ...
 
+    @abstractmethod
     def _close(self) -> None:
-        raise NotImplementedError
+        """Close what is open to the server; harmless when repeated."""
+        ...
 
+    @abstractmethod
     def _fetch_contract(self, timeout_s: float | None) -> Contract:
         """Ask the server for the contract: with a time-out once, else as often as the client asks anything."""
-        raise NotImplementedError
+        ...
 
     def _encode_request(
         self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -24,7 +23,7 @@ from rlservo.export.contract.contract import Contract, Distribution
 from rlservo.export.contract.errors import ActionError, RequestError, UsageError
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.export.contract.spaces import leaf_specs
-from rlservo.serve_app.interface import Observation
+from rlservo.serve_app.interface import Closeable, Observation
 from rlservo.serve_app.runtime.action_check import ActionCheck
 from rlservo.serve_app.runtime.drift import Drift
 from rlservo.serve_app.runtime.exploration import Draw, draw_action
@@ -92,7 +91,7 @@ class Step:
         return self.state if self.batch is not None else {name: leaf[0, ...] for name, leaf in self.state.items()}
 
 
-class Policy:
+class Policy(Closeable):
     """An exported policy, loaded and proven on this machine.
 
     ```python
@@ -358,14 +357,6 @@ class Policy:
     def close(self) -> None:
         """Drop the graph; `act` raises UsageError from now on."""
         self._run, self._ort_session = _refuse_closed, None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _open(self) -> onnxruntime.InferenceSession:
         if self._ort_session is None:

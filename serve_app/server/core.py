@@ -1,4 +1,4 @@
-"""What all protocols share: the request path, the API keys, and what is served.
+"""Core of the server, which all protocols share: the request path, the API keys, and what is served.
 
 What describes the server (`listing.py`, `gauges.py`) reads it.
 """

@@ -29,7 +29,7 @@ from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
 from rlservo.serve_app.ray_serve.haproxy.process_table import command_of, process_ids
 from rlservo.serve_app.ray_serve.processes import check_port, port_holder
 from rlservo.serve_app.wire.msgpack_arrays import pack
-from servers import Run, launched, trail
+from servers import Run, launched, processes_of
 
 pytestmark = [
     pytest.mark.serve,
@@ -57,7 +57,7 @@ class Server:
 
     def pids(self, title: str) -> list[int]:
         """Return the server's processes of this title."""
-        return sorted(pid for pid, command in trail(self.run.spoor).items() if command.startswith(title))
+        return sorted(pid for pid, command in processes_of(self.run.run_id).items() if command.startswith(title))
 
     def replica_port(self) -> int:
         (file,) = self.run.folder.rglob("haproxy.cfg")
