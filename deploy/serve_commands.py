@@ -37,6 +37,9 @@ def serve(
             help="Policy of a WebSocket at '/', where openpi's clients connect; the only one by default.",
         ),
     ] = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Record every decision into this folder (`rlservo log`).")
+    ] = None,
     config: policy_commands.ConfigOption = None,
     versions: policy_commands.VersionsOption = None,
     alias: policy_commands.AliasOption = None,
@@ -75,7 +78,11 @@ def serve(
         port=port,
         grpc_port=grpc_port,
         replicas=replicas,
-        settings=None if default_policy is None else {"default_policy": default_policy},
+        settings={
+            name: value
+            for name, value in (("default_policy", default_policy), ("record", record and str(record)))
+            if value is not None
+        },
         served=policy_commands.served_config(config, versions, alias, canary, shadow),
         admin_key_file=key_file(port),
         on_start=lambda: terminal.errors().print("starting Ray Serve ...", style="dim"),

@@ -35,6 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "serve_app/episodes": {"export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/wire"},
     "serve_app/server": {
         "export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/episodes", "serve_app/wire",
+        "serve_app/recording",
     },
     "serve_app/protocols": {
         "export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/episodes", "serve_app/server",

@@ -2,7 +2,7 @@
 
 A reply's state names the graph that it belongs to, and, where the step from one action to the next is limited, holds
 the last action. Both stand under names that no recurrent state has, so a client that sends back what it got needs to
-know neither.
+know neither. On a server that records, the graph's name is followed by the episode's and the number of the next step.
 """
 
 from __future__ import annotations
@@ -13,7 +13,11 @@ from typing import Any
 
 from rlservo.export.contract.errors import RequestError
 from rlservo.serve_app.runtime.policy import Policy, Step
+from rlservo.serve_app.versions.policy_store import EpisodeMark
 from rlservo.serve_app.wire.state_names import BELONGS_TO, LAST_ACTION, MARK
+
+MARK_BEGINS = "~"  # no policy's identity has one
+LONGEST_EPISODE_ID = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +35,8 @@ class CarriedState:
 
     last_action: Any = None
 
+    mark: EpisodeMark | None = None
+
     @classmethod
     def parse(cls, state: Mapping[str, Any]) -> CarriedState:
         """Take a request's state apart. Raises RequestError."""
@@ -44,19 +50,33 @@ class CarriedState:
             raise RequestError(
                 f"the state has the unknown entry '{str(unknown[0])[:64]}': send back what the last reply gave"
             )
-        policy_identity = state.get(BELONGS_TO)
-        if policy_identity is not None and type(policy_identity) is not str:
+        belongs_to = state.get(BELONGS_TO)
+        if belongs_to is None:
+            return cls(arrays, last_action=state.get(LAST_ACTION))
+        if type(belongs_to) is not str:
             raise RequestError(f"the state's '{BELONGS_TO}' must be the string that the last reply gave")
-        return cls(arrays, policy_identity=policy_identity, last_action=state.get(LAST_ACTION))
+        identity, mark = split_identity(belongs_to)
+        return cls(arrays, policy_identity=identity, last_action=state.get(LAST_ACTION), mark=mark)
 
 
 NO_STATE = CarriedState({}, is_empty=True)
 
 
-def carry(policy: Policy, step: Step) -> dict[str, Any]:
-    """Return the state that a client is to send with its next request."""
+def split_identity(belongs_to: str) -> tuple[str, EpisodeMark | None]:
+    """Return the policy's identity and the episode's mark, of which a client may have made anything."""
+    identity, _, rest = belongs_to.partition(MARK_BEGINS)
+    episode, _, step = rest.rpartition(MARK_BEGINS)
+    if not episode or len(episode) > LONGEST_EPISODE_ID or not (step.isascii() and step.isdigit() and len(step) < 16):
+        return identity, None
+    return identity, EpisodeMark(episode, int(step))
+
+
+def carry(policy: Policy, step: Step, mark: EpisodeMark | None) -> dict[str, Any]:
+    """Return the state that a client is to send with its next request; `mark` is for a recording."""
     carried: dict[str, Any] = dict(step.own_state)
     carried[BELONGS_TO] = policy.identity
+    if mark is not None:
+        carried[BELONGS_TO] += f"{MARK_BEGINS}{mark.episode}{MARK_BEGINS}{mark.step}"
     if policy.has_step_limit:
         carried[LAST_ACTION] = step.action
     return carried

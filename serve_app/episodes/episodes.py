@@ -12,14 +12,15 @@ from dataclasses import replace
 from typing import Any
 
 from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
-from rlservo.serve_app.episodes.carried_state import NO_STATE, CarriedState, carry
-from rlservo.serve_app.episodes.request import Episode, Request
+from rlservo.serve_app.episodes.carried_state import NO_STATE, CarriedState, carry, split_identity
+from rlservo.serve_app.episodes.request import Episode, Request, new_episode_id
 from rlservo.serve_app.episodes.sessions import Session, SessionId, Sessions, shorten
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import (
     NEEDS_LAST,
     NEEDS_STATE,
     Decision,
+    EpisodeMark,
     EpisodeNote,
     PolicyStore,
     take_step,
@@ -34,6 +35,8 @@ class Episodes:
         """`alone` says whether every request reaches this process; if not, no id finds its session reliably."""
         self.sessions = Sessions(most=max_sessions, idle_s=idle_s)
         self._alone = alone
+        self.marks_states = False
+        """Whether a state that goes to the client names its episode, for a recording."""
 
     def act(self, store: PolicyStore, request: Request) -> Decision:
         """Decide for a request that says something of its episode, or came on a stream that keeps one.
@@ -51,7 +54,7 @@ class Episodes:
                 return self._act_in_session(store, request, episode, episode.session_id)
             # There is nothing to remember: the id says only which requests belong together.
             episode = replace(episode, session_id=None, reset=False, end=False)
-        if episode.end or (episode.reset and stream is None):
+        if episode.end or (episode.reset and request.stream_id is None):
             word = "end" if episode.end else "reset"
             raise RequestError(f"'{word}' is for a session: send its 'session_id', too")
         if episode.state is not None:
@@ -72,7 +75,7 @@ class Episodes:
         session = None if session_id is None else self.sessions.peek(name, session_id)
         if session is not None:
             return session.policy
-        own = store.find(name, identity) if type(identity) is str and version is None else None
+        own = store.find(name, split_identity(identity)[0]) if type(identity) is str and version is None else None
         return own or store.get(name, version)
 
     def _act_from_carried(self, store: PolicyStore, request: Request, episode: Episode) -> Decision:
@@ -98,8 +101,16 @@ class Episodes:
             raise StateNeededError(f"policy '{name}' {NEEDS_LAST}")
         decision, step = _take_step(policy, request, episode, carried)
         if policy.is_stateful:
-            decision.episode = EpisodeNote(state=carry(policy, step))
+            mark = self._mark(carried, request) if self.marks_states else None
+            next_mark = None if mark is None else EpisodeMark(mark.episode, mark.step + 1)
+            decision.episode = EpisodeNote(state=carry(policy, step, next_mark), recorded=mark)
         return decision
+
+    def _mark(self, carried: CarriedState, request: Request) -> EpisodeMark:
+        """Return which step of which episode of the recording this is."""
+        if carried.is_empty:
+            return EpisodeMark(new_episode_id(request.label), 0)
+        return carried.mark or EpisodeMark(new_episode_id(request.label), 1)  # nobody knows which, but not the first
 
     def _act_on_stream(self, store: PolicyStore, request: Request, episode: Episode, stream: Session) -> Decision:
         """Act from the state that the connection keeps."""

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from rlservo.serve_app.episodes.sessions import Session, SessionId
+
+
+def new_episode_id(label: str | None) -> str:
+    """Return an id for an episode, or a stream, of whoever gave a label."""
+    return secrets.token_hex(8) if label is None else f"{label}.{secrets.token_hex(4)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +27,10 @@ class Episode:
     reset: bool = False  # begin the session, or the stream's episode
     end: bool = False  # forget the session after this request
     reward: Any = None
+    final_status: str | None = None
+    """How the episode ended, in the client's word: the observation is the one after its last action."""
+
+    truncated: bool = False  # whether it was broken off, as by a limit on its time
     last_action: Any = None  # what the robot was last commanded, where a limit is set on the step from it
 
 
@@ -49,8 +59,8 @@ class Request:
     """[s] How long it had waited before it was received; None where nobody knows."""
     stream: Session | None = None
     """The episode of the stream that it came on."""
-    on_websocket: bool = False
-    """Whether it is one of many that share a request id, told apart by `seq`."""
+    stream_id: str | None = None
+    """Of its WebSocket, whose requests share a request id and are told apart by `seq`."""
 
     obs: Any = None
     explore: bool = False

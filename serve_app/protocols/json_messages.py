@@ -14,7 +14,7 @@ import orjson
 from pydantic import BaseModel, ConfigDict, Field
 
 from rlservo.export.contract.errors import RequestError
-from rlservo.serve_app.server.request_fields import LONGEST_SESSION_ID, MAX_SEED, json_type
+from rlservo.serve_app.server.request_fields import LONGEST_SESSION_ID, LONGEST_STATUS, MAX_SEED, json_type
 
 LONGEST_LENIENT_BODY = 1 << 20  # a larger body with NaN in it is refused without saying where the NaN is
 OBS = (
@@ -57,10 +57,23 @@ class ActRequest(BaseModel):
     )
     reset: bool = Field(False, description="Begin an episode: the first request of a recurrent policy's session.")
     end: bool = Field(False, description="Forget the session after this request.")
-    reward: Any = Field(None, description="What the last action brought, for policies trained to see it.")
-    last_action: Any = Field(
-        None, description="What the robot was last commanded, where the policy's action is limited in its step."
+    reward: Any = Field(
+        None,
+        description="What the last action brought: for policies trained to see it, and for a recording.",
     )
+    last_action: Any = Field(
+        None,
+        description="What the robot was last commanded: where the policy's action is limited in its step, and for a "
+        "recording.",
+    )
+    final_status: str | None = Field(
+        None,
+        min_length=1,
+        max_length=LONGEST_STATUS,
+        description="How the episode ended, for a recording: `obs` is what followed its last action, and "
+        "the action of the reply is for nobody.",
+    )
+    truncated: bool = Field(False, description="With `final_status`: the episode was broken off, as by a time limit.")
 
 
 class ActReply(BaseModel):

@@ -8,7 +8,6 @@ one chunk each.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 from starlette.types import Message
@@ -60,9 +59,6 @@ class MsgpackCodec:
                     raise RequestError(f"unknown field '{unknown[0]}': known are {', '.join(sorted(REQUEST_FIELDS))}")
                 parse_options(request, content)
                 request.episode = parse_episode(content)
-        episode = request.episode
-        if episode is not None and episode.reset and episode.session_id is None and request.stream is None:
-            request.episode = replace(episode, reset=False)  # nothing is remembered here
 
     def encode(self, request: Request, decision: Decision) -> bytes:
         """Return the reply's frame; `reply_options` are further timings."""

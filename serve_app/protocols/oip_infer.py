@@ -49,6 +49,7 @@ from rlservo.serve_app.server.request_fields import (
     LONGEST_SESSION_ID,
     OPTIONS,
     json_type,
+    parse_episode,
     parse_finite,
     parse_options,
 )
@@ -63,7 +64,10 @@ STATE_POLICY = "state_policy"  # whose the states are
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
 MODEL_NAME = "model_name"  # KServe's client says again what the path says
 # What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
-PARAMETERS = frozenset({*OPTIONS, "binary_data_output", "sequence_id", "sequence_start", "sequence_end", STATE_POLICY})
+OUTCOME = ("reward", "final_status", "truncated")  # parameters with the meaning that they have in JSON
+PARAMETERS = frozenset(
+    {*OPTIONS, *OUTCOME, "binary_data_output", "sequence_id", "sequence_start", "sequence_end", STATE_POLICY}
+)
 TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
 IGNORED = frozenset({"priority", TIMEOUT, "headers", "content_type"})
 SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits one packet either way
@@ -332,23 +336,26 @@ def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters:
         if type(belongs_to) is not str:
             raise RequestError(f"'{STATE_POLICY}' must be the string that the last reply gave")
         states[BELONGS_TO] = belongs_to
-    reward = inputs.get(REWARD)
+    outcome = parse_episode({name: parameters[name] for name in OUTCOME if name in parameters}) or Episode()
+    reward = inputs.get(REWARD, outcome.reward)
     last = _last_action(contract, inputs)
+    common: dict[str, Any] = {
+        "reward": reward, "last_action": last, "final_status": outcome.final_status, "truncated": outcome.truncated,
+    }  # fmt: skip
     start, end = bool(parse_flag(parameters, "sequence_start")), bool(parse_flag(parameters, "sequence_end"))
     sequence_id = parameters.get("sequence_id")
     if sequence_id in (None, 0, ""):
         if start and not states:  # a single step, for whoever carries from there what there is to carry
-            return Episode(state={}, reward=reward, last_action=last)
-        if not states and reward is None and last is None:
+            return Episode(state={}, **common)
+        if not states and all(value is None or value is False for value in common.values()):
             return None
-        return Episode(state=states or None, reward=reward, last_action=last)
+        return Episode(state=states or None, **common)
     return Episode(
         state=states or None,
         session_id=_session_id(sequence_id),
         reset=start,
         end=end,
-        reward=reward,
-        last_action=last,
+        **common,
     )
 
 

@@ -16,7 +16,6 @@ import asyncio
 import contextlib
 import json
 import logging
-import secrets
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -24,7 +23,7 @@ from collections.abc import Callable, Mapping
 from starlette.types import Message, Receive, Scope, Send
 
 from rlservo.export.contract.errors import OverloadedError, RlservoError, UnknownPolicyError
-from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.episodes.request import Request, new_episode_id
 from rlservo.serve_app.episodes.sessions import Session
 from rlservo.serve_app.protocols.direct_routes import StreamRoute
 from rlservo.serve_app.protocols.http_errors import Headers, encode_bug, error_answer, send_error
@@ -64,12 +63,17 @@ class StreamEndpoint:
         """Serve one connection until the client closes it."""
         core, headers = self._core, scope[HEADERS]
         opening = Request(
-            PROTOCOL, "", None, time.perf_counter(), request_id=header_text(headers, REQUEST_ID), on_websocket=True
+            PROTOCOL,
+            "",
+            None,
+            time.perf_counter(),
+            label=header_text(headers, LABEL),
+            request_id=header_text(headers, REQUEST_ID),
         )
         try:
             opening.policy, opening.version = self._address(scope["path_params"])
-            # All requests of a stream get the same version where a canary runs.
-            opening.label = header_text(headers, LABEL) or secrets.token_hex(8)
+            opening.stream_id = new_episode_id(opening.label)
+            opening.label = opening.label or opening.stream_id  # where a canary runs they all get the same version
             policy = core.store().choose(opening.policy, opening.version, opening.label)
         except RlservoError as error:
             core.record_failure(opening, error.code, error.message)
@@ -128,7 +132,7 @@ class StreamEndpoint:
                 request_id=opening.request_id,
                 waited=waited,
                 stream=opening.stream,
-                on_websocket=True,
+                stream_id=opening.stream_id,
                 reply_options=timings,
             )
             idle.touch()

@@ -199,6 +199,12 @@ class PolicyServer(InferenceService):
         """Return this replica's listing; replicas call this of each other."""
         return {} if self._core is None else listing.describe(self._core)
 
+    def __del__(self) -> None:
+        """End the recording: Serve calls this when the replica has answered its last request."""
+        core = getattr(self, "_core", None)
+        if core is not None and core.recorder is not None:
+            core.recorder.close()
+
     async def _configure(self, user_config: Any) -> None:
         try:
             await self._control.configure(user_config)

@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import orjson
 from mcap.writer import CompressionType, Writer
 
@@ -29,6 +30,7 @@ from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
 
 PROFILE = "rlservo"
 CHUNK_BYTES = 256 * 1024
+YIELD_EVERY = 8  # messages written at a stretch before other threads get the interpreter
 DROPPED_TOPIC = "/rlservo/dropped"
 
 
@@ -77,7 +79,7 @@ class LogFile:
         own, inputs = record.own_action, record.dist_inputs
         logp = None if own is None or inputs is None else policy.log_probability(inputs, own)
         for row, leaves in enumerate(observed):
-            episode = record.episode if len(observed) == 1 else f"{record.episode}.{row}" if record.episode else ""
+            episode = _row_episode(record.episode, row, len(observed))
             parts = [_head(episode, record.step), b'"obs":' + policy.observations.encode(leaves)]
             if acted is not None:
                 parts.append(b'"action":' + policy.actions.encode(acted[row]))
@@ -90,28 +92,29 @@ class LogFile:
             if logp is not None:
                 parts.append(b'"logp":%b' % orjson.dumps(float(logp[row])))
             if record.reward_input is not None:
-                given = record.reward_input
-                parts.append(b'"reward_input":%b' % orjson.dumps(float(given if len(observed) == 1 else given[row])))
+                parts.append(b'"reward_input":%b' % _row_reward(record.reward_input, row))
             self._add(policy, "decision", b"{" + b",".join([*parts, *shared]) + b"}", record)
 
     def add_outcome(self, record: OutcomeRecord) -> None:
         """Write what came of a decision. Raises ValueError or RequestError where it does not fit."""
         policy = record.policy
-        parts = [_head(record.episode, record.step)]
-        if record.reward is not None:
-            parts.append(b'"reward":%b' % orjson.dumps(float(record.reward)))
-        if record.terminated:
-            parts.append(b'"terminated":true')
-        if record.truncated:
-            parts.append(b'"truncated":true')
-        if record.final_status is not None:
-            parts.append(b'"final_status":%b' % orjson.dumps(record.final_status))
-        if record.final_obs is not None:
-            leaves = policy.observations.rows(record.final_obs)[0]
-            parts.append(b'"final_obs":' + policy.observations.encode(leaves))
-        if record.commanded is not None:
-            parts.append(b'"commanded":' + policy.actions.encode(policy.actions.rows(record.commanded)[0]))
-        self._add(policy, "outcome", b"{" + b",".join(parts) + b"}", record)
+        observed = None if record.final_obs is None else policy.observations.rows(record.final_obs)
+        commanded = None if record.commanded is None else policy.actions.rows(record.commanded)
+        for row in range(record.rows):
+            parts = [_head(_row_episode(record.episode, row, record.rows), record.step)]
+            if record.reward is not None:
+                parts.append(b'"reward":%b' % _row_reward(record.reward, row))
+            if record.terminated:
+                parts.append(b'"terminated":true')
+            if record.truncated:
+                parts.append(b'"truncated":true')
+            if record.final_status is not None:
+                parts.append(b'"final_status":%b' % orjson.dumps(record.final_status))
+            if observed is not None:
+                parts.append(b'"final_obs":' + policy.observations.encode(observed[row]))
+            if commanded is not None:
+                parts.append(b'"commanded":' + policy.actions.encode(commanded[row]))
+            self._add(policy, "outcome", b"{" + b",".join(parts) + b"}", record)
 
     def add_dropped(self, count: int) -> None:
         """Mark that `count` records are missing before this place."""
@@ -158,6 +161,8 @@ class LogFile:
             record.wall_ns,
             self._sequence % 2**32,
         )
+        if self._sequence % YIELD_EVERY == 0:
+            time.sleep(0)
 
     def _log_time(self, monotonic_ns: int) -> int:
         return max(0, self._wall_ns + monotonic_ns - self._monotonic_ns)
@@ -194,3 +199,12 @@ class LogFile:
 
 def _head(episode: str, step: int) -> bytes:
     return b'"episode":%b,"step":%d' % (orjson.dumps(episode), step) if episode else b'"step":%d' % step
+
+
+def _row_episode(episode: str, row: int, rows: int) -> str:
+    return episode if rows == 1 or not episode else f"{episode}.{row}"
+
+
+def _row_reward(reward: Any, row: int) -> bytes:
+    rewards = np.ravel(np.asarray(reward, np.float64))
+    return orjson.dumps(float(rewards[row if len(rewards) > 1 else 0]))

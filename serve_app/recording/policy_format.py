@@ -25,6 +25,10 @@ NUMBERS = orjson.OPT_SERIALIZE_NUMPY
 Leaves = Mapping[str, NDArray[Any]]
 
 
+class LeafArrays(dict[str, NDArray[Any]]):
+    """A value, or a batch of them, taken apart: arrays by tensor name, `[batch, *shape]`."""
+
+
 class PolicyFormat:
     """How one policy's decisions are written and read; one object per policy, version and graph."""
 
@@ -78,7 +82,8 @@ class SpaceFormat:
         """
         found: dict[str, NDArray[Any]] = {}
         batch: int | None = None
-        for name, given in self._parts(value).items():
+        parts = {name: value[name] for name in self.leaves} if isinstance(value, LeafArrays) else self._parts(value)
+        for name, given in parts.items():
             leaf = self.leaves[name]
             array = np.asarray(given)
             if array.ndim and array.shape[-1:] == (1,) and not leaf.shape:  # a choice with an axis of its own
@@ -91,6 +96,10 @@ class SpaceFormat:
         if batch is None:
             return [found]
         return [{name: array[row] for name, array in found.items()} for row in range(batch)]
+
+    def count_rows(self, value: Any) -> int:
+        """Return how many values an array, or a nest of arrays, holds."""
+        return max(1, _total_size(value) // sum(leaf.size for leaf in self.leaves.values()))
 
     def encode(self, leaves: Mapping[str, Any]) -> bytes:
         """Return one value's JSON."""
@@ -141,6 +150,12 @@ class SpaceFormat:
             return self._formats[path].schema()
         inside = {key: self._schema(child, f"{path}.{key}") for key, child in _children(space)}
         return {"type": "object", "properties": inside}
+
+
+def _total_size(value: Any) -> int:
+    if isinstance(value, Mapping):
+        value = tuple(value.values())
+    return sum(map(_total_size, value)) if isinstance(value, tuple) else int(np.size(value))
 
 
 def _children(space: SpaceSpec) -> list[tuple[str, SpaceSpec]]:

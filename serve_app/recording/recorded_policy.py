@@ -89,7 +89,8 @@ class WithRecording(ActingPolicy):
             if policy is not None:
                 record = DecisionRecord(
                     policy, seen, _copy(action), self._episode, self._step, latency_ms, explore,
-                    reward_input=reward, error=error, wall_ns=wall_ns, monotonic_ns=monotonic_ns,
+                    reward_input=reward, error=error, rows=policy.observations.count_rows(seen), wall_ns=wall_ns,
+                    monotonic_ns=monotonic_ns,
                 )  # fmt: skip
                 self._add_details(record)
                 self.recorder.record(record)

@@ -36,7 +36,6 @@ BUFFER_RECORDS = 20_000
 BUFFER_BYTES = 64 * MIB
 DRAIN_S = 0.1  # between two looks into the buffer
 FLUSH_S = 0.7  # together under a second: that much a killed process loses
-YIELD_EVERY = 8  # records written at a stretch before other threads get the interpreter
 WAIT_S = 10.0  # for the writer to finish at close
 
 
@@ -78,6 +77,8 @@ class Recorder(Closeable):
         self._max_file_bytes, self._max_file_s, self._max_folder_bytes = max_file_bytes, max_file_s, max_folder_bytes
         self._buffer: deque[DecisionRecord | OutcomeRecord] = deque()
         self._room = BUFFER_RECORDS
+        self._held = 0  # in the buffer; of a batch each row
+        self._lock = threading.Lock()
         self._policies: dict[tuple[str, str, str, str], PolicyFormat] = {}
         self.dropped = 0
         """Records that did not fit into the buffer, or came after recording had ended."""
@@ -116,12 +117,14 @@ class Recorder(Closeable):
 
     def record(self, record: DecisionRecord | OutcomeRecord) -> bool:
         """Take a record; return whether there was room for it."""
-        while self._wait and len(self._buffer) >= self._room and self._thread.is_alive():
+        while self._wait and self._held >= self._room and self._thread.is_alive():
             time.sleep(0.001)
-        if len(self._buffer) >= self._room or self.failure is not None:
-            self.dropped += 1
-            return False
-        self._buffer.append(record)
+        with self._lock:
+            if self._held >= self._room or self.failure is not None:
+                self.dropped += record.rows
+                return False
+            self._held += record.rows
+            self._buffer.append(record)
         return True
 
     def close(self) -> None:
@@ -151,22 +154,22 @@ class Recorder(Closeable):
 
     def _drain(self) -> None:
         """Write what was in the buffer when this began."""
-        for count in range(len(self._buffer)):
-            record = self._buffer.popleft()
+        for _ in range(len(self._buffer)):
+            with self._lock:
+                record = self._buffer.popleft()
+                self._held -= record.rows
             file = self._file or self._next_file()
             try:
                 if isinstance(record, DecisionRecord):
                     file.add_decision(record)
                 else:
                     file.add_outcome(record)
-                self.written += 1
+                self.written += record.rows
             except (RlservoError, ValueError, TypeError, KeyError, IndexError) as error:  # not of the policy's spaces
-                self.dropped += 1
+                self.dropped += record.rows
                 if not self._unreadable:
                     self._unreadable = True
                     logger.warning("a record of policy '%s' was dropped: %s", record.policy.title, first_line(error))
-            if count % YIELD_EVERY == 0:
-                time.sleep(0)
         missing = self.dropped - self._marked
         if missing and self._file is not None:
             self._file.add_dropped(missing)
@@ -192,8 +195,10 @@ class Recorder(Closeable):
 
     def _end(self, error: Exception) -> None:
         self.failure = first_line(error)
-        self.dropped += len(self._buffer)
-        self._buffer.clear()
+        with self._lock:
+            self.dropped += self._held
+            self._held = 0
+            self._buffer.clear()
         if self._file is not None:
             self._file.abandon()
         logger.error("recording to %s has ended, acting goes on: %s", self.path, self.failure)

@@ -14,7 +14,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from rlservo.serve_app.interface import Observation
-from rlservo.serve_app.recording.policy_format import PolicyFormat
+from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
 
 
 @dataclass(slots=True, eq=False)  # not frozen: that triples the time of making one
@@ -22,7 +22,7 @@ class DecisionRecord:
     """An observation and the action that was sent for it, or why there was none."""
 
     policy: PolicyFormat
-    obs: Observation
+    obs: Observation | LeafArrays
     """As the policy was given it; a batch is recorded as so many decisions."""
     action: Any
     """As it was sent, in the action space's own form; None where there was none."""
@@ -45,6 +45,8 @@ class DecisionRecord:
     """The code of what came instead of an action: deadline-passed, unavailable, bad-observation ..."""
     commanded: Any = None
     """What the robot was commanded instead, in the action space's own form."""
+    rows: int = 1
+    """How many decisions it is."""
     wall_ns: int = field(default_factory=time.time_ns)
     monotonic_ns: int = field(default_factory=time.monotonic_ns)
 
@@ -56,13 +58,16 @@ class OutcomeRecord:
     policy: PolicyFormat
     episode: str
     step: int
-    reward: float | None = None
+    reward: Any = None
+    """A number; of a batch one for each row, or one for all."""
     terminated: bool = False
     truncated: bool = False
     final_status: str | None = None
-    final_obs: Observation | None = None
+    final_obs: Observation | LeafArrays | None = None
     """The observation after an episode's last action, which no decision holds."""
     commanded: Any = None
     """What the robot was commanded instead of the action."""
+    rows: int = 1
+    """Of the decision."""
     wall_ns: int = field(default_factory=time.time_ns)
     monotonic_ns: int = field(default_factory=time.monotonic_ns)

@@ -34,5 +34,8 @@ class PolicyOptions(BaseModel):
     formed in another order, so the last bits of an action may differ. Computed one by one all the same: policies with a
     memory or a `max_action_step`, and requests that explore or say anything of an episode."""
 
+    record: bool = True
+    """Whether a server that records (`--record`) records this policy, too."""
+
 
 DEFAULT_OPTIONS = PolicyOptions()

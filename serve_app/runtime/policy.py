@@ -139,6 +139,8 @@ class Policy(Closeable):
         self.has_step_limit = bool(self._step_limit)
         self.is_stateful = bool(contract.state) or self.has_step_limit
         """Whether an action depends on what came before: on a state, or by a limit on the last action."""
+        self.sees_reward = self._state_tensors.has_reward
+        """Whether it was trained to see the reward of its last action."""
         # Most policies read one array and give one: those few microseconds are what a control loop asks for.
         leaves = self._observations.leaves
         flat = "obs" in leaves and "action" in actions  # not a Dict or Tuple, which may have a single leaf

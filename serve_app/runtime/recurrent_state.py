@@ -26,7 +26,7 @@ class StateTensors:
     def __init__(self, contract: Contract) -> None:
         self._policy = contract.name
         self._specs: dict[str, StateSpec] = {state.name: state for state in contract.state}
-        self._has_reward = any(tensor.name == REWARD for tensor in contract.inputs)
+        self.has_reward = any(tensor.name == REWARD for tensor in contract.inputs)
         self._choices = contract.action_space if isinstance(contract.action_space, DiscreteSpec) else None
         self.outputs = [f"state_out.{name}" for name in self._specs]
         """The graph's outputs to ask for beside the action."""
@@ -38,7 +38,7 @@ class StateTensors:
         """
         now = {name: spec.initial_value(rows) for name, spec in self._specs.items()} if state is None else state
         inputs = {f"state_in.{name}": value for name, value in now.items()}
-        if self._has_reward:
+        if self.has_reward:
             inputs[REWARD] = self._reward(state is None, rows, reward)
         return inputs
 

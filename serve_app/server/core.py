@@ -37,6 +37,11 @@ class Core(RequestPath):
         self.replica = replica
         self.is_alone = alone
         self.keys = CurrentKeys(settings)
+        if settings.record is not None:
+            from rlservo.serve_app.server.request_recorder import RequestRecorder  # which needs an extra
+
+            self.recorder = RequestRecorder(settings)
+            self.episodes.marks_states = True
 
     @property
     def ready(self) -> bool:

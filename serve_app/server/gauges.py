@@ -30,7 +30,7 @@ class _Families(Collector):
     def collect(self) -> Iterator[Metric]:
         core, replica = self._core, self._core.replica
         yield from core.metrics.families(replica)
-        for families in (loaded, queue, batches, drift, sessions, keys):
+        for families in (loaded, queue, batches, drift, sessions, keys, recording):
             yield from families(core, replica)
         yield from core.shadows.families(replica)
 
@@ -64,6 +64,22 @@ def keys(core: Core, replica: str) -> Iterator[Metric]:
     """Yield whether the API keys in use are those of their file."""
     current = "1 while the API keys in use are those of their file; 0: the file cannot be used, and older keys stay"
     yield _gauge("rlservo_api_keys_current", current, replica, core.keys.current)
+
+
+def recording(core: Core, replica: str) -> Iterator[Metric]:
+    """Yield what is recorded and what is missing, where a recording was asked for."""
+    if core.recorder is None:
+        return
+    recorder = core.recorder.recorder
+    goes_on = "1 while decisions are recorded; 0: the folder could not be written to"
+    yield _gauge("rlservo_recording", goes_on, replica, recorder.failure is None)
+    for name, help_text, count in (
+        ("rlservo_records_written", "Decisions, and what came of them, in the recording", recorder.written),
+        ("rlservo_records_dropped", "Decisions that did not fit into the recording's buffer", recorder.dropped),
+    ):
+        family = CounterMetricFamily(name, help_text, labels=["replica"])
+        family.add_metric([replica], count)
+        yield family
 
 
 def batches(core: Core, replica: str) -> Iterator[Metric]:

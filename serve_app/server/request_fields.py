@@ -16,7 +16,10 @@ from rlservo.serve_app.episodes.request import Episode, Request
 MAX_SEED = 2**63 - 1
 LONGEST_SESSION_ID = 128
 OPTIONS = ("explore", "seed", "seq", "deadline_ms", "timestamp")
-EPISODE_FIELDS = frozenset({"state", "session_id", "reset", "end", "reward", "last_action"})
+LONGEST_STATUS = 64
+EPISODE_FIELDS = frozenset(
+    {"state", "session_id", "reset", "end", "reward", "last_action", "final_status", "truncated"}
+)
 REQUEST_FIELDS = frozenset({"obs", *OPTIONS, *EPISODE_FIELDS})
 
 
@@ -46,9 +49,12 @@ def parse_episode(document: Mapping[str, Any]) -> Episode | None:
     session_id = found.get("session_id", "-")
     if type(session_id) is not str or not 0 < len(session_id) <= LONGEST_SESSION_ID:
         raise RequestError(f"'session_id' must be a string of 1 to {LONGEST_SESSION_ID} characters")
-    for name in ("reset", "end"):
+    for name in ("reset", "end", "truncated"):
         if type(found.get(name, False)) is not bool:
             raise RequestError(f"'{name}' must be true or false, got {json_type(found[name])}")
+    status = found.get("final_status", "-")
+    if type(status) is not str or not 0 < len(status) <= LONGEST_STATUS:
+        raise RequestError(f"'final_status' must be a string of 1 to {LONGEST_STATUS} characters")
     return Episode(**found)
 
 

@@ -97,7 +97,7 @@ def _fields(request: Request, policy: str, version: str | None, code: str, secon
         "code": code,
         "ms": round(seconds * 1e3, 3),
     }
-    if request.on_websocket and request.seq is not None:
+    if request.stream_id is not None and request.seq is not None:
         fields["seq"] = request.seq
     return fields
 

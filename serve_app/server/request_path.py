@@ -16,7 +16,7 @@ import logging
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -41,6 +41,9 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 from rlservo.serve_app.versions.shadow import Shadows
 from rlservo.serve_app.wire.request_stamp import clock_id
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.server.request_recorder import RequestRecorder
 
 logger = logging.getLogger(__name__)
 
@@ -188,6 +191,7 @@ class RequestPath:
         self.metrics = Metrics()
         self.log = RequestLog(settings)
         self.shadows = Shadows()
+        self.recorder: RequestRecorder | None = None
 
     def store(self) -> PolicyStore:
         """Return the policies. Raises UnavailableError while they are being loaded."""
@@ -215,12 +219,16 @@ class RequestPath:
             raise
         except RlservoError as error:
             self.record_failure(request, error.code, error.message)
+            if self.recorder is not None:
+                self.recorder.record_failure(request, self._store_provider(), error)
             raise
         except Exception as error:
             self.record_bug(request)
             raise InternalError(BUG) from error
         taken = time.perf_counter() - request.received
         self.metrics.record_answer(request.protocol, decision, taken)
+        if self.recorder is not None:
+            self.recorder.record_answer(request, decision, taken)
         if self.log.every:
             self.log.write_answer(request, decision, taken)
         return reply
@@ -286,7 +294,7 @@ class RequestPath:
 
     def _admit(self, request: Request) -> None:
         """Raise OverloadedError or LateError; a wait before `received` begins to count."""
-        if request.on_websocket:  # request and reply alternate there, so that the streams' number is the bound
+        if request.stream_id is not None:  # request and reply alternate there, so that the streams' number is the bound
             self.admission.check_age(request.waited)
             return
         # Only now, when the body is here: one that is slow to come waits for itself.

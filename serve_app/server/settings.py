@@ -109,6 +109,16 @@ class ServerSettings(BaseModel):
     replica does. Off, Serve counts them in its own metrics and holds them to its `request_timeout_s`; where its tracing
     is on, it handles them in any case."""
 
+    record: str | None = None
+    """Record every decision of the policies into this folder (`docs/recording.md`), but of those whose options say
+    `"record": false`. Observations may be private: off by default. `rlservo serve --record` sets it, too."""
+
+    record_file_bytes: int = Field(256 << 20, ge=1 << 20)
+    """A recording goes on in a new file at this size, or after an hour."""
+
+    record_bytes: int = Field(10 << 30, ge=2 << 20)
+    """The oldest recordings in the folder are deleted beyond it; at least twice `record_file_bytes`."""
+
     max_policy_bytes: int = Field(512 << 20, ge=1024)
     """A larger policy.onnx (or policy.ts) is refused before it is read. Loading takes about twice its size."""
 
@@ -141,7 +151,7 @@ class ServerSettings(BaseModel):
             max_contract_bytes=self.max_contract_bytes,
         )
 
-    @field_validator("api_keys_file", "log_file")
+    @field_validator("api_keys_file", "log_file", "record")
     @classmethod
     def _absolute(cls, value: str | None) -> str | None:
         """A replica's working directory is not the caller's."""

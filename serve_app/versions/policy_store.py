@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, read_contract
 from rlservo.export.contract.contract import version_key
@@ -29,6 +29,13 @@ from rlservo.serve_app.versions.micro_batching import Batcher
 from rlservo.serve_app.versions.plan import PolicyPlan
 
 
+class EpisodeMark(NamedTuple):
+    """Which episode of a recording a state that the client carries is of, and which step comes next, from 0."""
+
+    episode: str
+    step: int
+
+
 @dataclass(frozen=True, slots=True)
 class EpisodeNote:
     """Fields of a reply about its episode."""
@@ -36,6 +43,7 @@ class EpisodeNote:
     state: Mapping[str, Any] | None = None  # for the client to carry, as `carried_state.py` has it
     session_id: str | int | None = None
     step: int | None = None  # how many actions this session or stream has given since its episode began
+    recorded: EpisodeMark | None = None  # whose step it was, where the client carries the state and it is recorded
 
 
 @dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
@@ -44,6 +52,9 @@ class Decision:
 
     action: Any
     """An array, or dicts and tuples of arrays where the action space is nested."""
+    policy: Policy
+    inputs: Mapping[str, Any]
+    """What the network was given, by tensor name `[batch, *shape]`."""
     name: str
     version: str
     infer_ms: float  # [ms] checking the observation, the network (for all that it ran for), checking the action
@@ -228,8 +239,8 @@ class PolicyStore:
         started = time.perf_counter()
         action = policy.build_action(computed.outputs, batch=batch)
         infer_ms = parse_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
-        version = policy.contract.version
-        return Decision(action, name, version, infer_ms, rows if batch else None, notices, sharers=computed.requests)
+        version, size, sharers = policy.contract.version, rows if batch else None, computed.requests
+        return Decision(action, policy, feed, name, version, infer_ms, size, notices, sharers=sharers)
 
     def close(self) -> None:
         """Close every policy; what is waiting to be computed with others is computed."""
@@ -281,8 +292,8 @@ def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision,
     started = time.perf_counter()
     step = policy.step(obs, **given)
     infer_ms = (time.perf_counter() - started) * 1e3
-    contract = policy.contract
-    return Decision(step.action, contract.name, contract.version, infer_ms, step.batch, step.notices), step
+    name, version = policy.contract.name, policy.contract.version
+    return Decision(step.action, policy, step.inputs, name, version, infer_ms, step.batch, step.notices), step
 
 
 def _draw(name: str, label: str | None, canary: Policy) -> float:

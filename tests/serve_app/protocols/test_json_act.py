@@ -302,7 +302,7 @@ def test_the_openapi_document_is_valid_3_0_and_describes_every_route(ask: Ask) -
     request = document["paths"]["/v1/policies/{name}/act"]["post"]["requestBody"]["content"]["application/json"][
         "schema"
     ]
-    of_episode = {"state", "session_id", "reset", "end", "reward", "last_action"}
+    of_episode = {"state", "session_id", "reset", "end", "reward", "last_action", "final_status", "truncated"}
     assert set(request["properties"]) == {"obs", "explore", "seed", "seq", "deadline_ms", "timestamp", *of_episode}
 
     def walk(node: Any) -> None:

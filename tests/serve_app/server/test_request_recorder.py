@@ -1,0 +1,251 @@
+"""What a server records, over every protocol: the actions replay bit for bit, episodes begin and end where they did."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import stat
+import threading
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.recording.episodes import Episode, episodes
+from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.replay.replay import replay
+from rlservo.serve_app.runtime.options import PolicyOptions
+from rlservo.serve_app.server.request_recorder import RequestRecorder
+from rlservo.serve_app.server.settings import ServerSettings
+from stores import load_store
+
+Serve = Callable[[Any], AbstractContextManager[int]]
+
+
+@dataclass
+class Server:
+    port: int
+    folder: Path
+    recorder: RequestRecorder
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def post(self, path: str, body: Any, **headers: str) -> tuple[int, Any]:
+        with contextlib.closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)) as connection:
+            connection.request("POST", path, json.dumps(body), {"content-type": "application/json", **headers})
+            reply = connection.getresponse()
+            return reply.status, json.loads(reply.read())
+
+    def act(self, policy: str, body: Any, **headers: str) -> tuple[int, Any]:
+        return self.post(f"/v1/policies/{policy}/act", body, **headers)
+
+    def recorded(self) -> list[Episode]:
+        """End the recording and return its episodes."""
+        self.recorder.close()
+        return list(episodes(Recording(self.folder)))
+
+    def metrics(self) -> dict[str, float]:
+        with urllib.request.urlopen(f"{self.url}/metrics", timeout=10) as reply:
+            lines = [line.rpartition(" ") for line in reply.read().decode().splitlines() if line[0] != "#"]
+        return {name.partition("{")[0]: float(value) for name, _, value in lines if name.startswith("rlservo_record")}
+
+
+@pytest.fixture
+def start(recurrent: Path, ur5: Path, served: Serve, tmp_path: Path) -> Iterator[Callable[..., Server]]:
+    """A function that serves three recurrent policies and ur5, recording."""
+    with contextlib.ExitStack() as stack:
+
+        def serve(options: dict[str, PolicyOptions] | None = None, **settings: Any) -> Server:
+            store = load_store(recurrent, ur5, options=options)
+            app = create_app(lambda: store, ServerSettings(record=str(tmp_path / "recorded"), **settings))
+            server = Server(stack.enter_context(served(app)), tmp_path / "recorded", app.state.core.recorder)
+            stack.callback(server.recorder.close)
+            return server
+
+        yield serve
+
+
+def arms(count: int, seed: int = 0) -> list[list[float]]:
+    return np.random.default_rng(seed).standard_normal((count, 3)).astype(np.float32).tolist()
+
+
+def observations(policy: Any, count: int, seed: int = 0) -> Any:
+    rng = np.random.default_rng(seed)
+    return [rng.standard_normal(policy.contract.observation_space.size).astype(np.float32) for _ in range(count)]
+
+
+def test_mixed_traffic_replays_bit_for_bit(start: Callable[..., Server], recurrent: Path, ur5: Path) -> None:
+    server = start()
+
+    def carry() -> None:  # the client carries the state
+        with PolicyClient(server.url, "lstm_box") as policy:
+            for _ in range(2):
+                policy.reset()
+                for obs in observations(policy, 6, 1):
+                    policy.act(obs)
+
+    def keep() -> None:  # the server keeps it, in a session
+        with PolicyClient(server.url, "lstm_box", server_state=True) as policy:
+            for _ in range(2):
+                policy.reset()
+                for obs in observations(policy, 5, 2):
+                    policy.act(obs, explore=True)
+
+    def stream() -> None:
+        with StreamClient(server.url, "lstm_box", server_state=True) as policy:
+            for _ in range(3):
+                policy.reset()
+                for obs in observations(policy, 4, 3):
+                    policy.act(obs)
+
+    def stateless() -> None:
+        with StreamClient(server.url, "ur5") as policy:
+            for _ in range(2):
+                policy.reset()
+                for obs in observations(policy, 7, 4):
+                    policy.act(obs)
+        with PolicyClient(server.url, "ur5") as client:
+            client.act(np.stack(observations(client, 3, 5)))
+
+    def oip() -> None:
+        size = 27
+        for step in range(3):
+            body = {
+                "inputs": [{"name": "obs", "shape": [1, size], "datatype": "FP32", "data": [0.1 * step] * size}],
+                "parameters": {"sequence_id": 7, "sequence_start": step == 0, "sequence_end": step == 2},
+            }
+            assert server.post("/v2/models/ur5/infer", body)[0] == 200
+
+    threads = [threading.Thread(target=task) for task in (carry, keep, stream, stateless, oip)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    found = server.recorded()
+    whole = [(one.policy.contract.name, len(one), one.begins, one.gap) for one in found if one.id]
+    assert sorted(whole, key=str) == sorted(
+        [("lstm_box", 6, True, None)] * 2
+        + [("lstm_box", 5, True, None)] * 2
+        + [("lstm_box", 4, True, None)] * 3
+        + [("ur5", 7, True, None)] * 2
+        + [("ur5", 3, True, None)],
+        key=str,
+    )
+    assert sum(len(one) for one in found if not one.id) == 3  # the rows of a batch that says nothing of its episode
+    explored = [one for one in found if one.explored.any()]
+    assert len(explored) == 2 and all(np.isfinite(one.logp).all() for one in explored)
+    for bundle, compared in ((recurrent / "lstm_box" / "1", 34), (ur5, 20)):
+        report = replay(Recording(server.folder), bundle)
+        assert (report.compared, report.identical, report.changed) == (compared, compared, 0)
+        assert report.same_graph is True
+    metrics = server.metrics()
+    assert metrics["rlservo_recording"] == 1 and metrics["rlservo_records_dropped_total"] == 0
+    assert metrics["rlservo_records_written_total"] == 54
+
+
+def test_the_client_tells_what_came_of_it(start: Callable[..., Server]) -> None:
+    server, seen = start(), np.zeros(27).tolist()
+    headers = {"x-session-id": "cell-7"}
+    action = server.act("ur5", {"obs": seen}, **headers)[1]["action"]
+    commanded = [0.1] * len(action)
+    assert server.act("ur5", {"obs": seen, "reward": 0.5, "last_action": commanded}, **headers)[0] == 200
+    last = {"obs": (np.ones(27) / 2).tolist(), "reward": 2, "final_status": "success"}
+    assert server.act("ur5", last, **headers)[0] == 200
+    server.act("ur5", {"obs": seen}, **headers)
+    cut = {"obs": seen, "reward": -1, "final_status": "time", "truncated": True}
+    assert server.act("ur5", cut, **headers)[0] == 200
+    success, cut_off = server.recorded()
+    assert (success.id, len(success), success.final_status, success.terminated) == ("cell-7", 2, "success", True)
+    assert success.reward.tolist() == [0.5, 2.0]
+    assert success.final_obs is not None and (success.final_obs["obs"] == 0.5).all()
+    assert success.fell_back.tolist() == [True, False]
+    assert np.allclose(success.executed["action"][0], 0.1)
+    assert (len(cut_off), cut_off.truncated, cut_off.terminated) == (1, True, False)
+
+
+@pytest.mark.parametrize(
+    ("field", "sentence"),
+    [({"final_status": ""}, "'final_status' must be a string"), ({"truncated": 1}, "'truncated' must be true or false")],
+)
+def test_bad_outcomes_are_refused(start: Callable[..., Server], field: dict[str, Any], sentence: str) -> None:
+    server = start()
+    status, reply = server.act("ur5", {"obs": [0] * 27, **field})
+    assert status == 400 and reply["error"].startswith(sentence)
+
+
+def test_a_request_sent_again_is_one_decision(start: Callable[..., Server]) -> None:
+    server = start()
+    first = {"obs": [0.5, 0.25, 0.125], "session_id": "a", "reset": True, "seq": 1}
+    again = {"obs": [0.5, 0.25, 0.25], "session_id": "a", "seq": 2}
+    replies = [server.act("lstm_box", body) for body in (first, again, again)]
+    assert replies[1][1]["action"] == replies[2][1]["action"]
+    (episode,) = server.recorded()
+    assert episode.id == "a" and episode.field("seq") == [1, 2]
+
+
+def test_what_got_no_action_stands_in_its_episode(start: Callable[..., Server]) -> None:
+    server, headers = start(), {"x-session-id": "cell-7"}
+    obs = [0.0] * 27
+    assert server.act("ur5", {"obs": obs}, **headers)[0] == 200
+    assert server.act("ur5", {"obs": obs, "deadline_ms": 0}, **headers)[0] == 408
+    assert server.act("ur5", {"obs": obs[:3]}, **headers)[0] == 422  # none of the policy's observations
+    assert server.act("ur5", {"obs": obs}, **headers)[0] == 200
+    (episode,) = server.recorded()
+    assert episode.acted.tolist() == [True, False, True] and episode.gap is None
+    assert episode.errors[1] == "deadline-passed"
+
+
+def test_policies_whose_options_say_so_are_left_out(start: Callable[..., Server]) -> None:
+    server = start({"ur5": PolicyOptions(record=False)})
+    assert server.act("ur5", {"obs": [0] * 27})[0] == 200
+    assert server.act("lstm_box", {"obs": [0, 0, 0], "state": {}})[0] == 200
+    assert [one.policy.contract.name for one in server.recorded()] == ["lstm_box"]
+
+
+def test_a_mark_that_a_client_made_up_is_taken_as_none(start: Callable[..., Server]) -> None:
+    server = start()
+    state = server.act("lstm_box", {"obs": [0, 0, 0], "state": {}})[1]["state"]
+    identity = state["@policy"].partition("~")[0]
+    for mark in ("~", "~a", "~a~-1", "~a~1e3", f"~{'a' * 300}~1", "~a~" + "9" * 20):
+        status, _ = server.act("lstm_box", {"obs": [0, 0, 0], "state": {**state, "@policy": identity + mark}})
+        assert status == 200, mark
+    found = server.recorded()
+    assert len(found) == 7 and [one.begins for one in found] == [True] + [False] * 6
+
+
+def test_nothing_of_headers_is_in_the_file_and_only_the_owner_reads_it(start: Callable[..., Server]) -> None:
+    server = start()
+    server.act("ur5", {"obs": [0] * 27}, authorization="Bearer secret-7", cookie="secret-8")
+    server.recorded()
+    (file,) = server.folder.iterdir()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600 and stat.S_IMODE(server.folder.stat().st_mode) == 0o700
+    (entry,) = Recording(server.folder).entries()
+    assert "secret" not in json.dumps(entry.fields)
+
+
+def test_a_reward_that_is_no_number_costs_its_record_alone(start: Callable[..., Server]) -> None:
+    server, headers = start(), {"x-session-id": "cell-7"}
+    for reward in (None, "much", {"a": 1}, [1, [2]], 1.0):
+        assert server.act("ur5", {"obs": [0] * 27, "reward": reward}, **headers)[0] == 200
+    (episode,) = server.recorded()
+    assert len(episode) == 5 and np.isfinite(episode.reward).tolist() == [False, False, False, True, False]
+    assert server.metrics()["rlservo_records_dropped_total"] == 3
+
+
+def test_a_folder_that_cannot_be_written_to_is_a_sentence(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(UsageError, match="nothing can be recorded at|exists"):
+        create_app(lambda: None, ServerSettings(record=str(file)))
