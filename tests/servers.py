@@ -225,13 +225,14 @@ def launched(
 
 @dataclass(frozen=True)
 class LiveServer:
-    """A policy server on Ray Serve, with a key, gRPC and a log file."""
+    """A policy server on Ray Serve, with a key, gRPC, a log file and a recording."""
 
     run: Run
     port: int
     grpc_port: int
     key: str
     log: Path
+    recorded: Path
 
     @property
     def bearer(self) -> str:
@@ -247,7 +248,9 @@ def live_server(policies: Path, recurrent: Path, tmp_path_factory: pytest.TempPa
     """
     key, line = new_key("tests")
     log = tmp_path_factory.mktemp("log") / "server.jsonl"
+    recorded = tmp_path_factory.mktemp("recorded")
     settings = {
+        "record": str(recorded),
         "api_keys": line,
         "default_policy": "ur5",
         "log_file": str(log),
@@ -261,7 +264,7 @@ def live_server(policies: Path, recurrent: Path, tmp_path_factory: pytest.TempPa
     ) as run:
         run.wait_until_ready()
         assert run.grpc_port is not None
-        yield LiveServer(run, run.port, run.grpc_port, key, log)
+        yield LiveServer(run, run.port, run.grpc_port, key, log, recorded)
         assert run.end(signal.SIGINT) == 0
 
 

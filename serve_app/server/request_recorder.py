@@ -8,8 +8,11 @@ from __future__ import annotations
 import time
 from collections import OrderedDict
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError, RlservoError, UnknownPolicyError, UsageError
 from rlservo.serve_app.episodes.request import Episode, Request
@@ -61,9 +64,10 @@ class RequestRecorder:
         episode, step = place
         known, rows, obs = self._format(policy), decision.batch or 1, LeafArrays(decision.inputs)
         ends = said.final_status is not None
-        if episode and step and (ends or said.reward is not None or said.last_action is not None):
+        reward = None if said.reward is None else _numbers(said.reward, rows)
+        if episode and step and (ends or reward is not None or said.last_action is not None):
             outcome = OutcomeRecord(
-                known, episode, step - 1, said.reward, ends and not said.truncated, ends and said.truncated,
+                known, episode, step - 1, reward, ends and not said.truncated, ends and said.truncated,
                 said.final_status, obs if ends else None, said.last_action, rows,
             )  # fmt: skip
             self.recorder.record(outcome)
@@ -74,13 +78,13 @@ class RequestRecorder:
             request_id=request.request_id, warnings=decision.notices, rows=rows,
         )  # fmt: skip
         if policy.sees_reward:
-            record.reward_input = said.reward
+            record.reward_input = reward
         if request.explore and policy.draw is not None:
             record.own_action, record.dist_inputs = policy.draw.own, policy.draw.inputs
         self.recorder.record(record)
 
     def record_failure(self, request: Request, store: PolicyStore | None, error: RlservoError) -> None:
-        """Record an observation that got no action, where it is one of the policy's at all."""
+        """Record a single observation that got no action, where it is one of the policy's at all."""
         if store is None or request.obs is None or isinstance(error, ObservationError | RequestError):
             return
         try:
@@ -89,11 +93,18 @@ class RequestRecorder:
             return
         if not policy.options.record:
             return
+        known = self._format(policy)
+        try:
+            parts = known.observations.rows(request.obs)  # nothing has looked at it yet
+        except (RequestError, ValueError, TypeError, KeyError):
+            return
+        if len(parts) > 1:
+            return
         taken_ms = (time.perf_counter() - request.received) * 1e3
         episode = "" if _carries_state(request) else _episode_of(request)
         step = self._count(policy.contract.name, episode, request.episode or NO_EPISODE) if episode else 0
         record = DecisionRecord(
-            self._format(policy), request.obs, None, episode, step, taken_ms, request.explore, seq=request.seq,
+            known, LeafArrays(parts[0]), None, episode, step, taken_ms, request.explore, seq=request.seq,
             request_id=request.request_id, error=error.code,
         )  # fmt: skip
         self.recorder.record(record)
@@ -144,6 +155,15 @@ def _episode_of(request: Request) -> str:
     """Return the episode that a request is of: its session, its stream, or all that comes under its label."""
     in_session = request.episode is not None and request.episode.session_id is not None
     return (request.label if request.stream_id is None or in_session else request.stream_id) or ""
+
+
+def _numbers(reward: Any, rows: int) -> NDArray[np.float64] | None:
+    """Return a request's reward, or one a row; None for what is none."""
+    try:
+        numbers = np.ravel(np.asarray(reward, np.float64))
+    except (ValueError, TypeError):
+        return None
+    return numbers if len(numbers) in (1, rows) else None
 
 
 def _carries_state(request: Request) -> bool:

@@ -6,6 +6,7 @@ import json
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from rlservo.serve_app.protocols.oip_grpc import Grpc, is_local
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.ray_serve.launcher import serve_policies
 from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.recording.episodes import episodes
+from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.runtime.policy import Policy
 from stores import load_store
 
@@ -44,6 +47,24 @@ def call(live_server: Any) -> Iterator[Call]:
             return reply.FromString(content)
 
         yield ask
+
+
+def test_what_grpc_decides_is_recorded(live_server: Any, call: Call, ur5: Path) -> None:
+    asked = request(OBS[:1], id="recorded-1")
+    asked.raw_input_contents.append(OBS[:1].tobytes())
+    asked.parameters["sequence_id"].string_param = "recorded-arm"
+    reply = call("ModelInfer", asked, messages.ModelInferResponse)
+    deadline = time.monotonic() + 20
+    while True:  # written within a second
+        mine = [one for one in episodes(Recording(live_server.recorded)) if one.id == "recorded-arm"]
+        if mine or time.monotonic() > deadline:
+            break
+        time.sleep(0.1)
+    assert len(mine) == 1 and mine[0].field("request_id") == ["grpc-17"]
+    np.testing.assert_array_equal(mine[0].obs["obs"], OBS[:1])
+    np.testing.assert_array_equal(mine[0].action["action"].tobytes(), reply.raw_output_contents[0])
+    with Policy.load(ur5) as policy:
+        np.testing.assert_array_equal(mine[0].action["action"], policy.act(OBS[:1]))
 
 
 def request(obs: Any, **fields: Any) -> Any:

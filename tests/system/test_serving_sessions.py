@@ -16,6 +16,8 @@ import pytest
 from rlservo.export.contract.errors import DeadlineError, SessionLostError, UnavailableError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.recording.episodes import episodes
+from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.runtime.policy import Policy
 from servers import LiveServer
 
@@ -74,6 +76,7 @@ def test_a_killed_replica_takes_its_memories_along_and_its_clients_learn_of_it(
         for step in range(3):
             for client in clients:
                 np.testing.assert_allclose(client.act(SEEN[step]), expected[step], rtol=1e-4, atol=1e-5)
+        time.sleep(1.0)  # a killed replica's recording lacks the last second
         os.kill(replica, signal.SIGKILL)
         for client in (held, streaming):
             deadline = time.monotonic() + 60
@@ -89,3 +92,14 @@ def test_a_killed_replica_takes_its_memories_along_and_its_clients_learn_of_it(
             client.reset()
             np.testing.assert_allclose(client.act(SEEN[0]), expected[0], rtol=1e-4, atol=1e-5)
             np.testing.assert_allclose(client.act(SEEN[1]), expected[1], rtol=1e-4, atol=1e-5)
+    recording = Recording(live_server.recorded)
+    clients_episodes = [
+        one
+        for one in episodes(recording)
+        if one.begins
+        and len(one) == 3
+        and one.policy.contract.name == MODEL
+        and np.array_equal(one.obs["obs"], SEEN[:3])
+    ]
+    assert len(clients_episodes) >= 3  # of before the kill
+    assert any(not facts.whole and facts.damage is None for facts in recording.files)

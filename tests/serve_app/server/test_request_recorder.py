@@ -177,7 +177,10 @@ def test_the_client_tells_what_came_of_it(start: Callable[..., Server]) -> None:
 
 @pytest.mark.parametrize(
     ("field", "sentence"),
-    [({"final_status": ""}, "'final_status' must be a string"), ({"truncated": 1}, "'truncated' must be true or false")],
+    [
+        ({"final_status": ""}, "'final_status' must be a string"),
+        ({"truncated": 1}, "'truncated' must be true or false"),
+    ],
 )
 def test_bad_outcomes_are_refused(start: Callable[..., Server], field: dict[str, Any], sentence: str) -> None:
     server = start()
@@ -235,17 +238,17 @@ def test_nothing_of_headers_is_in_the_file_and_only_the_owner_reads_it(start: Ca
     assert "secret" not in json.dumps(entry.fields)
 
 
-def test_a_reward_that_is_no_number_costs_its_record_alone(start: Callable[..., Server]) -> None:
+def test_a_reward_that_is_no_number_is_not_recorded(start: Callable[..., Server]) -> None:
     server, headers = start(), {"x-session-id": "cell-7"}
     for reward in (None, "much", {"a": 1}, [1, [2]], 1.0):
         assert server.act("ur5", {"obs": [0] * 27, "reward": reward}, **headers)[0] == 200
     (episode,) = server.recorded()
     assert len(episode) == 5 and np.isfinite(episode.reward).tolist() == [False, False, False, True, False]
-    assert server.metrics()["rlservo_records_dropped_total"] == 3
+    assert server.metrics()["rlservo_records_dropped_total"] == 0
 
 
 def test_a_folder_that_cannot_be_written_to_is_a_sentence(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()
-    with pytest.raises(UsageError, match="nothing can be recorded at|exists"):
+    with pytest.raises(UsageError, match="nothing can be recorded at"):
         create_app(lambda: None, ServerSettings(record=str(file)))
