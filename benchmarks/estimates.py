@@ -202,16 +202,21 @@ def main() -> None:
         if arguments.importance_only:
             candidates = [candidate for candidate in candidates if not candidate.deterministic]
         study(candidates, linear(BEHAVIOUR), arguments.episodes, seeds)
-    print(f"{arguments.repetitions} repetitions of {arguments.episodes} episodes; 95% intervals")
+    report(candidates, arguments.repetitions, arguments.episodes)
+
+
+def report(candidates: list[Candidate], repetitions: int, episodes: int) -> None:
+    """Print what was claimed of each candidate, and how often it held."""
+    print(f"{repetitions} repetitions of {episodes} episodes; 95% intervals")
     for candidate in candidates:
-        print(f"{candidate.name}: true return {candidate.truth:.1f}")
+        print(f"{candidate.name}: true return {candidate.truth:.4g}")
         for method in sorted({*candidate.claimed, *candidate.covered_unclaimed}):
             claimed, covered = candidate.claimed.get(method, 0), candidate.covered.get(method, 0)
             width = float(np.mean(candidate.widths[method])) if claimed else float("nan")
             outside = candidate.covered_unclaimed.get(method, 0)
             print(
-                f"  {method}: claimed {claimed}, covered {covered} of them, mean width {width:.1f}; "
-                f"covered {outside} of {arguments.repetitions - claimed} not claimed; "
+                f"  {method}: claimed {claimed}, covered {covered} of them, mean width {width:.3g}; "
+                f"covered {outside} of {repetitions - claimed} not claimed; "
                 f"mean of effective episodes {np.mean(candidate.effective[method]):.0f}"
             )
 

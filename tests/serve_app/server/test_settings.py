@@ -23,7 +23,7 @@ def test_arguments_win_over_the_environment_over_the_defaults() -> None:
         (
             {},
             {"RLSERVO_POLICY_OPTIONS": '{"ur5": {"micro_bach": 16}}'},
-            r"RLSERVO_POLICY_OPTIONS is not usable at 'ur5.micro_bach': .*known: out_of_bounds, .*, micro_batch, record$",
+            r"RLSERVO_POLICY_OPTIONS is not usable at 'ur5.micro_bach': .*known: out_of_bounds, .*, record$",
         ),
         ({"colour": 1}, {}, "known: threads"),
     ],
