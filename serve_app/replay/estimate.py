@@ -20,7 +20,7 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.replay.fitted_q import fitted_q
-from rlservo.serve_app.replay.followed import Followed, Follower
+from rlservo.serve_app.replay.follower import FollowedEpisode, Follower
 
 LARGEST = 5_000_000  # numbers in one matrix of episodes by steps
 RESAMPLES = 1000
@@ -228,7 +228,7 @@ def fitted_estimate(trajectories: list[Trajectory], gamma: float, rng: np.random
     )
 
 
-def _why_not(followed: Followed) -> str | None:
+def _why_not(followed: FollowedEpisode) -> str | None:
     episode = followed.episode
     if not episode.begins or not episode.id or episode.goes_on or episode.gap is not None:
         return "incomplete"
@@ -241,7 +241,7 @@ def _why_not(followed: Followed) -> str | None:
     return None if followed.known.all() else "in which the bundle's action is unsafe"
 
 
-def _trajectory(followed: Followed, contract: Contract, explore: bool) -> Trajectory:
+def _trajectory(followed: FollowedEpisode, contract: Contract, explore: bool) -> Trajectory:
     episode = followed.episode
     return Trajectory(
         episode.reward,
@@ -252,7 +252,7 @@ def _trajectory(followed: Followed, contract: Contract, explore: bool) -> Trajec
     )
 
 
-def _log_weights(followed: Followed, contract: Contract, explore: bool) -> NDArray[np.float64] | None:
+def _log_weights(followed: FollowedEpisode, contract: Contract, explore: bool) -> NDArray[np.float64] | None:
     """Return the log of each action's probability under the bundle over that under the recorded policy."""
     episode = followed.episode
     if not np.isfinite(episode.logp).all():

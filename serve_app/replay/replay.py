@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.recording.reader import Recording
-from rlservo.serve_app.replay.followed import Followed, Follower
+from rlservo.serve_app.replay.follower import FollowedEpisode, Follower
 
 WORST_MOMENTS = 10
 
@@ -132,9 +132,9 @@ class _Comparison:
         self._compared = 0
         self._worst: list[tuple[float, int, Moment]] = []
         self._order = itertools.count()  # no two moments are compared by anything else
-        self._followed: Followed | None = None
+        self._followed: FollowedEpisode | None = None
 
-    def add(self, followed: Followed) -> None:
+    def add(self, followed: FollowedEpisode) -> None:
         report, episode = self._report, followed.episode
         self._followed = followed
         explored = followed.known & episode.explored
@@ -180,7 +180,12 @@ class _Comparison:
         self._report.worst = [moment for _, _, moment in sorted(self._worst, reverse=True)]
 
     def _compare(
-        self, name: str, recorded: NDArray[Any], replayed: NDArray[Any], rows: NDArray[np.bool_], followed: Followed
+        self,
+        name: str,
+        recorded: NDArray[Any],
+        replayed: NDArray[Any],
+        rows: NDArray[np.bool_],
+        followed: FollowedEpisode,
     ) -> NDArray[np.bool_]:
         """Add one leaf's differences; return in which rows an element is beyond the tolerance."""
         flat = recorded.reshape(len(recorded), -1).astype(np.float64)
@@ -198,7 +203,7 @@ class _Comparison:
         return np.asarray(beyond.any(axis=1))
 
     def _keep_worst(
-        self, name: str, scaled: NDArray[np.float64], beyond: NDArray[np.bool_], followed: Followed
+        self, name: str, scaled: NDArray[np.float64], beyond: NDArray[np.bool_], followed: FollowedEpisode
     ) -> None:
         episode = followed.episode
         worst = np.where(beyond, scaled, 0.0).max(axis=1)

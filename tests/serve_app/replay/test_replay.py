@@ -16,7 +16,7 @@ from rlservo.serve_app.recording.episodes import episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.recording.recorded_policy import WithRecording
 from rlservo.serve_app.recording.recorder import Recorder
-from rlservo.serve_app.replay.followed import OtherContractError
+from rlservo.serve_app.replay.follower import OtherContractError
 from rlservo.serve_app.replay.replay import replay
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy

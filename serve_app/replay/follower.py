@@ -35,7 +35,7 @@ class OtherContractError(UsageError):
 
 
 @dataclass(frozen=True)
-class Followed:
+class FollowedEpisode:
     """An episode and what the bundle would have done in it. Rows that are not `known` hold zeros."""
 
     episode: Episode
@@ -65,7 +65,7 @@ class Follower:
     def contract(self) -> Contract:
         return self.policy.contract
 
-    def follow(self, recording: Recording, name: str | None = None) -> Iterator[Followed]:
+    def follow(self, recording: Recording, name: str | None = None) -> Iterator[FollowedEpisode]:
         """Yield every episode of the policy `name`, of the bundle's own name by default, or of the only one there is.
 
         Raises OtherContractError where its observations or actions are others than the bundle's.
@@ -85,7 +85,7 @@ class Follower:
             self.skipped.clear()
             yield from self.follow(recording, names.pop())
 
-    def _follow(self, episode: Episode) -> Followed:
+    def _follow(self, episode: Episode) -> FollowedEpisode:
         policy = self._policy_of(episode.policy)
         if not policy.is_stateful and all(tensor.name != REWARD for tensor in policy.contract.inputs):
             at_once = _follow_at_once(policy, episode)
@@ -127,7 +127,7 @@ class Follower:
                 last = done
         if episode.goes_on:
             self._carried[key] = (before, last)
-        return Followed(episode, known, unsafe, action, inputs)
+        return FollowedEpisode(episode, known, unsafe, action, inputs)
 
     def _policy_of(self, recorded: PolicyFormat) -> Policy:
         """Return the bundle under the options that the recorded policy had."""
@@ -155,7 +155,7 @@ class Follower:
         self._checked.add(id(recorded))
 
 
-def _follow_at_once(policy: Policy, episode: Episode) -> Followed | None:
+def _follow_at_once(policy: Policy, episode: Episode) -> FollowedEpisode | None:
     """Follow an episode with a policy that remembers nothing; None where a row needs a look of its own."""
     known = np.flatnonzero(episode.acted)
     action = {name: np.zeros_like(leaf) for name, leaf in episode.action.items()}
@@ -180,7 +180,7 @@ def _follow_at_once(policy: Policy, episode: Episode) -> Followed | None:
                 action[name][row] = leaf[0].reshape(action[name].shape[1:])
             if inputs is not None and answer.inputs is not None:
                 inputs[row] = answer.inputs[0]
-    return Followed(episode, episode.acted.copy(), np.zeros(len(episode), np.bool_), action, inputs)
+    return FollowedEpisode(episode, episode.acted.copy(), np.zeros(len(episode), np.bool_), action, inputs)
 
 
 def _is_close_only(
