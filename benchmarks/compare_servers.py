@@ -16,9 +16,9 @@ import urllib.request
 from collections.abc import Callable, Sequence
 from functools import partial
 
-import msgpack
 import numpy as np
 
+from rlservo.serve_app.wire.msgpack_arrays import pack
 from speed.loads import HttpLine, WebSocketLine
 from speed.servers import Exchange
 
@@ -35,9 +35,10 @@ def main() -> None:
         size = int(np.prod(json.load(reply)["observation_space"]["shape"]))
     obs = np.random.default_rng(0).uniform(-0.5, 0.5, size).astype(np.float32).tolist()
     act = Exchange("POST", f"{path}/act", json.dumps({"obs": obs}).encode())
-    kinds = {
+    message = pack({"obs": obs})
+    kinds: dict[str, Callable[[int], HttpLine | WebSocketLine]] = {
         "JSON": partial(HttpLine, exchange=act),
-        "WebSocket": partial(WebSocketLine, path=f"{path}/stream", message=msgpack.packb({"obs": obs}), greets=True),
+        "WebSocket": partial(WebSocketLine, path=f"{path}/stream", message=message, greets=True),
     }
     for kind, connect in kinds.items():
         lines = [connect(port) for port in asked.ports]

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError, RlservoError, UnknownPolicyError, UsageError
 from rlservo.serve_app.episodes.request import Episode, Request
-from rlservo.serve_app.recording.policy_format import PolicyFormat
+from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 
 try:
     from rlservo.serve_app.recording.recorder import Recorder
-    from rlservo.serve_app.recording.records import DecisionRecord, LeafArrays, OutcomeRecord
+    from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
 except ModuleNotFoundError as error:
     if (error.name or "").startswith("rlservo"):
         raise

@@ -54,12 +54,11 @@ def test_what_grpc_decides_is_recorded(live_server: Any, call: Call, ur5: Path) 
     asked.raw_input_contents.append(OBS[:1].tobytes())
     asked.parameters["sequence_id"].string_param = "recorded-arm"
     reply = call("ModelInfer", asked, messages.ModelInferResponse)
-    deadline = time.monotonic() + 20
-    while True:  # written within a second
-        mine = [one for one in episodes(Recording(live_server.recorded)) if one.id == "recorded-arm"]
-        if mine or time.monotonic() > deadline:
-            break
-        time.sleep(0.1)
+    deadline, mine = time.monotonic() + 20, []
+    while not mine and time.monotonic() < deadline:  # written within a second
+        time.sleep(0.2)
+        if any(live_server.recorded.iterdir()):
+            mine = [one for one in episodes(Recording(live_server.recorded)) if one.id == "recorded-arm"]
     assert len(mine) == 1 and mine[0].field("request_id") == ["grpc-17"]
     np.testing.assert_array_equal(mine[0].obs["obs"], OBS[:1])
     np.testing.assert_array_equal(mine[0].action["action"].tobytes(), reply.raw_output_contents[0])
