@@ -153,8 +153,10 @@ def rollout(
 def _link_of(policy: ActingPolicy) -> Link | None:
     """Return what a policy behind a network counted; None for one in process."""
     counts, fallback, inner = LinkCounts(), None, policy
-    if isinstance(policy, WithFallback):
-        counts, fallback, inner = policy.counts, policy.name, policy.policy
+    while (wrapped := getattr(inner, "policy", None)) is not None:  # in a fallback, a recording, or both
+        if isinstance(inner, WithFallback):
+            counts, fallback = inner.counts, inner.name
+        inner = wrapped
     reconnects = getattr(inner, "reconnects", None)
     if reconnects is None and fallback is None:
         return None

@@ -164,6 +164,20 @@ def test_fallbacks_are_recorded_as_what_the_robot_did(ur5: Path, tmp_path: Path)
     assert (report.compared, report.identical, report.not_compared) == (7, 7, 3)
 
 
+@pytest.mark.parametrize("recording_outside", [True, False])
+def test_report_counts_fallbacks_whatever_wraps_what(ur5: Path, tmp_path: Path, recording_outside: bool) -> None:
+    failing: Any = Failing(Policy.load(ur5))
+    file = tmp_path / "run.mcap"
+    policy = (
+        WithRecording(WithFallback(failing, "hold"), file)
+        if recording_outside
+        else WithFallback(WithRecording(failing, file), "hold")
+    )
+    with policy:
+        report = rollout(policy, "Recorded-v0", episodes=1, seed=1)
+    assert report.link is not None and (report.link.fallback, report.link.fallback_steps) == ("hold", 3)
+
+
 def test_commands_reach_the_policy_through_a_recording(ur5: Path, tmp_path: Path) -> None:
     failing: Any = Failing(Policy.load(ur5))
     with WithFallback(WithRecording(failing, tmp_path / "run.mcap"), "zero") as policy:
