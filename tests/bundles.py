@@ -37,6 +37,7 @@ from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, Element
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
+from stores import MemoryLedger
 
 ROOT = Path(__file__).resolve().parents[1]
 OBS = 27
@@ -365,22 +366,6 @@ def shipped() -> Path:
 
     made_of = [checkpoints / checkpoint for checkpoint in SHIPPED.values()]
     return cached("shipped-policies", [*SHIPPED, *made_of, *PRODUCT, EXPORTED_WITH], export)
-
-
-class MemoryLedger:
-    """The plans of one process, without Ray."""
-
-    def __init__(self) -> None:
-        self.plans: dict[int, bytes] = {}
-
-    def newest(self) -> int:
-        return max(self.plans, default=0)
-
-    def fetch(self, generation: int) -> bytes | None:
-        return self.plans.get(generation)
-
-    def append(self, generation: int, content: bytes) -> bool:
-        return self.plans.setdefault(generation, content) is content
 
 
 @pytest.fixture(scope="session")

@@ -28,3 +28,19 @@ def store_of(*policies: Policy, **given: Any) -> PolicyStore:
         before = plans[name].versions if name in plans else {}
         plans[name] = PolicyPlan(versions={**before, version: policy.digest}, aliases={PRODUCTION: version})
     return PolicyStore(policies, plans, **given)
+
+
+class MemoryLedger:
+    """The plans of one process, without Ray; the ledger in Ray is tested with Ray."""
+
+    def __init__(self) -> None:
+        self.plans: dict[int, bytes] = {}
+
+    def newest(self) -> int:
+        return max(self.plans, default=0)
+
+    def fetch(self, generation: int) -> bytes | None:
+        return self.plans.get(generation)
+
+    def append(self, generation: int, content: bytes) -> bool:
+        return self.plans.setdefault(generation, content) is content

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.export.contract.contract import Contract, Parity, Provenance, TensorSpec
+from bundles import PARITY, PROVENANCE
+from rlservo.export.contract.contract import Contract, TensorSpec
 from rlservo.export.contract.errors import (
     ActionError,
     DeadlineError,
@@ -40,18 +41,8 @@ CONTRACT = Contract(
     distribution=None,
     baked_in=(),
     control_rate_hz=10.0,
-    provenance=Provenance(
-        algorithm="none",
-        api_stack="new",
-        module_id="arm",
-        module_class="none",
-        checkpoint_sha256="0" * 64,
-        ray_version="none",
-        torch_version="none",
-        rlservo_version="0.1.0",
-        exported_at="2026-01-01T00:00:00Z",
-    ),
-    parity=Parity(reference="none", samples=0, batch_sizes=(), rtol=0, atol=0, formats={}),
+    provenance=PROVENANCE,
+    parity=PARITY,
 )
 OBS = np.array([0.1, 0.2, 0.3], np.float32)
 GOOD = [0.25, -0.5]

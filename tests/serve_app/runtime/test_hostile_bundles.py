@@ -49,6 +49,7 @@ from rlservo.serve_app.versions.plan import Plan, PolicyPlan, ServedConfig
 from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
+from stores import MemoryLedger
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -57,22 +58,6 @@ OBS = np.zeros(27, np.float32) + 0.1
 OPERATOR, _ = new_key("operator", admin=True)
 DIGEST = "sha256:" + hashlib.sha256(OPERATOR.encode()).hexdigest()
 SOON_S = 5.0  # [s] a command and a request for an action; the machine may be busy
-
-
-class Shelf:
-    """A ledger in memory."""
-
-    def __init__(self) -> None:
-        self.plans: dict[int, bytes] = {}
-
-    def newest(self) -> int:
-        return max(self.plans, default=0)
-
-    def fetch(self, generation: int) -> bytes | None:
-        return self.plans.get(generation)
-
-    def append(self, generation: int, content: bytes) -> bool:
-        return self.plans.setdefault(generation, content) is content
 
 
 @pytest.fixture
@@ -94,7 +79,7 @@ def patience_s(request: pytest.FixtureRequest) -> float:
 def url(root: Path, served: Serve, patience_s: float) -> Iterator[str]:
     """A server of ur5 in 1 and 2, and of gridworld."""
     loader = VersionLoader(Repository([root]), scan_timeout_s=patience_s, load_timeout_s=patience_s)
-    control = ReplicaVersions(loader, Shelf(), replica="r")
+    control = ReplicaVersions(loader, MemoryLedger(), replica="r")
     asyncio.run(control.configure({}))
     app = create_app(lambda: control.store, ServerSettings(operator_key=DIGEST), replica="r", control=control)
     with served(app) as port:
@@ -364,7 +349,7 @@ def test_a_replica_whose_files_hang_does_not_hold_up_the_commands_of_others(
     elsewhere = Path(shutil.copytree(root, tmp_path / "elsewhere"))
 
     async def run() -> None:
-        shelf = Shelf()
+        shelf = MemoryLedger()
         controls: list[ReplicaVersions] = []
 
         async def tell(generation: int) -> list[ReplicaProgress]:

@@ -25,31 +25,16 @@ from rlservo.serve_app.versions.plan import Canary
 from rlservo.serve_app.versions.replica_versions import Change, ReplicaProgress, ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
+from stores import MemoryLedger
 
 OBS = np.zeros(27, np.float32) + 0.1
-
-
-class Shelf:
-    """A ledger in memory; the one in Ray is tested with Ray."""
-
-    def __init__(self) -> None:
-        self.plans: dict[int, bytes] = {}
-
-    def newest(self) -> int:
-        return max(self.plans, default=0)
-
-    def fetch(self, generation: int) -> bytes | None:
-        return self.plans.get(generation)
-
-    def append(self, generation: int, content: bytes) -> bool:
-        return self.plans.setdefault(generation, content) is content
 
 
 class Fleet:
     """Replicas that tell each other, as Serve's broadcast does. Each has folders of its own, as on several nodes."""
 
     def __init__(self, *folders: Path) -> None:
-        self.shelf = Shelf()
+        self.shelf = MemoryLedger()
         self.current: Any = None
         self.controls = [self.start(folder, f"r{n}") for n, folder in enumerate(folders)]
 
@@ -295,7 +280,7 @@ def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folde
         return Policy.load(bundle)
 
     async def run() -> None:
-        control = ReplicaVersions(VersionLoader(Repository([folder]), slowly), Shelf(), replica="slow")
+        control = ReplicaVersions(VersionLoader(Repository([folder]), slowly), MemoryLedger(), replica="slow")
         await control.configure(config("1", production="1"))
         change = asyncio.create_task(control.load("ur5", "2", what="load"))
         while not began.is_set():
