@@ -51,11 +51,11 @@ export function keep(parent, items, keyOf, make, update = () => {}) {
 /** Return a table within a region that scrolls by itself, by keyboard as well; `columns` are its headings. */
 export function table(caption, columns) {
   const body = element("tbody");
-  const title = element("caption", { text: caption });
+  const title = element("caption", {}, element("span", { text: caption }));
   const head = element("tr", {}, ...columns.map((column) => element("th", { scope: "col", text: column })));
   const whole = element("table", {}, title, element("thead", {}, head), body);
   const region = element("div", { class: "scroll", role: "region", tabindex: "0", "aria-label": caption }, whole);
-  return { region, body, title };
+  return { region, body };
 }
 
 /** Show facts as a list of terms; those without a text are left out. */

@@ -10,13 +10,13 @@ const COLUMNS = [
   "State",
   "Aliases",
   "Requests",
-  "Each second",
+  "Per second",
   "Failures",
   "Latency p50 / p99",
   "Drift",
   "Contract",
 ];
-const NUMBERS = new Set(["Requests", "Each second", "Latency p50 / p99"]);
+const NUMBERS = new Set(["Requests", "Per second", "Latency p50 / p99"]);
 const CURVE_S = 120;
 const WIDTH = 240;
 const HEIGHT = 36;
@@ -181,8 +181,9 @@ function count(value) {
 function drawCurve(parts, rate, at) {
   if (rate !== null) parts.rates.push([at, rate]);
   parts.rates = parts.rates.filter(([time]) => time >= at - CURVE_S);
+  const begin = parts.rates[0]?.[0] ?? at;
   const most = Math.max(1, ...parts.rates.map(([, value]) => value));
-  const x = (time) => (WIDTH * (time - at + CURVE_S)) / CURVE_S;
+  const x = (time) => (WIDTH * (time - begin)) / (at - begin || 1);
   const y = (value) => HEIGHT - 1 - ((HEIGHT - 2) * value) / most;
   parts.line.setAttribute("points", parts.rates.map(([t, v]) => `${x(t).toFixed(1)},${y(v).toFixed(1)}`).join(" "));
   const highest = Math.max(0, ...parts.rates.map(([, value]) => value));

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
+from browser import BROWSERS
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.docs_page import PAGE
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import load_store
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (
     "--headless",
     "--no-sandbox",

@@ -14,8 +14,8 @@ from typing import Any
 
 import httpx
 import pytest
-from browser import Browser, Tab, browsing
 
+from browser import Browser, Tab, browsing
 from rlservo.export.contract.contract import BakedStep
 from rlservo.export.contract.spaces import BoxSpec, Element
 from rlservo.serve_app.client.admin_client import AdminClient
