@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
 import os
@@ -16,6 +17,7 @@ import httpx
 import pytest
 
 from browser import Browser, Tab, browsing
+from rlservo.export.contract.bundle import read_contract, write_contract
 from rlservo.export.contract.contract import BakedStep
 from rlservo.export.contract.spaces import BoxSpec, Element
 from rlservo.serve_app.client.admin_client import AdminClient
@@ -23,6 +25,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.status_page import FOLDER, prefers_html
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.plan_changes import set_alias
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from servers import over_uvicorn
 from stores import load_store
@@ -38,6 +41,8 @@ FIREFOX = "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"
 PAGE = {"accept": CHROMIUM}
 OPERATOR, OPERATOR_LINE = new_key("operator", admin=True)
 ROBOT, ROBOT_LINE = new_key("cell-7")
+FIRST = {"policies": {"ur5": {"aliases": {"production": "1"}}}}  # which version is in use
+CONTRACT_BUTTON = "document.querySelector('#policy-ur5').parentElement.querySelector('tbody button')"
 MARKUP = "<img src=x onerror='window.broken=1'><script>window.broken=1</script>&amp;"
 # Where pictures for the documents go, if they are wanted: docs/operations.md has the command.
 PICTURES = os.environ.get("RLSERVO_TEST_PICTURES")
@@ -143,7 +148,6 @@ def test_the_page_names_no_other_host_and_keeps_nothing() -> None:
 @dataclass(frozen=True)
 class Served:
     port: int
-    app: Any
 
     @property
     def url(self) -> str:
@@ -158,28 +162,34 @@ class Served:
                 assert reply.status_code == 200, reply.text
 
 
+JOINTS = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
+NAMES = [f"{part} {joint}" for part in ("position of", "speed of", "last target of") for joint in JOINTS]
+NAMES += [f"{part} {axis}" for part in ("target", "hand", "obstacle") for axis in "xyz"]
+
+
+def describe(folder: Path, **changes: Any) -> None:
+    """Give a bundle of `box_policy` a filter, and what else its contract shall say."""
+    contract = read_contract(folder)
+    values = {"count": 1000.0, "mean": [0.0] * 27, "std": [0.5] * 27}
+    step = BakedStep(step="mean_std_filter", detail=changes.pop("detail", "RLlib's filter"), values=values)
+    write_contract(folder, contract.model_copy(update={"baked_in": (step, *contract.baked_in), **changes}))
+
+
+def observations(*names: str, unit: str = "rad") -> BoxSpec:
+    elements = tuple(Element(name=name, unit=unit) for name in names)
+    return BoxSpec(shape=(27,), dtype="float32", low=-2.0, high=None, elements=elements)
+
+
 @pytest.fixture(scope="module")
 def repository(
     box_policy: Callable[..., Path], discrete_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """ur5 in versions 1 and 2, both with a filter, a description and an element that are markup; gridworld."""
-    from rlservo.export.contract import bundle
-
+    """ur5 in versions 1 and 2, both with a filter; gridworld."""
     root = tmp_path_factory.mktemp("policies")
-    values = {"count": 1000.0, "mean": [0.0] * 27, "std": [0.5] * 27}
-    elements = (
-        Element(name=MARKUP, unit="<b>rad</b>"),
-        *(Element(name=f"joint {i}", unit="rad") for i in range(1, 27)),
-    )
+    space = observations(*NAMES)
     for seed, version in enumerate("12"):
         folder = box_policy(root, version=version, seed=seed)
-        contract = bundle.read_contract(folder)
-        changes = {
-            "description": f"Reaches a target. {MARKUP}",
-            "baked_in": (BakedStep(step="mean_std_filter", detail=MARKUP, values=values), *contract.baked_in),
-            "observation_space": BoxSpec(shape=(27,), dtype="float32", low=-2.0, high=None, elements=elements),
-        }
-        bundle.write_contract(folder, contract.model_copy(update=changes))
+        describe(folder, description="Brings the arm's hand to a target.", observation_space=space)
     discrete_policy(root)
     return root
 
@@ -187,12 +197,10 @@ def repository(
 @pytest.fixture
 def server(repository: Path, controlled: Controlled, served: Serve) -> Iterator[Served]:
     """A server that asks for a key only who administers it; version 1 is in use."""
-    config = {"policies": {"ur5": {"aliases": {"production": "1"}}}}
-    with controlled(repository, config=config) as control:
+    with controlled(repository, config=FIRST) as control:
         settings = ServerSettings(operator_key=OPERATOR_LINE.split()[-1])
-        app = create_app(lambda: control.store, settings, control=control, replica="replica-a")
-        with served(app) as port:
-            yield Served(port, app)
+        with served(create_app(lambda: control.store, settings, control=control, replica="replica-a")) as port:
+            yield Served(port)
 
 
 @pytest.fixture(scope="module")
@@ -242,9 +250,9 @@ def test_the_page_shows_what_runs_and_sees_a_switch_of_versions(tab: Tab, server
     assert tab.evaluate(row("2"))["Drift"] == "nothing seen yet"
 
     # The open contract, the focus and what is selected outlive what is shown anew.
-    tab.evaluate("document.querySelector('#policy-ur5').parentElement.querySelector('tbody button').focus()")
+    tab.evaluate(f"{CONTRACT_BUTTON}.focus()")
     tab.press("Enter")
-    tab.wait_for_text("Contract of ur5, version 1", "Observation, element by element", "joint 26")
+    tab.wait_for_text("Contract of ur5, version 1", "Observation, element by element", "obstacle z")
     with AdminClient(server.url, api_key=OPERATOR) as admin:
         admin.canary("ur5", "2", 0.25)
         admin.shadow("ur5", "2")
@@ -253,7 +261,7 @@ def test_the_page_shows_what_runs_and_sees_a_switch_of_versions(tab: Tab, server
         admin.alias("ur5", "production", "2")
     tab.wait_for_text("ur5: production leads to version 2 (before: 1)", "version 2 (a rollback leads to 1)")
     server.act(30)
-    tab.wait_for(f"{row('2')}.Requests === '30' && Number({row('2')}['Each second']) > 0")
+    tab.wait_for(f"{row('2')}.Requests === '30' && Number({row('2')}['Per second']) > 0")
     cells = tab.evaluate(row("2"))
     assert cells["Aliases"] == "production" and re.fullmatch(r"[\d.]+ / [\d.]+ ms", cells["Latency p50 / p99"])
     assert tab.evaluate("document.activeElement.getAttribute('aria-label')") == "Contract of ur5, version 1"
@@ -270,20 +278,57 @@ def test_the_page_shows_what_runs_and_sees_a_switch_of_versions(tab: Tab, server
     assert not [request for request in tab.requests.values() if request.headers.get("Referer")]
 
 
-def test_what_a_policy_says_of_itself_is_text(tab: Tab, server: Served) -> None:
-    server.act(16)
-    tab.visit(server.url)
-    tab.wait_for_text(f"Reaches a target. {MARKUP}")
-    tab.evaluate("document.querySelector('#policy-ur5').parentElement.querySelector('tbody button').click()")
-    tab.wait_for_text("Contract of ur5, version 1", "<b>rad</b>", f"mean std filter: {MARKUP}")
-    drift = "[...document.querySelectorAll('.contract tbody tr')].find(row => row.cells[1].textContent.includes('img'))"
-    assert tab.evaluate(f"{drift}.cells[1].textContent") == MARKUP
-    assert tab.wait_for(f"{drift}.cells[7].textContent !== '–' && {drift}.cells[7].textContent") == "0"
-    assert tab.evaluate("document.querySelectorAll('main img, main script, main b').length") == 0
-    # Even a fault of the page's own script could not make markup of it.
-    tried = "(() => { try { document.body.innerHTML = '<p>x'; return 'done' } catch (error) { return error.name } })()"
-    assert tab.evaluate(tried) == "TypeError"
-    assert tab.evaluate("document.querySelectorAll('script').length") == 1
+def test_what_a_policy_says_of_itself_is_text(
+    tab: Tab, box_policy: Callable[..., Path], served: Serve, tmp_path: Path
+) -> None:
+    folder = box_policy(tmp_path)
+    space = observations(MARKUP, *NAMES[1:], unit="<b>rad</b>")
+    describe(folder, description=f"Reaches a target. {MARKUP}", observation_space=space, detail=MARKUP)
+    store = load_store(tmp_path)
+    with served(create_app(lambda: store, ServerSettings())) as port:
+        Served(port).act(16)
+        tab.visit(f"http://127.0.0.1:{port}")
+        tab.wait_for_text(f"Reaches a target. {MARKUP}", "most 0 σ: <img")
+        tab.evaluate(f"{CONTRACT_BUTTON}.click()")
+        tab.wait_for_text("Contract of ur5, version 1", "<b>rad</b>", f"mean std filter: {MARKUP}")
+        line = "[...document.querySelectorAll('.contract tbody tr')].find(row => row.textContent.includes('img'))"
+        assert tab.evaluate(f"{line}.cells[1].textContent") == MARKUP
+        assert tab.evaluate(f"{line}.cells[7].textContent") == "0"  # its drift, found by that name
+        assert tab.evaluate("document.querySelectorAll('main img, main script, main b').length") == 0
+        # Even a fault of the page's own script could not make markup of it.
+        tried = "(() => { try { document.body.innerHTML = '<p>' } catch (error) { return error.name } })()"
+        assert tab.evaluate(tried) == "TypeError"
+        assert tab.evaluate("document.querySelectorAll('script').length") == 1
+
+
+def test_several_replicas_are_summed_and_their_differences_said(
+    tab: Tab, repository: Path, controlled: Controlled, served: Serve
+) -> None:
+    """Behind a proxy that takes turns, each answer is another replica's."""
+    with controlled(repository, config=FIRST) as one, controlled(repository, config=FIRST) as other:
+        replicas = [
+            create_app(lambda control=control: control.store, ServerSettings(), control=control, replica=name)
+            for control, name in ((one, "replica-a"), (other, "replica-b"))
+        ]
+        turns = itertools.cycle(replicas)
+
+        async def proxy(scope: Any, receive: Any, send: Any) -> None:
+            await (replicas[0] if scope["type"] == "lifespan" else next(turns))(scope, receive, send)
+
+        with served(proxy) as port:
+            Served(port).act(50)
+            tab.visit(f"http://127.0.0.1:{port}")
+            tab.wait_for_text("replica-a", "replica-b", "the sum of what these said")
+            tab.wait_for(f"{row('1')}.Requests === '50' && {row('1')}.State === 'ready'")
+            assert one.plan is not None
+            after = set_alias(one.plan, "ur5", "production", "2")
+            asyncio.run(one.change(lambda _: after, what="alias"))
+            tab.wait_for_text("Not every replica has followed the last change yet.", "(before: 1)")
+            assert tab.evaluate(row("2"))["Aliases"] == "production"
+            asyncio.run(other.change(lambda _: after, what="alias"))
+            tab.wait_for("!document.body.innerText.includes('Not every replica')")
+            # Whichever replica is asked: no change is seen twice, or back.
+            assert tab.evaluate("document.getElementById('changes').children.length") == 1
 
 
 def test_the_page_reads_prometheus_text_as_it_is_written(tab: Tab, server: Served) -> None:
@@ -323,7 +368,7 @@ def test_with_keys_the_page_asks_for_one_and_keeps_it_nowhere(
     with controlled(repository) as control:
         app = create_app(lambda: control.store, ServerSettings(api_keys=ROBOT_LINE), control=control)
         with served(app) as port:
-            server = Served(port, app)
+            server = Served(port)
             server.act(3, key=ROBOT)
             tab.visit(server.url)
             tab.wait_for_text("This server wants an API key.")
@@ -387,18 +432,20 @@ def test_a_small_screen_and_a_keyboard_are_enough(tab: Tab, server: Served, tmp_
     unnamed = "[...document.querySelectorAll('table')].filter(table => !table.caption?.textContent)"
     unscoped = "[...document.querySelectorAll('th')].filter(cell => !['row', 'col'].includes(cell.scope))"
     assert tab.evaluate(f"[{unnamed}.length, {unscoped}.length]") == [0, 0]
-    tab.evaluate("scrollTo(0, 0)")
+    tab.evaluate("scrollTo(0, 0); document.querySelectorAll('.scroll').forEach(region => region.scrollTo(0, 0))")
     picture(tab, "status_page_390", tmp_path)
 
 
-def test_a_server_that_goes_away_is_said_and_comes_back_by_itself(tab: Tab, server: Served, tmp_path: Path) -> None:
-    with over_uvicorn(server.app) as port:
+def test_a_server_that_goes_away_is_said_and_comes_back_by_itself(tab: Tab, repository: Path, tmp_path: Path) -> None:
+    store = load_store(repository)
+    app = create_app(lambda: store, ServerSettings())
+    with over_uvicorn(app) as port:
         tab.visit(f"http://127.0.0.1:{port}")
         tab.wait_for_text("2 policies served")
     tab.wait_for_text("No answer since", "This page goes on asking.", "the server does not answer", "Versions of ur5")
     assert tab.evaluate("document.title") == "rlservo: no answer"
     picture(tab, "status_page_away", tmp_path)
-    with over_uvicorn(server.app, port):
+    with over_uvicorn(app, port):
         tab.wait_for_text("2 policies served", "the server answers again")
         assert "No answer" not in tab.text() and tab.evaluate("document.body.className") == ""
 
