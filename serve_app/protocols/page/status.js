@@ -278,8 +278,9 @@ function changesBetween(before, after) {
 
 function changesOf(then, now) {
   const sentences = [];
-  for (const alias of new Set([...Object.keys(then.aliases), ...Object.keys(now.aliases)])) {
-    const [from, to] = [then.aliases[alias], now.aliases[alias]];
+  const [froms, tos] = [then, now].map(({ aliases }) => new Map(Object.entries(aliases)));
+  for (const alias of new Set([...froms.keys(), ...tos.keys()])) {
+    const [from, to] = [froms.get(alias), tos.get(alias)];
     if (from === to) continue;
     const before = from === undefined ? "" : ` (before: ${from})`;
     sentences.push(to === undefined ? `${alias} is gone` : `${alias} leads to version ${to}${before}`);
