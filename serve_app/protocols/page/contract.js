@@ -3,6 +3,7 @@
 import { clip, element, setText, showFacts, table } from "./dom.js";
 
 const MOST_ELEMENTS = 128; // of a leaf; an image's pixels are no rows each, nor series of the metrics
+const MOST_ROWS = 512; // of a table
 const FILTER = "mean_std_filter";
 const FAR = 1; // [standard deviations of the training] of a shift worth a look, as in the Grafana dashboard
 const BOUNDED = ["#", "Element", "Unit", "Low", "High"];
@@ -19,6 +20,7 @@ export function showContract(contract) {
   node.append(facts);
   node.append(observations(contract, rows), actions(contract));
   if (contract.state.length > 0) node.append(memory(contract.state));
+  node.append(tensors(contract));
   node.append(element("h4", { text: "Baked into the graph, in this order" }), steps(contract.baked_in));
   if (contract.evaluations.length > 0) node.append(evaluations(contract.evaluations));
   return { node, showDrift: (drift) => showDrift(rows, drift) };
@@ -60,7 +62,7 @@ function factsOf(contract) {
 function observations(contract, rows) {
   const { region, body } = table("Observation, element by element", [...BOUNDED, ...COMPARED]);
   const filter = filterOf(contract);
-  for (const row of elements(contract.observation_space, "obs")) {
+  for (const row of rowsOf(contract.observation_space, "obs")) {
     const shift = element("td", { class: "number" });
     const spread = element("td", { class: "number" });
     const trained = [filter?.mean[row.index], filter?.std[row.index]].map((value) => number(value));
@@ -72,7 +74,7 @@ function observations(contract, rows) {
 
 function actions(contract) {
   const { region, body } = table("Action, ready for the environment's step", BOUNDED);
-  for (const row of elements(contract.action_space, "action")) body.append(line(row));
+  for (const row of rowsOf(contract.action_space, "action")) body.append(line(row));
   return region;
 }
 
@@ -88,28 +90,49 @@ function line({ index, name, unit, low, high }, ...more) {
   );
 }
 
-/** Return a row for each element of a space: of nested spaces leaf by leaf, of a large leaf one for all of it. */
-function elements(space, path) {
+/** Return the rows of a space, no more than a page can show. */
+function rowsOf(space, path) {
+  const rows = [];
+  for (const row of elements(space, path)) {
+    if (rows.length === MOST_ROWS) return [...rows, { index: "…", name: "and more", unit: "", label: null }];
+    rows.push(row);
+  }
+  return rows;
+}
+
+/** Yield a row for each element of a space: of nested spaces leaf by leaf, of a large leaf one for all of it. */
+function* elements(space, path) {
   if (space.kind === "dict" || space.kind === "tuple") {
-    return Object.keys(space.spaces)
-      .sort(space.kind === "dict" ? undefined : (a, b) => a - b)
-      .flatMap((key) => elements(space.spaces[key], `${path}.${key}`));
+    const keys = Object.keys(space.spaces);
+    if (space.kind === "dict") keys.sort(); // as RLlib has them
+    for (const key of keys) yield* elements(space.spaces[key], `${path}.${key}`);
+    return;
   }
   const size = (space.shape ?? []).reduce((product, axis) => product * axis, 1);
   if (size > MOST_ELEMENTS) {
     const name = `${path}: ${space.dtype}, shape (${space.shape.join(", ")}), all ${size} elements`;
-    const [lows, highs] = [0, 1].map((side) => Array.from({ length: size }, (_, index) => bounds(space, index)[side]));
-    const [low, high] = [lows.reduce((a, b) => Math.min(a, b)), highs.reduce((a, b) => Math.max(a, b))];
-    return [{ index: 0, name, unit: "", low, high, label: "largest" }];
+    yield { index: 0, name, unit: "", ...extent(space, size), label: "largest" };
+    return;
   }
   const names = (space.elements ?? []).map(({ name }) => name);
   const unique = new Set(names).size === size;
-  return Array.from({ length: size }, (_, index) => {
+  for (let index = 0; index < size; index++) {
     const [low, high] = bounds(space, index);
     const numbered = index in names ? `${index} (${names[index]})` : String(index);
     const name = names[index] ?? (size === 1 ? path : `${path}[${index}]`);
-    return { index, name, unit: space.elements?.[index]?.unit ?? "", low, high, label: unique ? name : numbered };
-  });
+    yield { index, name, unit: space.elements?.[index]?.unit ?? "", low, high, label: unique ? name : numbered };
+  }
+}
+
+/** Return the lowest and the highest bound of a large leaf. */
+function extent(space, size) {
+  let [low, high] = [Infinity, -Infinity];
+  const listed = [space.low, space.high, space.nvec].some(Array.isArray);
+  for (let index = 0; index < (listed ? size : 1); index++) {
+    const [lower, upper] = bounds(space, index);
+    [low, high] = [Math.min(low, lower), Math.max(high, upper)];
+  }
+  return { low, high };
 }
 
 function bounds(space, index) {
@@ -138,6 +161,14 @@ function memory(states) {
   const { region, body } = table("Memory, carried from step to step", ["Name", "Kind", "Type", "Shape"]);
   for (const { name, kind, dtype, shape } of states) {
     body.append(cells(name, "", [kind.replaceAll("_", " "), dtype, `(${shape.join(", ")})`]));
+  }
+  return region;
+}
+
+function tensors({ inputs, outputs }) {
+  const { region, body } = table("Tensors of the graph, the batch first", ["Name", "Side", "Type", "Shape"]);
+  for (const [side, those] of Object.entries({ input: inputs, output: outputs })) {
+    for (const { name, dtype, shape } of those) body.append(cells(name, "", [side, dtype, `(${shape.join(", ")})`]));
   }
   return region;
 }

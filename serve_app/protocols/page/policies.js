@@ -119,7 +119,7 @@ function makeRow(parts, name, version) {
   const cells = kinds.map((kind) => element("td", kind));
   const button = element("button", {
     type: "button",
-    text: "Show",
+    text: "Contract",
     "aria-label": `Contract of ${name}, version ${version}`,
     "aria-expanded": "false",
     "aria-controls": parts.contract.id,
@@ -225,8 +225,6 @@ function closeContract(parts) {
 function markOpen(parts, version) {
   for (const row of parts.versions.body.children) {
     const open = row.firstChild.textContent === version;
-    const button = row.querySelector("button");
-    button.setAttribute("aria-expanded", String(open));
-    setText(button, open ? "Hide" : "Show");
+    row.querySelector("button").setAttribute("aria-expanded", String(open));
   }
 }

@@ -102,7 +102,7 @@ async function askAll() {
 }
 
 function succeed(listing, samples) {
-  const at = performance.now() / 1000;
+  const at = Date.now() / 1000; // and not `performance.now()`, which stands still while a computer sleeps
   if (awaySince !== null) {
     forget(); // it may have been started anew: its changes are counted from 1 again
     note("the server answers again");
@@ -182,6 +182,7 @@ function useKey(event) {
   setText(byId("key-error"), "");
   setText(byId("state"), "Asking the server …");
   byId("key-form").hidden = true;
+  byId("policies").focus();
   refresh();
 }
 

@@ -301,6 +301,7 @@ def test_what_a_policy_says_of_itself_is_text(
         assert tab.evaluate("document.querySelectorAll('script').length") == 1
 
 
+@pytest.mark.slow
 def test_several_replicas_are_summed_and_their_differences_said(
     tab: Tab, repository: Path, controlled: Controlled, served: Serve
 ) -> None:
@@ -436,6 +437,7 @@ def test_a_small_screen_and_a_keyboard_are_enough(tab: Tab, server: Served, tmp_
     picture(tab, "status_page_390", tmp_path)
 
 
+@pytest.mark.slow
 def test_a_server_that_goes_away_is_said_and_comes_back_by_itself(tab: Tab, repository: Path, tmp_path: Path) -> None:
     store = load_store(repository)
     app = create_app(lambda: store, ServerSettings())
@@ -450,6 +452,7 @@ def test_a_server_that_goes_away_is_said_and_comes_back_by_itself(tab: Tab, repo
         assert "No answer" not in tab.text() and tab.evaluate("document.body.className") == ""
 
 
+@pytest.mark.slow
 def test_a_hidden_page_asks_nothing(tab: Tab, server: Served) -> None:
     tab.visit(server.url)
     tab.wait_for_text("2 policies served")
@@ -525,3 +528,5 @@ def test_on_ray_serve_the_page_shows_what_runs(tab: Tab, live_server: Any) -> No
         assert reply.status_code == 200
     tab.wait_for(f"Number({row('10')}.Requests.replaceAll(',', '')) >= {before + 5}")
     assert httpx.get(url, timeout=20).status_code == 401
+    tab.evaluate("document.querySelector('#policy-act_nested').parentElement.querySelector('tbody button').click()")
+    tab.wait_for_text("Contract of act_nested, version 1", "Memory, carried from step to step", "obs.", "action.")
