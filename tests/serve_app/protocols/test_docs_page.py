@@ -40,6 +40,10 @@ def test_the_documentation_is_drawn_and_tried_out_without_the_internet(
         for button in ("[id$=healthz_healthz_get] button", ".try-out__btn", ".execute"):
             tab.wait_for(f"(document.querySelector('{button}').click(), true)")
         tab.wait_for("document.querySelector('.live-responses-table').innerText.includes('OK')")
+        # A page of the server's own may also ask for actions.
+        body = "JSON.stringify({obs: Array(27).fill(0)})"
+        act = f"{{method: 'POST', headers: {{'content-type': 'application/json'}}, body: {body}}}"
+        assert tab.evaluate(f"fetch('/v1/policies/ur5/act', {act}).then(reply => reply.status)") == 200
         asked = {request.url for request in tab.requests.values() if not request.url.startswith("data:")}
         assert {address.split("/")[2] for address in asked} == {f"127.0.0.1:{port}"}
         assert tab.complaints == []  # nothing that it needs is forbidden by its security policy
