@@ -142,6 +142,7 @@ def test_the_page_names_no_other_host_and_keeps_nothing() -> None:
             "sessionStorage", "indexedDB", "cookie", "style=", "<style", "postMessage", "import(",
         ):  # fmt: skip
             assert forbidden not in text, (file, forbidden)
+        assert not re.search(r"[\"'`=]/(v1|v2|page|docs|metrics)\b", text), file  # it works below a route prefix, too
         assert not re.search(r"<script(?![^>]*\bsrc=)|\son\w+=\"", text), file
 
 
@@ -253,6 +254,9 @@ def test_the_page_shows_what_runs_and_sees_a_switch_of_versions(tab: Tab, server
     tab.evaluate(f"{CONTRACT_BUTTON}.focus()")
     tab.press("Enter")
     tab.wait_for_text("Contract of ur5, version 1", "Observation, element by element", "obstacle z")
+    buttons = "document.querySelectorAll('[aria-controls=policy-ur5-contract]')"
+    tab.evaluate(f"[1, 0].forEach(index => {buttons}[index].click())")  # asked for at once, and sent one by one
+    tab.wait_for_text("Contract of ur5, version 1")
     with AdminClient(server.url, api_key=OPERATOR) as admin:
         admin.canary("ur5", "2", 0.25)
         admin.shadow("ur5", "2")
@@ -272,7 +276,8 @@ def test_the_page_shows_what_runs_and_sees_a_switch_of_versions(tab: Tab, server
     # One request at a time, and no other than these.
     asked = [request for request in tab.requests.values() if "/page/" not in request.url]
     paths = [request.url.removeprefix(server.url) for request in asked]
-    assert set(paths) == {"/", "/v1/policies", "/metrics", "/v1/policies/ur5/versions/1"}
+    contracts = {f"/v1/policies/ur5/versions/{version}" for version in "12"}
+    assert set(paths) == {"/", "/v1/policies", "/metrics", *contracts}
     for before, after in itertools.pairwise(asked):
         assert before.ended is not None and before.ended <= after.began, (before, after)
     assert not [request for request in tab.requests.values() if request.headers.get("Referer")]
@@ -330,6 +335,8 @@ def test_several_replicas_are_summed_and_their_differences_said(
             tab.wait_for("!document.body.innerText.includes('Not every replica')")
             # Whichever replica is asked: no change is seen twice, or back.
             assert tab.evaluate("document.getElementById('changes').children.length") == 1
+            Served(port).act(20)  # each is looked at again and again
+            tab.wait_for(f"{row('1')}.Requests === '50' && {row('2')}.Requests === '20'")
 
 
 def test_the_page_reads_prometheus_text_as_it_is_written(tab: Tab, server: Served) -> None:
