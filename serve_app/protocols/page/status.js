@@ -315,5 +315,8 @@ function clock(date) {
 
 byId("key-form").addEventListener("submit", useKey);
 byId("forget").addEventListener("click", () => askForKey(""));
-document.addEventListener("visibilitychange", refresh);
+document.addEventListener("visibilitychange", () => {
+  listings.clear(); // a server that was started anew meanwhile counts its changes from 1 again
+  refresh();
+});
 refresh();

@@ -135,7 +135,7 @@ def test_without_web_pages_there_is_none(policies: Path, served: Serve) -> None:
 def test_the_page_names_no_other_host_and_keeps_nothing() -> None:
     """What the security policy forbids is not tried either."""
     for file in FOLDER.iterdir():
-        text = re.sub(r"^\s*//.*$", "", file.read_text(), flags=re.MULTILINE)
+        text = re.sub(r"^\s*(//|/?\*).*$", "", file.read_text(), flags=re.MULTILINE)
         assert set(re.findall(r"https?://[^\s\"'/]*", text)) <= {"http://www.w3.org"}, file
         for forbidden in (
             "innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "new Function", "localStorage",
