@@ -1,15 +1,15 @@
 // What runs on the server that this page is from, asked again and again.
 //
-// Everything is asked with one key, which is kept in a variable here and nowhere else; one request at a time. Each
-// answer of `/v1/policies` and `/metrics` is one replica's, so the page keeps what each replica said last.
+// Each answer of `/v1/policies` and `/metrics` is one replica's, so the page keeps what each replica said last.
 
+import { changesBetween } from "./changes.js";
 import { clip, element, keep, setText, showFacts } from "./dom.js";
 import { driftOf, Looks, parse } from "./metrics.js";
-import { sayCanary, showPolicies } from "./policies.js";
+import { showPolicies } from "./policies.js";
+import { ask, hasKey, NoSuccess, useKey } from "./requests.js";
 
 const EVERY_MS = 2000;
 const SLOWEST_MS = 10000; // between attempts, while there is no answer
-const TIMEOUT_MS = 8000;
 const WINDOW_S = 20; // of rates and latencies
 const KEPT_S = 60; // of what a replica said
 const MOST_CHANGES = 50;
@@ -18,7 +18,6 @@ const STATES = ["failed", "loading", MISSING, "ready"]; // of several replicas t
 
 const byId = (id) => document.getElementById(id);
 
-let key = null;
 let epoch = 0; // counts the keys: what was asked with an earlier one is not shown
 let timer = 0;
 let busy = false;
@@ -28,52 +27,6 @@ let awaySince = null;
 let shown = null; // the listing on the page
 const listings = new Map(); // replica -> {at, listing}
 const looks = new Looks(WINDOW_S, KEPT_S);
-
-/** No answer (status 0), or one that is not a success, with the server's sentence. */
-class NoSuccess extends Error {
-  constructor(status, sentence) {
-    super(sentence);
-    this.status = status;
-  }
-}
-
-let last = Promise.resolve();
-
-/** Ask for a path when everything asked before is answered. */
-function ask(path) {
-  const answer = last.then(() => send(path));
-  last = answer.catch(() => {});
-  return answer;
-}
-
-async function send(path) {
-  const [reply, text] = await receive(path).catch(() => {
-    throw new NoSuccess(0, "");
-  });
-  if (!reply.ok) throw new NoSuccess(reply.status, sentenceOf(text) ?? `status ${reply.status}`);
-  return text;
-}
-
-async function receive(path) {
-  const reply = await fetch(path, {
-    headers: key === null ? {} : { authorization: `Bearer ${key}` },
-    mode: "same-origin",
-    credentials: "omit",
-    cache: "no-store",
-    redirect: "error",
-    referrerPolicy: "no-referrer",
-    signal: AbortSignal.timeout(TIMEOUT_MS),
-  });
-  return [reply, await reply.text()];
-}
-
-function sentenceOf(text) {
-  try {
-    return clip(JSON.parse(text).error, 500);
-  } catch {
-    return null; // what stands before the server answered
-  }
-}
 
 /** Ask once, show what came, and have it done again. */
 async function refresh() {
@@ -117,7 +70,7 @@ function succeed(listing, samples) {
 
 function fail(error) {
   if (error.status === 401 || error.status === 403) {
-    askForKey(key === null ? "" : `The server refused the key: ${error.message}.`);
+    askForKey(hasKey() ? `The server refused the key: ${error.message}.` : "");
     return;
   }
   if (!(error instanceof NoSuccess)) {
@@ -156,7 +109,7 @@ function askForKey(why) {
 
 /** Take everything off the page that a key has opened, and the key. */
 function clear() {
-  key = null;
+  useKey(null);
   epoch += 1;
   shown = null;
   forget();
@@ -168,7 +121,7 @@ function clear() {
   document.body.className = "";
 }
 
-function useKey(event) {
+function takeKey(event) {
   event.preventDefault();
   const typed = byId("key").value.trim();
   byId("key").value = "";
@@ -176,7 +129,7 @@ function useKey(event) {
     setText(byId("key-error"), typed === "" ? "Type a key first." : "A key has no spaces and no special letters.");
     return;
   }
-  key = typed;
+  useKey(typed);
   epoch += 1;
   wantsKey = false;
   setText(byId("key-error"), "");
@@ -208,7 +161,7 @@ function newest() {
 function show(listing, at) {
   document.body.className = "";
   byId("key-form").hidden = true;
-  byId("key-used").hidden = key === null;
+  byId("key-used").hidden = !hasKey();
   for (const sentence of changesBetween(shown, listing)) note(sentence);
   shown = listing;
   showPolicies(byId("policies"), listing, { looks, askContract, at });
@@ -263,45 +216,6 @@ function factsOf({ generation, changed_at: changedAt, changed_by: changedBy }) {
   ];
 }
 
-/** Return sentences for what differs between two listings. */
-function changesBetween(before, after) {
-  if (before === null) return [];
-  const sentences = [];
-  const policies = new Map(before.policies.map((policy) => [policy.name, policy]));
-  for (const now of after.policies) {
-    const then = policies.get(now.name);
-    policies.delete(now.name);
-    if (then === undefined) sentences.push(`${now.name} is served, version ${now.version}`);
-    else sentences.push(...changesOf(then, now).map((sentence) => `${now.name}: ${sentence}`));
-  }
-  return [...sentences, ...[...policies.keys()].map((name) => `${name} is no longer served`)];
-}
-
-function changesOf(then, now) {
-  const sentences = [];
-  const [froms, tos] = [then, now].map(({ aliases }) => new Map(Object.entries(aliases)));
-  for (const alias of new Set([...froms.keys(), ...tos.keys()])) {
-    const [from, to] = [froms.get(alias), tos.get(alias)];
-    if (from === to) continue;
-    const before = from === undefined ? "" : ` (before: ${from})`;
-    sentences.push(to === undefined ? `${alias} is gone` : `${alias} leads to version ${to}${before}`);
-  }
-  const states = new Map(then.version_states.map(({ version, state }) => [version, state]));
-  for (const { version, state, reason } of now.version_states) {
-    const why = reason && `: ${clip(reason, 300)}`;
-    if (states.get(version) !== state) sentences.push(`version ${version} is ${state}${why}`);
-    states.delete(version);
-  }
-  for (const version of states.keys()) sentences.push(`version ${version} is unloaded`);
-  if (JSON.stringify(then.canary) !== JSON.stringify(now.canary)) {
-    sentences.push(now.canary ? `canary: ${sayCanary(now.canary)}` : "the canary has ended");
-  }
-  if (then.shadow?.version !== now.shadow?.version) {
-    sentences.push(now.shadow ? `version ${now.shadow.version} computes along` : "the shadow has ended");
-  }
-  return sentences;
-}
-
 function note(sentence) {
   const time = element("time", { text: clock(new Date()) });
   byId("history").hidden = false;
@@ -313,7 +227,7 @@ function clock(date) {
   return date.toLocaleTimeString([], { hour12: false });
 }
 
-byId("key-form").addEventListener("submit", useKey);
+byId("key-form").addEventListener("submit", takeKey);
 byId("forget").addEventListener("click", () => askForKey(""));
 document.addEventListener("visibilitychange", () => {
   listings.clear(); // a server that was started anew meanwhile counts its changes from 1 again
