@@ -69,7 +69,9 @@ def serve(
         if served.admin_key_file is not None:
             note(f"administration: rlservo policy --help; its key is in {served.admin_key_file}")
         terminal.output().print(
-            f"ready; documentation at {served.url}/docs; Ctrl-C stops", highlight=False, soft_wrap=True
+            f"ready; what runs: {served.url} in a browser (API: {served.url}/docs); Ctrl-C stops",
+            highlight=False,
+            soft_wrap=True,
         )
 
     serve_policies(

@@ -19,6 +19,7 @@ TOGETHER = {
     "tests/system/test_serving_protocols.py": "live server",
     "tests/system/test_serving_sessions.py": "live server",
     "tests/serve_app/protocols/test_access.py::test_on_ray_serve": "live server",
+    "tests/serve_app/protocols/test_status_page.py::test_on_ray_serve": "live server",
     "tests/serve_app/protocols/test_web_pages.py::test_on_ray_serve": "live server",
     "tests/system/test_robo_gym_client.py": "shipped server",
     "tests/system/test_served_policies.py": "shipped server",

@@ -54,9 +54,9 @@ except RlservoError as error:
 
 
 @contextlib.contextmanager
-def over_uvicorn(app: Any) -> Iterator[int]:
-    """Serve an ASGI application from a thread; gives the port."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
+def over_uvicorn(app: Any, port: int = 0) -> Iterator[int]:
+    """Serve an ASGI application from a thread; gives the port, by default a free one."""
+    with socket.create_server(("127.0.0.1", port)) as listener:
         server = uvicorn.Server(uvicorn.Config(app, log_level="critical", access_log=False, lifespan="on"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()

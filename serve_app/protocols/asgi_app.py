@@ -17,6 +17,7 @@ from rlservo.serve_app.protocols.docs_page import add_docs
 from rlservo.serve_app.protocols.fastapi_routes import add_route
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.json_messages import encode_json
+from rlservo.serve_app.protocols.status_page import add_status_page
 from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.gauges import exposition
@@ -61,6 +62,7 @@ def create_app(
     oip_models.add_routes(app, core, app.add_direct)
     if settings.docs:
         add_docs(app)
+        add_status_page(app)
     app.add_exception_handler(RlservoError, _on_rlservo_error)
     app.add_exception_handler(HTTPException, _on_http_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)

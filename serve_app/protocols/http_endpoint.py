@@ -46,6 +46,7 @@ logger = logging.getLogger(__name__)
 PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
 TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been read
 STAMP_HEADER = STAMP.encode()
+ROOT = "/"  # a page for browsers (`status_page.py`), nothing for programs
 KEY = "rlservo.key"  # in a connection's scope: the key that opened it
 REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, beside the protocol's own
 
@@ -124,7 +125,8 @@ class PolicyApp(FastAPI):
                 await _send_refusal(scope, receive, send, UnknownPolicyError(sentence))
                 return
             if route is None:
-                await http_error(404, scope)(scope, receive, send)
+                varying = {"Vary": "Accept"} if path == ROOT else None
+                await http_error(404, scope, headers=varying)(scope, receive, send)
                 return
             body = await receive_body(self._core, headers, receive)
         except RlservoError as error:

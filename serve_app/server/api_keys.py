@@ -50,7 +50,7 @@ class Access(Enum):
     """Who may use a route or a method; `grant` and the route classes write it down where a route is made."""
 
     open = "open"
-    """Everybody, without a key: what orchestrators probe, and the documentation, which tells nothing of policies."""
+    """Everybody, without a key: what orchestrators probe, and web pages that tell nothing of policies by themselves."""
 
     act = "act"
     """Whoever has a key; where the server has none, everybody."""

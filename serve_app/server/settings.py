@@ -136,7 +136,7 @@ class ServerSettings(BaseModel):
     follow a change."""
 
     docs: bool = True
-    """Serve the interactive API documentation at /docs, from files that come with the server."""
+    """Serve web pages, from files that come with the server: what runs at `/`, the API's documentation at /docs."""
 
     @property
     def bundle_limits(self) -> BundleLimits:

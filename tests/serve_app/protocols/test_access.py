@@ -19,6 +19,7 @@ import pytest
 
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
+from rlservo.serve_app.protocols.status_page import FOLDER
 from rlservo.serve_app.server.api_keys import ACCESS, Access, access_of, grant, new_key
 from rlservo.serve_app.server.request_log import FIELDS
 from rlservo.serve_app.server.settings import ServerSettings
@@ -159,6 +160,7 @@ def paths(app: PolicyApp) -> list[tuple[str, str, Access]]:
     found = []
     for route in app.routes:
         path = route.path.replace("{name}", "ur5").replace("{version}", "1")  # type: ignore[attr-defined]
+        path = path.replace("{file}", "dom.js")
         if path == "/docs/files":
             path += "/swagger-ui.css"
         for method in sorted(getattr(route, "methods", None) or {"GET"}):
@@ -170,13 +172,14 @@ def test_every_route_says_who_may_use_it(app: PolicyApp) -> None:
     for route in app.routes:
         said = getattr(route, ACCESS, None) or getattr(getattr(route, "endpoint", None), ACCESS, None)
         assert isinstance(said, Access), f"{route} does not say who may use it"
-    levels = {route.path: access_of(route) for route in app.routes}  # type: ignore[attr-defined]
-    assert {path for path, access in levels.items() if access is Access.admin} == set(ADMIN_PATHS)
-    assert {path for path, access in levels.items() if access is Access.open} == {
-        "/healthz", "/v2/health/live", "/v2/health/ready", "/docs", "/docs/files", "/openapi.json",
+    levels = {(route.path, access_of(route)) for route in app.routes}  # type: ignore[attr-defined]
+    assert {path for path, access in levels if access is Access.admin} == set(ADMIN_PATHS)
+    assert {path for path, access in levels if access is Access.open} == {
+        "/", "/page/{file}", "/healthz", "/v2/health/live", "/v2/health/ready", "/docs", "/docs/files", "/openapi.json",
     }  # fmt: skip
+    assert ("/", Access.act) in levels  # the stream; the page is another route, for GET alone
     document = app.openapi()["paths"]
-    assert set(document) <= set(levels)
+    assert set(document) <= {path for path, _ in levels}
 
 
 def test_a_route_that_says_nothing_is_for_administrators_alone(
@@ -242,6 +245,26 @@ def test_no_spelling_of_a_path_gets_around_the_keys(server: Served) -> None:
     assert asked > 1000
     assert server.plan == before and server.control.store is not None
     assert server.control.store.names == ("gridworld", "ur5")
+
+
+def test_asking_for_html_opens_nothing_but_the_page(server: Served) -> None:
+    page, html, opened = (FOLDER / "index.html").read_bytes(), b"accept: text/html", 0
+    closed = 401 if server.kind == "keys" else 404
+    with Wire(server.port) as wire:
+        for target in spellings("/"):
+            status, answer = wire.ask(b"GET", target, html, *bearer(WRONG), body=b"")
+            if plain_of(target) == "/" and status == 200:
+                assert answer == page, target
+                opened += 1
+            else:
+                assert status in (0, 400, 401, 403, 404), (target, status, answer[:200])
+        for verb in (b"POST", b"PUT", b"DELETE", b"PATCH", b"OPTIONS", b"TRACE"):  # as if there were no page
+            assert wire.ask(verb, b"/", html, body=b"")[0] == closed, verb
+        if server.kind == "keys":
+            for method, path, access in paths(server.app):
+                if access is not Access.open:
+                    assert path == "/" or wire.ask(method.encode(), path.encode(), html, body=b"")[0] == 401, path
+    assert opened > 1
 
 
 def test_other_methods_of_a_path_are_kept_as_its_own_is(server: Served) -> None:

@@ -21,6 +21,7 @@ from typing import Any
 import httpx
 import pytest
 
+from browser import BROWSERS
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
@@ -32,7 +33,6 @@ Controlled = Callable[..., AbstractContextManager[ReplicaVersions]]
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 REBOUND = "robot.rebound.test"
 FLAGS = (
     "--headless",
@@ -90,6 +90,7 @@ const socket = path => new Promise(done => {
   for (const path of ["/", "/v1/policies/leaky/stream"]) await note("socket " + path, socket(path));
   for (const path of ["/v1/policies", "/v2/repository/index", "/metrics", "/openapi.json"])
     await note("read " + path, fetch(target + path));
+  await note("read page", fetch(target + "/", {headers: {accept: "text/html"}}));
   await fetch("/report", {method: "POST", headers: {"content-type": "application/json"}, body: JSON.stringify(out)});
 })();
 </script>"""
@@ -203,6 +204,7 @@ def test_the_servers_own_page_gets_through(browser: str, target: Target, tmp_pat
     target.pages.page = page_for(f"http://127.0.0.1:{target.port}")
     report = visit(browser, f"http://127.0.0.1:{target.port}/page.html", target.pages, tmp_path / "profile")
     assert report["act json"] == report["infer json"] == report["infer octets"] == report["read /v1/policies"] == 200
+    assert report["read page"] == 200
     assert report["socket /"] == report["socket /v1/policies/leaky/stream"] == "open"
     assert report["unload json"] == report["admin json"] == 401 and report["newline json"] == 400
     # What a form can send is not answered even here.
