@@ -29,8 +29,8 @@ def cached(name: str, made_of: Iterable[Path | str], make: Callable[[Path], None
     root.mkdir(parents=True, exist_ok=True)
     folder = root / f"{name}-{_digest(made_of)}"
     complete = folder.with_name(f"{folder.name}.complete")  # beside it: the folder holds what `make` wrote, only
-    with (root / f"{name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # another process of this run, or another run, may be making it
+    with folder.with_name(f"{folder.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # another process of this run, or another run, may be making the same
         if not complete.exists():
             _remove_unused(root, name)
             shutil.rmtree(folder, ignore_errors=True)
@@ -62,4 +62,5 @@ def _remove_unused(root: Path, name: str) -> None:
     for complete in root.glob(f"{name}-*.complete"):
         if time.time() - complete.stat().st_mtime > KEPT_S:
             complete.unlink(missing_ok=True)
+            complete.with_suffix(".lock").unlink(missing_ok=True)
             shutil.rmtree(complete.with_suffix(""), ignore_errors=True)

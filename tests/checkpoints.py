@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,16 +18,23 @@ from cache import cached, versions
 
 ZOO = Path(__file__).resolve().with_name("zoo")
 APP = ZOO / "app"  # the user's own code that some of the checkpoints need
-TRAINED_WITH = [ZOO, str(ZOO), versions("ray", "torch", "gymnasium", "numpy")]  # pickles name the code's own folder
+TRAINED_WITH = [ZOO, versions("ray", "torch", "gymnasium", "numpy")]
+
+
+def copy(folder: Path) -> None:
+    shutil.copytree(ZOO, folder / ZOO.name, ignore=shutil.ignore_patterns("__pycache__"))
 
 
 def trained(script: str) -> Path:
     """Return the folder that a training script fills."""
+    # Pickles name their code's file: a copy that is there as long as they are, whatever becomes of this checkout.
+    code = cached("zoo-code", [ZOO], copy) / ZOO.name
 
     def train(folder: Path) -> None:
         # With the token in its environment Ray writes none to the user's home.
         environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
-        command = [sys.executable, "-W", "ignore", str(ZOO / script), str(folder)]
+        environment["RAY_enable_worker_prestart"] = "0"  # everything here trains in one process
+        command = [sys.executable, "-W", "ignore", str(code / script), str(folder)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=580)
         assert done.returncode == 0, done.stderr[-3000:]
 

@@ -247,6 +247,7 @@ def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) 
         made.deploy(serving("1"), by_command=True)
         made.while_starting = made.check("--own", DIFFERENT)[1]
         made.wait_for(lambda seen: len(seen) == 2)
+        made.wait_for_status("RUNNING")  # each check below is a process of seconds
         deadline = time.monotonic() + PATIENCE_S
         while (found := made.check("--own", DIFFERENT))[0] != 0:
             assert time.monotonic() < deadline, found

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-pytest_plugins = ["checkpoints", "bundles", "clusters", "environments", "servers"]
+pytest_plugins = ["checkpoints", "bundles", "clusters", "environments", "servers", "trainings"]
 
 # Tests that share what is costly to make, by the beginning of their id. All others share their file's own.
 TOGETHER = {
@@ -25,29 +25,75 @@ TOGETHER = {
     "tests/system/test_served_policies.py": "shipped server",
     "tests/system/test_cluster_check.py": "cluster",
     "tests/system/test_policies_under_load.py": "cluster",
+    "tests/benchmarks/test_training_benchmark.py": "one Ray",
+    "tests/examples/test_edge_environments.py": "one Ray",
     "tests/examples/test_shipped_policies.py": "one Ray",
+    "tests/examples/test_simple_trainer.py": "one Ray",
+    "tests/examples/test_slurm.py": "one Ray",
     "tests/examples/test_tour.py": "one Ray",
     "tests/examples/test_training_scripts.py": "one Ray",
 }
 
 
-class ByFile(LoadScopeScheduling):
-    """All tests of a file in one process, or those that are together."""
+# Servers and Rays that tests share. One that nobody uses still takes a tenth of a core or more.
+RUNNING = {"live_server", "shipped_server", "cluster", "one_ray"}
+
+
+def group_of(nodeid: str) -> str:
+    """Return what a test runs together with: its file, or those that share more."""
+    shared = (group for beginning, group in TOGETHER.items() if nodeid.startswith(beginning))
+    return next(shared, nodeid.partition("::")[0])
+
+
+class ByGroup(LoadScopeScheduling):
+    """All tests of a group in one process."""
 
     def _split_scope(self, nodeid: str) -> str:
-        shared = (group for beginning, group in TOGETHER.items() if nodeid.startswith(beginning))
-        return next(shared, nodeid.partition("::")[0])
+        return group_of(nodeid)
 
 
 @pytest.hookimpl(optionalhook=True)  # -p no:xdist
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByFile:
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByGroup:
     """Take the place of `--dist`: marks (loadgroup) do not reach xdist 3.8 under pytest 9.2."""
     config.option.loadscopereorder = False  # the order below, not the files with the most tests first
-    return ByFile(config, log)
+    return ByGroup(config, log)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files with slow tests first: none of them is the last that the others wait for."""
+    """Put the groups that share something, then the files with slow tests first: nobody waits for those in the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    shared = set(TOGETHER.values())
+    items.sort(key=lambda item: (group_of(item.nodeid) not in shared, item.path not in slow))
+
+
+class SharedFixtures:
+    """Ends what a group shares as soon as its last test has run, not with the session."""
+
+    def __init__(self) -> None:
+        self._running: list[tuple[pytest.FixtureDef[Any], Any]] = []
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Keep each group's tests together, in whatever order the others have put them."""
+        first: dict[str, int] = {}
+        for item in items:
+            first.setdefault(group_of(item.nodeid), len(first))
+        items.sort(key=lambda item: first[group_of(item.nodeid)])
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: pytest.FixtureDef[Any], request: Any) -> Any:
+        if fixturedef.argname in RUNNING:
+            self._running.append((fixturedef, request))
+        return (yield)
+
+    @pytest.hookimpl(trylast=True)  # after the module's own fixtures
+    def pytest_runtest_teardown(self, item: pytest.Item, nextitem: pytest.Item | None) -> None:
+        if nextitem is None or group_of(nextitem.nodeid) != group_of(item.nodeid):
+            while self._running:
+                fixturedef, request = self._running.pop()
+                fixturedef.finish(request)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(SharedFixtures())

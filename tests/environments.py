@@ -1,22 +1,45 @@
-"""Pythons with packages that cannot share our environment: other servers' clients, robo-gym."""
+"""The wheel, and Pythons with packages that cannot share our environment: other servers' clients, robo-gym."""
 
 from __future__ import annotations
 
 import os
 import re
 import subprocess
+import sys
+import tempfile
 import venv
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from cache import PYTHON, cached
+from cache import PYTHON, cached, versions
 
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGED = ("envs", "export", "serve_app", "deploy", "pyproject.toml", "setup.py", "README.md", "LICENSE")
 ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")
 # What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and
 # pip would settle that with an old robo-gym-server-modules that has no pin and does not work.
 CLIENT = ("httpcore>=1.0.6", "pydantic>=2.6")
+
+
+@pytest.fixture(scope="session")
+def wheel() -> Path:
+    """The wheel of this tree."""
+
+    def build(folder: Path) -> None:
+        with tempfile.TemporaryDirectory() as temporary:
+            source = Path(temporary) / "tree"
+            # A copy without build leftovers: setuptools would take stale files from build/.
+            subprocess.run(["git", "-C", str(ROOT), "checkout-index", "-a", f"--prefix={source}/"], check=False)
+            for name in PACKAGED:
+                subprocess.run(["cp", "-r", str(ROOT / name), str(source)], check=True)
+            command = [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(source)]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+            assert done.returncode == 0, done.stdout + done.stderr
+
+    made_of = [ROOT / name for name in PACKAGED]
+    return next(cached("wheel", [*made_of, versions("build")], build).glob("*.whl"))
 
 
 def virtual_environment(*packages: str) -> Path:

@@ -10,24 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from cache import PYTHON, cached
+
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("envs", "export", "serve_app", "deploy")
-
-
-@pytest.fixture(scope="session")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("wheel")
-    source = tmp_path_factory.mktemp("source") / "tree"
-    # A copy without build leftovers: setuptools would take stale files from build/.
-    subprocess.run(["git", "-C", str(ROOT), "checkout-index", "-a", f"--prefix={source}/"], check=False)
-    for folder in FOLDERS:
-        subprocess.run(["cp", "-r", str(ROOT / folder), str(source)], check=True)
-    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
-        subprocess.run(["cp", str(ROOT / name), str(source)], check=True)
-    build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(out), str(source)]
-    done = subprocess.run(build, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return next(out.glob("*.whl"))
 
 
 def test_wheel_holds_every_module_and_asset_and_no_foreign_top_level(wheel: Path) -> None:
@@ -52,19 +38,29 @@ def test_metadata_installs_no_developers_tools_and_has_no_placeholder(wheel: Pat
     assert "<this repository>" not in readme
 
 
+def pip(environment: Path) -> list[str]:
+    return [sys.executable, "-m", "pip", "--python", str(environment / "bin" / "python")]
+
+
 @pytest.mark.slow
 def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -> None:
-    venv.create(tmp_path / "env")
-    python = tmp_path / "env" / "bin" / "python"
-    pip = [sys.executable, "-m", "pip", "--python", str(python)]
-    install = [*pip, "install", "-q", "--no-compile", "-c", str(ROOT / "constraints.txt"), str(wheel)]
-    done = subprocess.run(install, capture_output=True, text=True, timeout=500)
-    assert done.returncode == 0, done.stderr
+    constraints = ROOT / "constraints.txt"
+
+    def install(folder: Path) -> None:
+        venv.create(folder)
+        done = subprocess.run(
+            [*pip(folder), "install", "-q", "--no-compile", "-c", str(constraints), str(wheel)],
+            capture_output=True, text=True, timeout=500,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+
+    environment = cached("wheel-environment", [wheel.parent.name, constraints, PYTHON], install)
+    python = environment / "bin" / "python"
 
     def run(*command: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
 
-    listed = run(*pip, "list", "--format=freeze").stdout.lower()
+    listed = run(*pip(environment), "list", "--format=freeze").stdout.lower()
     assert "\nonnxruntime==" in f"\n{listed}"
     for heavy in ("torch", "ray", "gymnasium", "mujoco", "fastapi", "onnx"):
         assert f"\n{heavy}==" not in f"\n{listed}"
@@ -77,7 +73,7 @@ def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -
     program = "import sys; print(*sorted(name for name in sys.modules if 'rlservo' in name), 'typing' in sys.modules)"
     started = run(str(python), "-c", program)
     assert started.stdout.split() == ["rlservo", "rlservo.envs", "rlservo.envs.discovery", "False"]
-    rlservo = str(tmp_path / "env" / "bin" / "rlservo")
+    rlservo = str(environment / "bin" / "rlservo")
     assert run(rlservo, "--version").stdout.startswith("rlservo ")
     refused = run(rlservo, "serve", ".")
     assert refused.returncode == 2

@@ -4,50 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import os
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from ctypes.util import find_library
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
-HERE = Path(__file__).resolve().parent
-EXAMPLES = HERE.parents[1] / "examples"
-TINY = ("--set", "train_batch_size_per_learner=400", "--hidden", "16")
-
-
-@dataclass(frozen=True)
-class Ended:
-    """How a script ended."""
-
-    code: int
-    out: str
-    err: str
-
-
-def command(script: str, *arguments: str) -> list[str]:
-    return [sys.executable, str(EXAMPLES / script), *arguments]
-
-
-def environment(home: Path) -> dict[str, str]:
-    """A home of its own shows what a script leaves there. Ray's workers would step back behind all else: nice 15."""
-    return {**os.environ, "HOME": str(home), "RAY_worker_niceness": "0"}
-
-
-def run_script(script: str, *arguments: str, home: Path) -> Ended:
-    done = subprocess.run(
-        command(script, *arguments), capture_output=True, text=True, timeout=500, env=environment(home), cwd=home
-    )
-    return Ended(done.returncode, done.stdout, done.stderr)
+from trainings import EXAMPLES, ON_ONE_CORE, TINY, Ended, OneRay, command, environment
 
 
 def run_here(script: str, *arguments: str, home: Path) -> Ended:
@@ -75,7 +46,7 @@ def run_here(script: str, *arguments: str, home: Path) -> Ended:
 def run_helper(script: str, *arguments: str, folder: Path) -> str:
     """Run a script of the tests' own and return its output; the last line is a JSON document."""
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", str(HERE / script), *arguments],
+        [sys.executable, "-W", "ignore", str(Path(__file__).with_name(script)), *arguments],
         capture_output=True,
         text=True,
         timeout=550,
@@ -86,14 +57,9 @@ def run_helper(script: str, *arguments: str, folder: Path) -> str:
     return done.stdout
 
 
-@pytest.fixture(scope="session", name="run_script")
-def run_script_fixture() -> Callable[..., Ended]:
-    """The function above, for test files: they cannot import this one."""
-    return run_script
-
-
 @pytest.fixture(scope="session", name="run_helper")
 def run_helper_fixture() -> Callable[..., str]:
+    """The function above, for test files: they cannot import this one."""
     return run_helper
 
 
@@ -102,98 +68,83 @@ def run_here_fixture() -> Callable[..., Ended]:
     return run_here
 
 
-def _inference(script: str, *more: str) -> tuple[str, ...]:
-    return (script, *more, "--stop-iters", "1", "--num-episodes-during-inference", "2", "--storage", "runs")
-
-
-def _again(name: str, *changes: str) -> tuple[str, ...]:
-    return ("train_shipped.py", name, *(word for change in changes for word in ("--set", change)))
-
-
-OFFSCREEN = bool(os.environ.get("DISPLAY") or find_library("EGL") or find_library("OSMesa"))
-IN_ONE_RAY = {
-    "ur": _inference("training_inference_ur.py"),
-    "mir": _inference("training_inference_mir.py", "--num-cpus", "1"),
-    "tour": ("tour.py", "--quick", *(() if OFFSCREEN else ("--no-video",))),
-    "again": _again(
-        "cartpole_dqn",
-        "stop.env_steps=400", "steps_per_iteration=300", "training.num_steps_sampled_before_learning_starts=200",
-    ),
-    "judged": _again(
-        "mir100_obstacle_avoidance",
-        "stop.env_steps=5000", "stop.episodes=3", "validation.above=0", "validation.episodes=2",
-        "training.train_batch_size_per_learner=2048", "training.num_epochs=1",
-    ),
-}  # fmt: skip
+# Slurm's srun takes options, then a command. It writes down on which node it was asked to run what.
+SRUN = r"""#!/usr/bin/env bash
+node=-
+while [ "${1#--}" != "$1" ]; do
+  case "$1" in --nodelist=*) node="${1#*=}" ;; esac
+  shift
+done
+echo "$node $*" >> "$STUB_LOG"
+exec "$@"
+"""
+SCONTROL = """#!/usr/bin/env bash
+[ "$1 $2 $3" = "show hostnames node[1-2]" ] && printf 'node1\nnode2\n'
+"""
 
 
 @dataclass(frozen=True)
-class Trained:
-    """How a script ended, in which folder, and what it left in the home folder."""
+class Job:
+    """A job that ran: its script's end, and the folders that it had."""
 
     ended: Ended
-    folder: Path
-    home: frozenset[str]
-    videos: bool = OFFSCREEN  # whether there is an OpenGL library to make them with
-
-
-@pytest.fixture(scope="session")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Trained]]:
-    """Return a function that runs a script of IN_ONE_RAY once; all of them share a process and a Ray."""
-    folder, home = tmp_path_factory.mktemp("one_ray"), tmp_path_factory.mktemp("home")
-    command = [sys.executable, "-W", "ignore", str(HERE / "train_in_one_ray.py")]
-    with (
-        (folder / "errors.txt").open("w") as errors,
-        subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment(home),
-            cwd=home,
-        ) as process,
-    ):  # fmt: skip
-
-        @cache
-        def train(name: str) -> Trained:
-            assert process.stdin is not None and process.stdout is not None
-            process.stdin.write(json.dumps([str(folder / name), *IN_ONE_RAY[name]]) + "\n")
-            process.stdin.flush()
-            reply = process.stdout.readline()
-            assert reply, (folder / "errors.txt").read_text()[-5000:]
-            one = json.loads(reply)
-            return Trained(Ended(one["code"], one["out"], one["err"]), folder / name, frozenset(one["home"]))
-
-        try:
-            yield train
-        finally:
-            assert process.stdin is not None
-            process.stdin.close()  # the last request: it ends, and its Ray with it
-            try:
-                process.wait(200)
-            except subprocess.TimeoutExpired:
-                process.kill()
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """A finished run of `simple_trainer.py`: two learning rates, evaluation, traces, a bundle."""
-
     home: Path
-    ended: Ended
+    checkout: Path
+    stubs: Path
 
     @property
-    def run(self) -> Path:
-        return next(path.parent for path in (self.home / "runs").glob("*/run.json"))
+    def called(self) -> list[str]:
+        """Return what `srun` was asked to run: the node, then the command."""
+        return (self.stubs / "srun.log").read_text().splitlines()
+
+
+def submit(script: str, *arguments: str, folder: Path, **more: str) -> Job:
+    """Run a job script as Slurm would: from a spool, in an environment of its own."""
+    job = Job(Ended(-1, "", ""), *(folder / name for name in ("home", "checkout", "stubs")))
+    for each in (job.home, job.checkout, job.stubs):
+        each.mkdir()
+    for name in ("examples", "deploy"):
+        (job.checkout / name).symlink_to(EXAMPLES.parent / name)
+    for name, text in (("srun", SRUN), ("scontrol", SCONTROL)):
+        (job.stubs / name).write_text(text)
+        (job.stubs / name).chmod(0o755)
+    spool = job.stubs / "slurm_script"
+    shutil.copy(EXAMPLES.parent / "deploy" / "slurm" / script, spool)
+    variables = {
+        **environment(job.home),
+        "PATH": f"{job.stubs}:{os.environ['PATH']}",
+        "STUB_LOG": str(job.stubs / "srun.log"),
+        "SLURM_SUBMIT_DIR": str(job.checkout),
+        "SLURM_JOB_ID": str(os.getpid()),
+        "SLURM_CPUS_PER_TASK": "1",
+        "RLSERVO_PYTHON": sys.executable,
+        "RLSERVO_STORAGE": str(job.home / "runs"),
+        "RLSERVO_RAY_FOLDER": f"/tmp/slurm-{os.getpid()}",
+        **more,
+    }
+    done = subprocess.run(
+        ["bash", str(spool), *arguments], env=variables, capture_output=True, text=True, timeout=500, cwd=job.home
+    )
+    return replace(job, ended=Ended(done.returncode, done.stdout, done.stderr))
+
+
+@pytest.fixture(scope="session", name="submit")
+def submit_fixture() -> Callable[..., Job]:
+    return submit
 
 
 @pytest.fixture(scope="session")
-def sweep(tmp_path_factory: pytest.TempPathFactory) -> Sweep:
-    home = tmp_path_factory.mktemp("sweep")
-    (home / "space.yaml").write_text("gamma: {choice: [0.9]}\n")
-    ended = run_script(
-        "simple_trainer.py", "--run", "PPO", "--name-env", "CartPole-v1", "--num-cpus", "0", *TINY,
-        "--stop-iters", "2", "--sweep", "lr=1e-4,1e-3", "--search-space", "space.yaml", "--scheduler", "asha",
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Job:
+    """A sweep of `simple_trainer.py` as a job of one node: two learning rates, evaluation, traces, a bundle."""
+    folder = tmp_path_factory.mktemp("sweep")
+    space = folder / "space.yaml"
+    space.write_text("gamma: {choice: [0.9]}\n")
+    return submit(
+        "one_node.sh", "--run", "PPO", "--name-env", "CartPole-v1", *TINY,
+        "--stop-iters", "2", "--sweep", "lr=1e-4,1e-3", "--search-space", str(space), "--scheduler", "asha",
         "--evaluation-interval", "1", "--evaluation-duration", "2", "--output", "traces", "--episodes", "2",
-        home=home,
+        folder=folder,
     )  # fmt: skip
-    return Sweep(home, ended)
 
 
 @dataclass(frozen=True)
@@ -207,12 +158,12 @@ class Interrupted:
 
 
 @pytest.fixture(scope="session")
-def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interrupted]:
+def interrupted(tmp_path_factory: pytest.TempPathFactory, one_ray: OneRay) -> Iterator[Interrupted]:
     home = tmp_path_factory.mktemp("interrupted")
     started = subprocess.Popen(
         command(
-            "simple_trainer.py", "--num-cpus", "1", *TINY, "--stop-iters", "6", "--checkpoint-frequency", "1",
-            "--episodes", "1",
+            "simple_trainer.py", "--num-cpus", "1", *ON_ONE_CORE, *TINY, "--stop-iters", "6",
+            "--checkpoint-frequency", "1", "--episodes", "1",
         ),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(home), cwd=home,
         start_new_session=True,
@@ -228,7 +179,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interrupte
         stopped = Ended(started.returncode, out, err)
         left = in_session(started.pid)
         run = next(home.glob("runs/*"))
-        resumed = run_script("simple_trainer.py", "--resume", str(run), home=home)
+        resumed = one_ray.run("resumed", "simple_trainer.py", "--resume", str(run)).ended
         yield Interrupted(home, stopped, resumed, left)
     finally:
         if started.poll() is None:

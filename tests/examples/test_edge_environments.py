@@ -16,11 +16,11 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def edges(tmp_path_factory: pytest.TempPathFactory, run_helper: Any) -> tuple[Path, dict[str, Any]]:
-    folder = tmp_path_factory.mktemp("edges")
-    out = run_helper("train_edges.py", str(folder), folder=folder)
-    found: dict[str, Any] = json.loads(out.splitlines()[-1])
-    return folder, found
+def edges(trained: Any) -> tuple[Path, dict[str, Any]]:
+    run = trained("edges")
+    assert run.ended.code == 0, run.ended.out + run.ended.err
+    found: dict[str, Any] = json.loads((run.folder / "edges.json").read_text())
+    return run.folder, found
 
 
 @pytest.mark.parametrize("name", ["Float64", "Promises32"])

@@ -22,10 +22,10 @@ def returns(ended: Any) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("script", "name"), ROBOTS)
 def test_checkpoint_and_bundle_run_the_same_episodes_and_the_bundle_needs_no_clipping(
-    script: str, name: str, tmp_path: Path, run_script: Any, run_here: Any
+    script: str, name: str, tmp_path: Path, run_here: Any
 ) -> None:
     bundle = export_checkpoint(CHECKPOINTS / name, tmp_path, notify=lambda _: None).path
-    raw = run_script(script, str(CHECKPOINTS / name), "--num-episodes", "2", home=tmp_path)
+    raw = run_here(script, str(CHECKPOINTS / name), "--num-episodes", "2", home=tmp_path)
     exported = run_here(script, "--bundle", str(bundle), "--num-episodes", "2", home=tmp_path)
     assert returns(raw) == returns(exported)
     clipped, actions = map(int, re.search(r"clipped (\d+) of (\d+) actions", raw.out).groups())  # type: ignore[union-attr]

@@ -1,9 +1,7 @@
-"""Train on edge environments for a moment, as the trainer would, in one Ray; print one JSON document.
+"""Train on edge environments for a moment, as the trainer would; write what came of it to edges.json.
 
-python train_edges.py FOLDER
-
-Where Tune is not what an environment is at the edge of, its algorithm trains in this process: a trial's own process
-takes longer to start than to train.
+Runs in a folder of its own and in a Ray of one core: `trainings.py`. Where Tune is not what an environment is at the
+edge of, its algorithm trains in this process: a trial's own process takes longer to start than to train.
 """
 
 from __future__ import annotations
@@ -11,16 +9,15 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import sys
+import time
 from pathlib import Path
 from typing import Any
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-sys.path[:0] = [str(EXAMPLES), str(Path(__file__).parent / "app")]
+import shared.episode_traces as episode_traces
+import shared.training_run as training_run
+import simple_trainer
 
-import shared.episode_traces as episode_traces  # noqa: E402
-import shared.training_run as training_run  # noqa: E402
-import simple_trainer  # noqa: E402
+from trainings import ON_ONE_CORE
 
 RUNS = {
     "Float64": ["--set", "vf_clip_param=100.0", "--observation-filter", "MeanStdFilter"],
@@ -29,58 +26,48 @@ RUNS = {
     "Endless": [],
     "Crashing": ["--restart-failed-sub-environments", "--set", "rollout_fragment_length=25"],
     "Crashing runner": [
-        "--num-cpus",
-        "1",
-        "--set",
-        "rollout_fragment_length=25",
-        "--env-arg",
-        "crashes=1",
-        "--stop-iters",
-        "100000",
-        "--stop-timesteps",
-        "300",
+        "--num-cpus", "1", *ON_ONE_CORE, "--set", "rollout_fragment_length=25", "--env-arg", "crashes=1",
+        "--stop-iters", "100000", "--stop-timesteps", "300",
     ],
     "Crashing for good": ["--stop-iters", "50"],
-}
+}  # fmt: skip
 
 
 TUNED = ("Endless", "Crashing for good")  # what Tune makes of no return, and of a trial that fails
 
 
-def main(folder: Path) -> None:
+def main() -> None:
+    folder = Path.cwd()  # an absolute path: Tune's workers run in the trial's folder
     training_run.pickle_by_value(simple_trainer, episode_traces)
     found = {}
-    with training_run.ray_session(num_cpus=2, app_dir=Path(__file__).parent / "app"):
-        for name, more in RUNS.items():
-            env = f"edge_environments:edge/{name.split()[0]}-v0"
-            common = ["--num-cpus", "0", "--name-env", env, "--stop-iters", "2", "--hidden", "16"]
-            if name.startswith("Crashing"):  # an absolute path: Tune's workers run in the trial's folder
-                common += ["--env-arg", f"log={folder / name.replace(' ', '_')}.txt"]
-            own = (
-                more if "DQN" in more else [*more, "--set", "train_batch_size_per_learner=300", "--set", "num_epochs=2"]
-            )
-            parser = simple_trainer.argument_parser()
-            args = parser.parse_args([*common, *own])
-            simple_trainer.check_arguments(parser, args)
-            said = io.StringIO()
-            with contextlib.redirect_stdout(said):
-                try:
-                    config, run, _ = simple_trainer.set_up(args)
-                    stop = {"training_iteration": args.stop_iters, training_run.STEPS: args.stop_timesteps}
-                    train = train_with_tune if name in TUNED else train_here
-                    checkpoint, steps = train(config, run, folder / "runs" / name, stop)
-                    bundle = training_run.export_and_run(
-                        checkpoint,
-                        folder / "policies" / name.replace(" ", "-"),
-                        env_id=run.env_id,
-                        env_config=run.env_config,
-                        episodes=0 if name.startswith(("Endless", "Crashing")) else 1,
-                    )
-                    found[name] = {"bundle": str(bundle), "steps": steps}
-                except training_run.RlservoError as error:
-                    found[name] = {"error": error.message}
-            found[name]["said"] = said.getvalue()
-    print(json.dumps(found))
+    for name, more in RUNS.items():
+        env = f"edge_environments:edge/{name.split()[0]}-v0"
+        common = ["--num-cpus", "0", "--name-env", env, "--stop-iters", "2", "--hidden", "16"]
+        if name.startswith("Crashing"):
+            common += ["--env-arg", f"log={folder / name.replace(' ', '_')}.txt"]
+        own = more if "DQN" in more else [*more, "--set", "train_batch_size_per_learner=300", "--set", "num_epochs=2"]
+        parser = simple_trainer.argument_parser()
+        args = parser.parse_args([*common, *own])
+        simple_trainer.check_arguments(parser, args)
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said):
+            try:
+                config, run, _ = simple_trainer.set_up(args)
+                stop = {"training_iteration": args.stop_iters, training_run.STEPS: args.stop_timesteps}
+                train = train_with_tune if name in TUNED else train_here
+                checkpoint, steps = train(config, run, folder / "runs" / name, stop)
+                bundle = training_run.export_and_run(
+                    checkpoint,
+                    folder / "policies" / name.replace(" ", "-"),
+                    env_id=run.env_id,
+                    env_config=run.env_config,
+                    episodes=0 if name.startswith(("Endless", "Crashing")) else 1,
+                )
+                found[name] = {"bundle": str(bundle), "steps": steps}
+            except training_run.RlservoError as error:
+                found[name] = {"error": error.message}
+        found[name]["said"] = said.getvalue()
+    Path("edges.json").write_text(json.dumps(found))
 
 
 def train_with_tune(config: Any, run: Any, storage: Path, stop: dict[str, float]) -> tuple[Path, int]:
@@ -93,9 +80,11 @@ def train_here(config: Any, run: Any, storage: Path, stop: dict[str, float]) -> 
     with training_run.stopping(training_run.build(config)) as algorithm:
         result = algorithm.train()
         while all(result[name] < limit for name, limit in stop.items()):
-            result = algorithm.train()
+            before, result = result, algorithm.train()
+            if result[training_run.STEPS] == before[training_run.STEPS]:  # the only runner is being made anew
+                time.sleep(0.2)
         return Path(algorithm.save_to_path(str(storage))), int(result[training_run.STEPS])
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main()

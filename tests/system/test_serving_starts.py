@@ -87,6 +87,7 @@ def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
         **cluster_environment(ray_folder),
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
         "RAY_TMPDIR": str(ray_folder),
+        "RAY_enable_worker_prestart": "0",  # a process for each core, beside those that Serve starts
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -204,46 +207,77 @@ def test_a_failed_export_leaves_earlier_versions_alone(
     assert load_bundle(first.path).contract == first.contract
 
 
-def test_the_users_own_code_is_found_in_the_app_dir_and_only_there(
-    zoo: Path, app: Path, tmp_path: Path, notices: list[str]
-) -> None:
-    # In a process of its own: here the module may have been imported by another test.
-    script = (
-        "import sys; from rlservo.export.commands.export import export_checkpoint\n"
-        "from rlservo.export.contract.errors import CheckpointError\n"
-        f"args = dict(notify=lambda s: None)\n"
-        f"try: export_checkpoint({str(zoo / 'user_module')!r}, {str(tmp_path)!r}, app_dir={str(tmp_path)!r}, **args)\n"
-        "except CheckpointError as error: print('refused:', error)\n"
-        f"before = list(sys.path)\n"
-        f"r = export_checkpoint({str(zoo / 'user_module')!r}, {str(tmp_path)!r}, app_dir={str(app)!r}, **args)\n"
-        "print('module:', r.contract.provenance.module_class, sys.path == before)\n"
-    )
-    done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    refused, exported = done.stdout.splitlines()
-    assert "the Python module 'zoo_parts'" in refused and str(tmp_path) in refused and "--app-dir" in refused
-    assert exported == "module: zoo_parts.UserModule True"
+# In a process of its own, of both API stacks: here other tests may have imported the user's modules, filled RLlib's
+# registry, or started a Ray. One process for all of it: to import RLlib takes longer than the exports.
+EXPORTS = """
+import json, subprocess, sys
+import gymnasium
+def refuse(*a, **k): raise AssertionError('started')
+subprocess.Popen.__init__ = refuse
+gymnasium.make = refuse
+from rlservo.export.commands.export import export_checkpoint
+from rlservo.export.contract.errors import CheckpointError
+zoo, old_zoo, app, empty = sys.argv[1:]
+# Whatever else comes before it on the import path, as a class of the checkpoint's may bring.
+def disturb(step): sys.path.insert(0, empty)
+def export(checkpoint, **how):
+    try:
+        result = export_checkpoint(checkpoint, empty + '/out', notify=lambda line: None, **how)
+    except CheckpointError as error:
+        return f'refused: {error}'
+    return f'module: {result.contract.provenance.module_class}'
+for checkpoint in (zoo + '/pendulum', old_zoo + '/sac'):
+    export(checkpoint)
+import ray, psutil
+found = {'started': [ray.is_initialized(), [p.name() for p in psutil.Process().children(recursive=True)]]}
+found['empty user_module'] = export(zoo + '/user_module', app_dir=empty)
+before = list(sys.path)
+found['app user_module'] = export(zoo + '/user_module', app_dir=app)
+found['same path'] = sys.path == before
+for name in ('user_model', 'named_model'):
+    for folder, path in (('empty', empty), ('app', app)):
+        found[f'{folder} {name}'] = export(old_zoo + '/' + name, app_dir=path, progress=disturb)
+print(json.dumps(found))
+"""
 
 
-def test_an_export_starts_no_ray_no_environment_and_no_process(zoo: Path, tmp_path: Path) -> None:
-    script = (
-        "import sys, threading, subprocess, gymnasium\n"
-        "def refuse(*a, **k): raise AssertionError('started')\n"
-        "subprocess.Popen.__init__ = refuse\n"
-        "gymnasium.make = refuse\n"
-        "from rlservo.export.commands.export import export_checkpoint\n"
-        f"r = export_checkpoint({str(zoo / 'pendulum')!r}, {str(tmp_path)!r}, notify=lambda s: None)\n"
-        "import ray, psutil\n"
-        "print(ray.is_initialized(), [p.name() for p in psutil.Process().children(recursive=True)])\n"
-    )
-    home = tmp_path / "home"
-    home.mkdir()
+@dataclass(frozen=True)
+class Process:
+    found: dict[str, Any]
+    empty: Path
+    home: Path
+
+
+@pytest.fixture(scope="module")
+def alone(zoo: Path, old_zoo: Path, app: Path, tmp_path_factory: pytest.TempPathFactory) -> Process:
+    """What EXPORTS found, and the folders that it had."""
+    home, empty = tmp_path_factory.mktemp("home"), tmp_path_factory.mktemp("empty")
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", script],
+        [sys.executable, "-W", "error", "-c", EXPORTS, *map(str, (zoo, old_zoo, app, empty))],
         capture_output=True, text=True, timeout=300, env={**os.environ, "HOME": str(home)},
     )  # fmt: skip
-    assert (done.returncode, done.stdout, done.stderr) == (0, "False []\n", "")
-    assert not (home / ".ray").exists()
+    assert (done.returncode, done.stderr) == (0, "")
+    return Process(json.loads(done.stdout), empty, home)
+
+
+def test_the_users_own_code_is_found_in_the_app_dir_and_only_there(alone: Process) -> None:
+    refused = alone.found["empty user_module"]
+    assert "the Python module 'zoo_parts'" in refused and str(alone.empty) in refused and "--app-dir" in refused
+    assert alone.found["app user_module"] == "module: zoo_parts.UserModule"
+    assert alone.found["same path"]
+
+
+def test_the_users_own_old_models_are_found_in_the_app_dir_and_only_there(alone: Process) -> None:
+    by_class, by_name = (alone.found[f"empty {name}"] for name in ("user_model", "named_model"))
+    assert "the Python module 'old_zoo_parts'" in by_class and str(alone.empty) in by_class and "--app-dir" in by_class
+    assert alone.found["app user_model"] == "module: old_zoo_parts.OldModel"
+    assert "'named_model'" in by_name and str(alone.empty) in by_name and "--app-dir" in by_name
+    assert alone.found["app named_model"] == "module: old_zoo_parts.OldNamedModel"
+
+
+def test_an_export_of_either_stack_starts_no_ray_no_environment_and_no_process(alone: Process) -> None:
+    assert alone.found["started"] == [False, []]
+    assert not (alone.home / ".ray").exists()
 
 
 @pytest.mark.parametrize(

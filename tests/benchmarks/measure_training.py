@@ -1,0 +1,16 @@
+"""Measure training for a moment, as benchmarks/training.py does; leaves its files. Runs in a Ray: `trainings.py`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+
+import training
+
+training.warm_up()
+rows = [training.measure("CartPole-v1", 1, 4, 1, 512, limit) for limit in (0.5, 200.0)]
+for row in rows:
+    print(training.line(row))
+training.write(rows, "CartPole-v1", 512, Path())

@@ -1,0 +1,129 @@
+"""Trainings, by the scripts that users run: one after the other in one process and one Ray.
+
+Starting a Ray and importing RLlib take longer than most of what is trained here, so only a test of the start itself
+starts its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from ctypes.util import find_library
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).resolve().parent
+EXAMPLES = HERE.parent / "examples"
+TINY = ("--set", "train_batch_size_per_learner=400", "--hidden", "16")
+# An env runner beside the driver, which waits while it samples.
+HALVES = ("num_cpus_per_env_runner", "num_cpus_for_main_process", "num_cpus_per_learner")
+ON_ONE_CORE = tuple(word for name in HALVES for word in ("--set", f"{name}=0.5"))
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a script ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+def command(script: str, *arguments: str) -> list[str]:
+    return [sys.executable, str(EXAMPLES / script), *arguments]
+
+
+def environment(home: Path) -> dict[str, str]:
+    """A home of its own shows what a script leaves there. Ray's workers would step back behind all else: nice 15."""
+    return {**os.environ, "HOME": str(home), "RAY_worker_niceness": "0"}
+
+
+def _inference(script: str, *more: str) -> tuple[str, ...]:
+    return (script, *more, "--stop-iters", "1", "--num-episodes-during-inference", "2", "--storage", "runs")
+
+
+def _again(name: str, *changes: str) -> tuple[str, ...]:
+    return ("train_shipped.py", name, *(word for change in changes for word in ("--set", change)))
+
+
+OFFSCREEN = bool(os.environ.get("DISPLAY") or find_library("EGL") or find_library("OSMesa"))
+IN_ONE_RAY = {
+    "ur": _inference("training_inference_ur.py"),
+    "mir": _inference("training_inference_mir.py", "--num-cpus", "1"),
+    "tour": ("tour.py", "--quick", *(() if OFFSCREEN else ("--no-video",))),
+    "again": _again(
+        "cartpole_dqn",
+        "stop.env_steps=400", "steps_per_iteration=300", "training.num_steps_sampled_before_learning_starts=200",
+    ),
+    "judged": _again(
+        "mir100_obstacle_avoidance",
+        "stop.env_steps=5000", "stop.episodes=3", "validation.above=0", "validation.episodes=2",
+        "training.train_batch_size_per_learner=2048", "training.num_epochs=1",
+    ),
+    "edges": (str(HERE / "examples" / "train_edges.py"),),
+    "benchmark": (str(HERE / "benchmarks" / "measure_training.py"),),
+}  # fmt: skip
+"""Scripts of `examples/`, or of the tests' own, by the name of the folder that they run in."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """How a script ended, in which folder, and what it left in the home folder."""
+
+    ended: Ended
+    folder: Path
+    home: frozenset[str]
+    videos: bool = OFFSCREEN  # whether there is an OpenGL library to make them with
+
+
+class OneRay:
+    """A process with a Ray of one core that runs scripts."""
+
+    def __init__(self, process: subprocess.Popen[str], folder: Path) -> None:
+        self._process = process
+        self._folder = folder
+
+    def run(self, name: str, *words: str) -> Trained:
+        """Run a script with these arguments in a new folder."""
+        process = self._process
+        assert process.stdin is not None and process.stdout is not None
+        process.stdin.write(json.dumps([str(self._folder / name), *words]) + "\n")
+        process.stdin.flush()
+        reply = process.stdout.readline()
+        assert reply, (self._folder / "errors.txt").read_text()[-5000:]
+        one = json.loads(reply)
+        return Trained(Ended(one["code"], one["out"], one["err"]), self._folder / name, frozenset(one["home"]))
+
+
+@pytest.fixture(scope="session")
+def one_ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OneRay]:
+    folder, home = tmp_path_factory.mktemp("one_ray"), tmp_path_factory.mktemp("home")
+    command = [sys.executable, "-W", "ignore", str(HERE / "train_in_one_ray.py")]
+    with (
+        (folder / "errors.txt").open("w") as errors,
+        subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment(home),
+            cwd=home,
+        ) as process,
+    ):  # fmt: skip
+        try:
+            yield OneRay(process, folder)
+        finally:
+            assert process.stdin is not None
+            process.stdin.close()  # the last request: it ends, and its Ray with it
+            try:
+                process.wait(200)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+@pytest.fixture(scope="session")
+def trained(one_ray: OneRay) -> Callable[[str], Trained]:
+    """Return a function that runs a script of IN_ONE_RAY, once a session."""
+    return cache(lambda name: one_ray.run(name, *IN_ONE_RAY[name]))
