@@ -28,8 +28,7 @@ ENV = "rlservo/EndEffectorPositioningURSim-v0"
 ABREAST = 64  # episodes that run side by side
 VARIANTS = {  # mean moved by so many standard deviations, log of the standard deviation moved by
     "the recorded policy": (0.0, 0.0),
-    "mean moved by 0.02 of the spread": (0.02, 0.0),
-    "mean moved by 0.05 of the spread": (0.05, 0.0),
+    "mean moved by 0.03 of the spread": (0.03, 0.0),
     "spread 2% smaller": (0.0, -0.02),
     "mean moved by 0.3 of the spread": (0.3, 0.0),
 }
@@ -90,9 +89,9 @@ def run_episodes(policy: Policy, variant: tuple[float, float], episodes: int, fi
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("bundle", type=Path)
-    parser.add_argument("--episodes", type=int, default=300, help="in each recording")
+    parser.add_argument("--episodes", type=int, default=400, help="in each recording")
     parser.add_argument("--repetitions", type=int, default=100)
-    parser.add_argument("--truth", type=int, default=2000, help="episodes for each candidate's true return")
+    parser.add_argument("--truth", type=int, default=4000, help="episodes for each candidate's true return")
     arguments = parser.parse_args()
     candidates = [Candidate(name, linear(0.0), False) for name in VARIANTS]
     with Policy.load(arguments.bundle) as policy:

@@ -26,7 +26,6 @@ LARGEST = 5_000_000  # numbers in one matrix of episodes by steps
 RESAMPLES = 1000
 CONFIDENCE = 0.95
 FEWEST_EPISODES = 30
-EPISODES_PER_SKEWNESS = 3.0  # times its square: fewer, and a bootstrap does not know how rare the rare ones are
 SMALLEST_SHARE = 0.5  # of effective episodes; below it the intervals miss the truth too often (docs/recording.md)
 
 
@@ -156,6 +155,10 @@ def importance_sampling(trajectories: list[Trajectory], gamma: float, rng: np.ra
     effective = float(final.sum()) ** 2 / squares if squares > 0 else 0.0
 
     counts = rng.multinomial(len(trajectories), np.full(len(trajectories), 1 / len(trajectories)), RESAMPLES)
+    # The worst and the best episode are there once more: a bootstrap is too sure of how rare the rare ones are.
+    returns = earned.sum(axis=1)
+    counts[:, int(np.argmin(returns))] += 1
+    counts[:, int(np.argmax(returns))] += 1
     numerators, denominators = counts @ discounted, counts @ weights
     with np.errstate(invalid="ignore", divide="ignore"):
         resampled = np.nan_to_num(numerators / denominators).sum(axis=1)
@@ -163,7 +166,7 @@ def importance_sampling(trajectories: list[Trajectory], gamma: float, rng: np.ra
     plain = discounted.sum(axis=1)
     # A few heavy weights make a bootstrap too sure of itself: measured, this much wider covers (docs/recording.md).
     wider = float(np.sqrt(len(trajectories) / effective)) if effective > 0 else 1.0
-    supported, reason = _support(earned.sum(axis=1), effective)
+    supported, reason = _support(len(trajectories), effective)
     return [
         Estimate(
             "weighted per-decision importance sampling",
@@ -176,7 +179,7 @@ def importance_sampling(trajectories: list[Trajectory], gamma: float, rng: np.ra
         Estimate(
             "per-decision importance sampling",
             float(plain.mean()),
-            _interval(plain.mean() + wider * (_resampled_means(plain, rng) - plain.mean())),
+            _interval(plain.mean() + wider * (counts @ plain / counts.sum(axis=1) - plain.mean())),
             effective,
             supported,
             reason,
@@ -184,8 +187,7 @@ def importance_sampling(trajectories: list[Trajectory], gamma: float, rng: np.ra
     ]
 
 
-def _support(returns: NDArray[np.float64], effective: float) -> tuple[bool, str]:
-    episodes = len(returns)
+def _support(episodes: int, effective: float) -> tuple[bool, str]:
     if episodes < FEWEST_EPISODES:
         return False, f"{episodes} episodes are too few: at least {FEWEST_EPISODES} are needed"
     if effective < SMALLEST_SHARE * episodes:
@@ -193,21 +195,10 @@ def _support(returns: NDArray[np.float64], effective: float) -> tuple[bool, str]
             f"the bundle acts too differently from what was recorded: {episodes} episodes tell as much as "
             f"{effective:.1f} of its own, and {SMALLEST_SHARE * episodes:.0f} are needed"
         )
-    needed = EPISODES_PER_SKEWNESS * _skewness(returns) ** 2
-    if episodes < needed:
-        return False, (
-            f"a few episodes ended unlike all others, and {episodes} episodes are too few to tell how often that "
-            f"happens: about {needed:.0f} are needed"
-        )
     return True, (
         f"{episodes} episodes tell as much as {effective:.0f} of the bundle's own; what happens in fewer than one of "
         f"{max(1, episodes // 3)} may be missing"
     )
-
-
-def _skewness(values: NDArray[np.float64]) -> float:
-    spread = float(values.std())
-    return float(((values - values.mean()) ** 3).mean()) / spread**3 if spread > 1e-9 * np.abs(values).max() else 0.0
 
 
 def fitted_estimate(trajectories: list[Trajectory], gamma: float, rng: np.random.Generator) -> Estimate:
