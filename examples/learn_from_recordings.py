@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import shared.ray_settings as ray_settings  # before Ray  # isort: skip
+import numpy as np
 import shared.recorded_episodes as recorded_episodes
 import shared.search_space as search_space
 import shared.training_run as training_run
@@ -33,7 +34,7 @@ from ray.rllib.core.rl_module.rl_module import RLModule, RLModuleSpec
 from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from shared.help_text import DefaultsFormatter
-from shared.recorded_episodes import Recorded, RecordedEpisodes
+from shared.recorded_episodes import Choice, Recorded, RecordedEpisodes
 from shared.training_run import UsageError
 
 from rlservo.export.checkpoints.location import (
@@ -43,6 +44,7 @@ from rlservo.export.checkpoints.location import (
     CheckpointFiles,
     locate_checkpoint,
 )
+from rlservo.export.rllib import private_names
 from rlservo.serve_app.recording.conversion import gym_space
 from rlservo.serve_app.recording.reader import Recording
 
@@ -70,6 +72,15 @@ def argument_parser() -> argparse.ArgumentParser:
     parser.add_argument("--run", choices=ALGORITHMS, default="MARWIL", help="RLlib's algorithm")
     parser.add_argument("--from", type=Path, dest="start", metavar="CHECKPOINT", help="checkpoint to go on from")
     parser.add_argument("--out", type=Path, required=True, help="new folder for the checkpoint")
+    parser.add_argument("--status", help="learn only from episodes with this final status, say success")
+    parser.add_argument(
+        "--modes", action="store_true",
+        help="where the recorded policy explored, learn its most likely actions in place of those it drew (BC)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--ahead", type=int, default=0,
+        help="learn for each observation the action of so many control cycles later (BC): the robot's latency",
+    )  # fmt: skip
     parser.add_argument("--epochs", type=int, default=20, help="passes over the recordings")
     parser.add_argument("--batch-size", type=int, default=1024, help="decisions in a minibatch")
     parser.add_argument(
@@ -103,7 +114,9 @@ def start_from(checkpoint: Path) -> Start:
 
 def start_anew(config: AlgorithmConfig, recorded: Recorded, with_filter: bool) -> Start:
     """Return RLlib's connectors around the recorded spaces; the filter's statistics are the recordings'."""
-    observations, actions = (gym_space(one) for one in (recorded.contract.observation_space, recorded.contract.action_space))
+    observations, actions = (
+        gym_space(one) for one in (recorded.contract.observation_space, recorded.contract.action_space)
+    )
     spaces = (observations, actions)
     wide = len(observations.shape or ()) != 1
 
@@ -135,7 +148,9 @@ def module_spec(config: AlgorithmConfig, start: Start, longest: int) -> tuple[RL
         return None, f"a new network: {type(module).__name__} is none of this algorithm's"
     spec = RLModuleSpec.from_module(module)
     spec.inference_only = False
-    settings = asdict(cast(Any, spec.model_config)) if is_dataclass(spec.model_config) else dict(spec.model_config or {})
+    settings = (
+        asdict(cast(Any, spec.model_config)) if is_dataclass(spec.model_config) else dict(spec.model_config or {})
+    )
     if module.is_stateful():
         settings["max_seq_len"] = longest
     if not actor_critic:  # the learner's own class has more heads than SAC's; those begin anew
@@ -159,8 +174,21 @@ def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmCo
         # An iteration is a pass; more than one minibatch, or RLlib asks for batches another way.
         dataset_num_iters_per_learner=max(2, round(recorded.decisions / args.batch_size)),
     )
-    start = start_from(args.start) if args.start else start_anew(
-        config, recorded, args.observation_filter == "MeanStdFilter"
+    if args.run == "CQL":  # ray 2.60: its own default is refused by its own check, and it asks for an environment
+        cast(Any, config).lr = None
+        private_names.replace(config, "_is_online", False)
+    if args.run == "MARWIL":
+        # RLlib's 100 never changes at its rate of 1e-8: advantages of a hundredth are then no advantages, and those of
+        # a thousand overflow. The variance of returns is their scale until the value function has learned.
+        returns = [episode.get_return() for episode in recorded.episodes]
+        cast(Any, config).training(
+            moving_average_sqd_adv_norm_start=float(np.var(returns)) or 1.0,
+            moving_average_sqd_adv_norm_update_rate=0.01,
+        )
+    start = (
+        start_from(args.start)
+        if args.start
+        else start_anew(config, recorded, args.observation_filter == "MeanStdFilter")
     )
     action_space = start.module_to_env.input_action_space or gym_space(recorded.contract.action_space)
     config.environment(observation_space=start.env_to_module.observation_space, action_space=action_space)
@@ -215,17 +243,25 @@ def main() -> None:
         raise UsageError(f"--out {args.out} exists: give a new folder")
     if args.epochs < 1 or args.batch_size < 1:
         raise UsageError(f"--epochs is {args.epochs} and --batch-size {args.batch_size}: expected at least 1")
+    if args.run != "BC" and (args.modes or args.ahead):
+        raise UsageError("--modes and --ahead are BC's: rewards and values belong to the actions that were executed")
+    if args.ahead < 0:
+        raise UsageError(f"--ahead is {args.ahead}: expected 0 or more control cycles")
     training_run.pickle_by_value(sys.modules[__name__], recorded_episodes)
     torch.set_num_threads(1)
-    recorded = recorded_episodes.read_recordings(
-        Recording(args.recordings), name=args.policy, rewards=args.run != "BC"
-    )
+    choice = Choice(rewards=args.run != "BC", status=args.status, modes=args.modes, ahead=args.ahead)
+    recorded = recorded_episodes.read_recordings(Recording(args.recordings), choice, name=args.policy)
     report(recorded)
     with training_run.ray_session(num_cpus=1):
         config, start, sentence = configure(args, recorded)
         print(f"{args.run} from {sentence}", flush=True)
-        learn(config, recorded_episodes.through_connectors(recorded.episodes, start.env_to_module), args.epochs,
-              args.out, start)
+        learn(
+            config,
+            recorded_episodes.through_connectors(recorded.episodes, start.env_to_module),
+            args.epochs,
+            args.out,
+            start,
+        )
     print(f"checkpoint: {args.out}\nnext: rlservo export {args.out} --out policies --name {recorded.contract.name}")
 
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
+import shared.ray_settings as ray_settings  # before Ray  # isort: skip
 import numpy as np
 import torch
 from ray.rllib.core.columns import Columns
@@ -26,9 +27,10 @@ from rlservo.export.rllib import private_names
 from rlservo.export.rllib.new_connectors import PLUMBING
 from rlservo.serve_app.recording.conversion import episodes_of_one
 from rlservo.serve_app.recording.episodes import Episode
-from rlservo.serve_app.recording.own_actions import own_actions
+from rlservo.serve_app.recording.own_actions import OwnActions, modes, own_actions
 from rlservo.serve_app.recording.reader import Recording
 
+assert ray_settings
 AT_ONCE = 256  # episodes in a pipeline's pass, and of which minibatches are drawn
 CANNOT_LEARN = ("FrameStacking",)
 """Pieces that put nothing into the episode: a learner would need a second one of its own."""
@@ -59,17 +61,33 @@ class Recorded:
         return float(np.mean([episode.get_return() for episode in self.episodes]))
 
 
-def read_recordings(recording: Recording, *, name: str | None = None, rewards: bool = True) -> Recorded:
-    """Return every whole episode of one policy; without `rewards` also those that lack some.
+@dataclass(frozen=True)
+class Choice:
+    """Which episodes are learned from, and what of them is learned."""
+
+    rewards: bool = True
+    """Whether the learner needs rewards, and the observation after an episode that was cut off."""
+    status: str | None = None
+    """Only episodes that ended so."""
+    modes: bool = False
+    """Whether the most likely action of a recorded distribution is learned, not the one that was drawn."""
+    ahead: int = 0
+    """Learn for an observation what was done so many cycles later."""
+
+
+def read_recordings(recording: Recording, choice: Choice | None = None, *, name: str | None = None) -> Recorded:
+    """Return the whole episodes of one policy that can be learned from.
 
     Raises UsageError where none can be used, and RecordingError.
     """
+    chosen = choice or Choice()
     recorded: Recorded | None = None
     for episode in episodes_of_one(recording, name):
         recorded = recorded or Recorded(episode.policy.contract)
-        reason = _why_not(episode, rewards)
+        own = modes(episode) if chosen.modes else own_actions(episode)
+        reason = _why_not(episode, own, chosen)
         if reason is None:
-            _add(recorded, episode)
+            _add(recorded, episode, own, chosen.ahead)
         else:
             recorded.not_used[reason] = recorded.not_used.get(reason, 0) + 1
     assert recorded is not None, "episodes_of_one raises where there are none"
@@ -79,29 +97,31 @@ def read_recordings(recording: Recording, *, name: str | None = None, rewards: b
     return recorded
 
 
-def _why_not(episode: Episode, rewards: bool) -> str | None:
+def _why_not(episode: Episode, own: OwnActions, choice: Choice) -> str | None:
     if not episode.id or not episode.begins or episode.gap is not None:
         return "without their beginning or with a gap"
     if episode.goes_on:
         return "too long to be read in one piece"
     if not episode.ended:
         return "without an end"
-    if not (episode.acted | episode.fell_back).all():
-        return "in which the robot was not always commanded something known"
-    if rewards and not np.isfinite(episode.reward).all():
+    if choice.status is not None and episode.final_status != choice.status:
+        return f"that did not end in {choice.status!r}"
+    if not own.known.all():
+        return "in which the module's own actions are not all known"
+    if choice.rewards and not np.isfinite(episode.reward).all():
         return "without every reward"
-    if rewards and not episode.terminated and episode.final_obs is None:
+    if choice.rewards and not episode.terminated and episode.final_obs is None:
         return "cut off, without the observation after the last action"
     return None
 
 
-def _add(recorded: Recorded, episode: Episode) -> None:
+def _add(recorded: Recorded, episode: Episode, own: OwnActions, ahead: int) -> None:
     contract = episode.policy.contract
-    own = own_actions(episode)
     recorded.own += int(own.recorded.sum())
     recorded.inverted += int((~own.recorded).sum())
     recorded.clipped += int(own.clipped.sum())
     rows = range(len(episode))
+    later = [min(row + ahead, len(episode) - 1) for row in rows]
     final = episode.final_obs
     seen = [_row(contract.observation_space, episode.obs, row, "obs") for row in rows]
     # The value of what follows a terminated episode is 0, whatever it looks like.
@@ -110,7 +130,7 @@ def _add(recorded: Recorded, episode: Episode) -> None:
         SingleAgentEpisode(
             id_=f"{len(recorded.episodes)}",  # RLlib numbers episodes with "_" behind their ids
             observations=seen,
-            actions=[_row(contract.action_space, own.leaves, row, "action") for row in rows],
+            actions=[_row(contract.action_space, own.leaves, row, "action") for row in later],
             rewards=[float(reward) for reward in np.nan_to_num(episode.reward)],
             infos=[{} for _ in seen],
             terminated=episode.terminated,
@@ -179,10 +199,10 @@ class RecordedEpisodes(OfflineData):
 
     def sample(
         self,
-        num_samples: int,  # noqa: ARG002 (RLlib's signature)
+        num_samples: int,
         return_iterator: bool = False,
         num_shards: int = 1,
-        module_state: Any = None,  # noqa: ARG002
+        module_state: Any = None,
     ) -> Any:
         """Return what the one learner in this process iterates over."""
         assert return_iterator, "dataset_num_iters_per_learner is more than 1"

@@ -25,6 +25,12 @@ def transform_of(contract: Contract) -> Transform:
     return "unsquash" if "unsquash" in steps else "clip" if "clip" in steps else "none"
 
 
+def is_invertible(contract: Contract) -> bool:
+    """Return whether own actions can be told from sent ones: not where a connector of the user's own changes them."""
+    steps = [step.step for step in contract.baked_in]
+    return "user_connector" not in steps[steps.index("mode") :] if "mode" in steps else True
+
+
 def to_sent(own: NDArray[Any], transform: Transform, leaf: LeafSpec) -> NDArray[Any]:
     """Return the actions that are sent for own ones, both `[rows, *leaf.shape]`, of float64 for a Box."""
     if not isinstance(leaf, BoxSpec):
