@@ -24,6 +24,7 @@ TOGETHER = {
     "tests/system/test_served_policies.py": "shipped server",
     "tests/system/test_cluster_check.py": "cluster",
     "tests/system/test_policies_under_load.py": "cluster",
+    "tests/examples/test_learn_from_recordings.py": "one Ray",
     "tests/examples/test_shipped_policies.py": "one Ray",
     "tests/examples/test_tour.py": "one Ray",
     "tests/examples/test_training_scripts.py": "one Ray",

@@ -138,8 +138,11 @@ class Trained:
 
 
 @pytest.fixture(scope="session")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Trained]]:
-    """Return a function that runs a script of IN_ONE_RAY once; all of them share a process and a Ray."""
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Trained]]:
+    """Return a function that runs a script once, by its name in IN_ONE_RAY or by a new name and its words.
+
+    All of them share a process and a Ray.
+    """
     folder, home = tmp_path_factory.mktemp("one_ray"), tmp_path_factory.mktemp("home")
     command = [sys.executable, "-W", "ignore", str(HERE / "train_in_one_ray.py")]
     with (
@@ -151,9 +154,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str]
     ):  # fmt: skip
 
         @cache
-        def train(name: str) -> Trained:
+        def train(name: str, *words: str) -> Trained:
             assert process.stdin is not None and process.stdout is not None
-            process.stdin.write(json.dumps([str(folder / name), *IN_ONE_RAY[name]]) + "\n")
+            process.stdin.write(json.dumps([str(folder / name), *(words or IN_ONE_RAY[name])]) + "\n")
             process.stdin.flush()
             reply = process.stdout.readline()
             assert reply, (folder / "errors.txt").read_text()[-5000:]
