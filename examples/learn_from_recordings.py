@@ -191,7 +191,13 @@ def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmCo
         else start_anew(config, recorded, args.observation_filter == "MeanStdFilter")
     )
     action_space = start.module_to_env.input_action_space or gym_space(recorded.contract.action_space)
-    config.environment(observation_space=start.env_to_module.observation_space, action_space=action_space)
+    origin = recorded.contract.provenance  # nothing is made of the environment: an export names its elements by it
+    config.environment(
+        env=origin.env_id,
+        env_config=dict(origin.env_config),
+        observation_space=start.env_to_module.observation_space,
+        action_space=action_space,
+    )
     longest = max(map(len, recorded.episodes)) + 1  # RLlib puts a step behind each, for the value of what follows
     spec, sentence = module_spec(config, start, longest)
     if spec is not None:
@@ -233,7 +239,8 @@ def report(recorded: Recorded) -> None:
         print(f"not used: {count} episodes {reason}")
     print(
         f"own actions: {recorded.own} recorded, {recorded.inverted} computed from what was executed, of which "
-        f"{recorded.clipped} at a bound (the true ones may lie beyond it)"
+        f"{recorded.clipped} at a bound (the true ones may lie beyond it)",
+        flush=True,
     )
 
 
