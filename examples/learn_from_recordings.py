@@ -35,7 +35,6 @@ from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from shared.help_text import DefaultsFormatter
 from shared.recorded_episodes import Choice, Recorded, RecordedEpisodes
-from shared.training_run import UsageError
 
 from rlservo.export.checkpoints.location import (
     ENV_TO_MODULE,
@@ -44,6 +43,7 @@ from rlservo.export.checkpoints.location import (
     CheckpointFiles,
     locate_checkpoint,
 )
+from rlservo.export.contract.errors import UsageError
 from rlservo.export.rllib import private_names
 from rlservo.serve_app.recording.conversion import gym_space
 from rlservo.serve_app.recording.reader import Recording
@@ -107,7 +107,7 @@ def start_from(checkpoint: Path) -> Start:
     return Start(
         EnvToModulePipeline.from_checkpoint(str(files.env_to_module)),
         ModuleToEnvPipeline.from_checkpoint(str(files.module_to_env)),
-        cast(RLModule, RLModule.from_checkpoint(str(files.module))),
+        RLModule.from_checkpoint(str(files.module)),
         files.module,
     )
 
@@ -169,7 +169,7 @@ def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmCo
     config.debugging(seed=args.seed, log_level="ERROR")
     config.training(train_batch_size_per_learner=args.batch_size)
     config.offline_data(
-        input_=[str(path) for path in args.recordings],
+        input_=cast(Any, [str(path) for path in args.recordings]),  # RLlib takes a list, its annotation does not
         offline_data_class=RecordedEpisodes,
         # An iteration is a pass; more than one minibatch, or RLlib asks for batches another way.
         dataset_num_iters_per_learner=max(2, round(recorded.decisions / args.batch_size)),

@@ -193,7 +193,7 @@ class RecordedEpisodes(OfflineData):
         self.config = config
         self.episodes: list[SingleAgentEpisode] = []
         self.iter_batches_kwargs: dict[str, Any] = {}
-        self.learner_handles: list[Any] = []  # these four are set by the algorithm
+        self.learner_handles: Any = []  # these four are set by the algorithm
         self.locality_hints = self.module_spec = self.spaces = None
         self._rng = np.random.default_rng(config.seed)
 

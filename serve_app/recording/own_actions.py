@@ -29,7 +29,7 @@ class OwnActions:
     known: NDArray[np.bool_]
     """Rows whose own action is known; the others hold some number."""
     recorded: NDArray[np.bool_]
-    """Rows whose own action was recorded; those that are known beside them are computed."""
+    """Rows whose own action, or its distribution, was recorded; those that are known beside them are computed."""
     clipped: NDArray[np.bool_]
     """Rows whose own action is computed and lies at the bound or anywhere beyond it: the bound stands for it."""
 
@@ -79,7 +79,7 @@ def modes(episode: Episode) -> OwnActions:
         shape = (-1, *[1] * (before.ndim - 1))
         leaves[name] = np.where(drawn.reshape(shape), mode.reshape(before.shape).astype(before.dtype), before)
     known = own.known & ~episode.fell_back
-    return OwnActions(leaves, known, own.recorded & ~drawn, own.clipped & ~drawn)
+    return OwnActions(leaves, known, own.recorded | drawn, own.clipped & ~drawn)
 
 
 def _is_sent_as(sent: NDArray[Any], executed: NDArray[Any], leaf: LeafSpec) -> NDArray[np.bool_]:

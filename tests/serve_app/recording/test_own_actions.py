@@ -120,6 +120,7 @@ def test_a_recorded_own_action_is_kept_beyond_the_bound(ur5: Path, tmp_path: Pat
     assert own.leaves["action"].tobytes() == episode.own_action["action"].tobytes()
     assert (np.abs(own.leaves["action"]) > 1.0).any()
     mode = modes(episode)
+    assert mode.recorded.all()
     np.testing.assert_array_equal(mode.leaves["action"], episode.dist_inputs[:, :6])
 
 
