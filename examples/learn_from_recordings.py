@@ -12,7 +12,6 @@ filter: of the recorded observations. docs/learning.md has the whole path.
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ import shared.recorded_episodes as recorded_episodes
 import shared.search_space as search_space
 import shared.training_run as training_run
 import torch
+from gymnasium.spaces import Box
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.algorithms.sac.default_sac_rl_module import DefaultSACRLModule
 from ray.rllib.connectors.env_to_module import EnvToModulePipeline, FlattenObservations, MeanStdFilter
@@ -50,7 +50,6 @@ from rlservo.serve_app.recording.reader import Recording
 
 assert ray_settings
 ALGORITHMS = ("BC", "MARWIL", "CQL", "IQL")
-MODULE_TO_ENV_SETTINGS = ("normalize_actions", "clip_actions")
 
 
 @dataclass(frozen=True)
@@ -97,19 +96,28 @@ def argument_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def start_from(checkpoint: Path) -> Start:
-    """Return a checkpoint's connectors and module. Raises CheckpointError, and UsageError for what has none."""
+def start_from(checkpoint: Path, recorded: Recorded) -> Start:
+    """Return a checkpoint's connectors and module.
+
+    Raises CheckpointError, and UsageError for one without connectors or with other observations or actions.
+    """
     files = locate_checkpoint(checkpoint)
     if not isinstance(files, CheckpointFiles) or not files.has_pipelines or files.is_one_of_several:
         raise UsageError(
             f"--from {checkpoint}: expected a checkpoint of RLlib's new API stack, of one agent, with its connectors"
         )
-    return Start(
-        EnvToModulePipeline.from_checkpoint(str(files.env_to_module)),
-        ModuleToEnvPipeline.from_checkpoint(str(files.module_to_env)),
-        RLModule.from_checkpoint(str(files.module)),
-        files.module,
-    )
+    env_to_module = EnvToModulePipeline.from_checkpoint(str(files.env_to_module))
+    module_to_env = ModuleToEnvPipeline.from_checkpoint(str(files.module_to_env))
+    seen, done = gym_space(recorded.contract.observation_space), gym_space(recorded.contract.action_space)
+    ours = env_to_module.input_observation_space
+    alike = ours == seen or (isinstance(ours, Box) and isinstance(seen, Box) and ours.shape == seen.shape)
+    if not alike:
+        raise UsageError(f"--from {checkpoint}: it observes {ours}, and recorded is {seen}")
+    if module_to_env.input_action_space != done:
+        raise UsageError(
+            f"--from {checkpoint}: its actions are {module_to_env.input_action_space}, recorded are {done}"
+        )
+    return Start(env_to_module, module_to_env, RLModule.from_checkpoint(str(files.module)), files.module)
 
 
 def start_anew(config: AlgorithmConfig, recorded: Recorded, with_filter: bool) -> Start:
@@ -186,7 +194,7 @@ def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmCo
             moving_average_sqd_adv_norm_update_rate=0.01,
         )
     start = (
-        start_from(args.start)
+        start_from(args.start, recorded)
         if args.start
         else start_anew(config, recorded, args.observation_filter == "MeanStdFilter")
     )
@@ -224,7 +232,6 @@ def learn(config: AlgorithmConfig, episodes: list[SingleAgentEpisode], epochs: i
         algorithm.save_to_path(str(folder.resolve()))
     # An offline algorithm has no environment runner, and so none of what stands around its module.
     runner = folder.resolve() / RUNNERS[0]
-    shutil.rmtree(runner, ignore_errors=True)  # of CQL, whose configuration says it has one
     for pipeline, name in ((start.env_to_module, ENV_TO_MODULE), (start.module_to_env, MODULE_TO_ENV)):
         pipeline.save_to_path(str(runner / name), state=pipeline.get_state())  # else it misses pieces without a state
 

@@ -152,6 +152,7 @@ def test_q_learners_go_on_from_sac(algorithm: str, trained: Callable[..., Any], 
         (("--run", "BC", "--out", "."), "--out . exists"),
         (("--run", "BC", "--epochs", "0"), "--epochs is 0"),
         (("--run", "BC", "--from", "nowhere"), "nowhere does not exist"),
+        (("--run", "BC", "--from", str(UR5)), "its actions are Box(-1.0, 1.0, (5,), float32), recorded are Box("),
     ],
 )
 def test_wrong_arguments_are_refused_in_a_sentence(
