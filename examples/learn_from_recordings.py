@@ -218,6 +218,8 @@ def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmCo
     changes = {name: values[0] for name, values in search_space.parse_settings(args.set, "--set").items()}
     search_space.apply(config, changes, "--set")
     search_space.validate(config)
+    if cast(Any, config).num_learners:
+        raise UsageError("--set num_learners: recordings are learned from in this process, by one learner")
     return config, start, sentence
 
 

@@ -85,7 +85,7 @@ def test_marwil_values_whole_episodes(trained: Callable[..., Any], shipped: Path
 def value_errors(graph: onnxruntime.InferenceSession, episode: Episode, gamma: float) -> list[float]:
     assert episode.final_obs is not None
     seen = np.concatenate([episode.obs["obs"], episode.final_obs["obs"]])
-    *values, after = graph.run(["value"], {"obs": seen})[0].reshape(-1)
+    *values, after = np.asarray(graph.run(["value"], {"obs": seen})[0]).reshape(-1)
     rest = 0.0 if episode.terminated else float(after)
     errors = []
     for value, reward in zip(reversed(values), reversed(episode.reward), strict=True):
@@ -122,7 +122,8 @@ def test_a_new_network_learns_ahead_of_the_latency(trained: Callable[..., Any], 
     assert last < first - 0.5
     bundle = export_checkpoint(done.folder / "learned", tmp_path, name="ur5", notify=lambda line: None)
     baked = {step.step: step.values for step in bundle.contract.baked_in}
-    seen = np.concatenate([one.obs["obs"] for one in recorded[:2]] + [one.final_obs["obs"] for one in recorded[:2]])
+    ends = [one.final_obs["obs"] for one in recorded[:2] if one.final_obs is not None]
+    seen = np.concatenate([one.obs["obs"] for one in recorded[:2]] + ends)
     np.testing.assert_allclose(baked["mean_std_filter"]["mean"], seen.mean(axis=0), atol=1e-5)
     assert baked["mean_std_filter"]["count"] == 502
 
@@ -151,6 +152,7 @@ def test_q_learners_go_on_from_sac(algorithm: str, trained: Callable[..., Any], 
         (("--run", "BC", "--status", "happy"), "no recorded episode can be learned from: 3 that did not end in"),
         (("--run", "BC", "--out", "."), "--out . exists"),
         (("--run", "BC", "--epochs", "0"), "--epochs is 0"),
+        (("--run", "BC", "--set", "num_learners=1"), "--set num_learners: recordings are learned from in this process"),
         (("--run", "BC", "--from", "nowhere"), "nowhere does not exist"),
         (("--run", "BC", "--from", str(UR5)), "its actions are Box(-1.0, 1.0, (5,), float32), recorded are Box("),
     ],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -25,7 +25,7 @@ ROWS = 2000
 
 def box(low: Any, high: Any, dtype: str = "float32") -> BoxSpec:
     bounds = [tuple(None if np.isinf(x) else float(np.dtype(dtype).type(x)) for x in side) for side in (low, high)]
-    return BoxSpec(shape=(len(low),), dtype=dtype, low=bounds[0], high=bounds[1])
+    return BoxSpec(shape=(len(low),), dtype=dtype, low=bounds[0], high=bounds[1], elements=())
 
 
 def send_by_rllib(own: np.ndarray[Any, Any], transform: Transform, leaf: BoxSpec) -> np.ndarray[Any, Any]:
@@ -42,7 +42,11 @@ def send_by_rllib(own: np.ndarray[Any, Any], transform: Transform, leaf: BoxSpec
     )
     episode = SingleAgentEpisode(id_="0")
     batch = connector(
-        rl_module=None, batch={Columns.ACTIONS: {("0",): list(own)}}, episodes=[episode], explore=False, shared_data={}
+        rl_module=cast(Any, None),
+        batch={Columns.ACTIONS: {("0",): list(own)}},
+        episodes=[episode],
+        explore=False,
+        shared_data={},
     )
     return np.stack(batch.get(Columns.ACTIONS_FOR_ENV, batch[Columns.ACTIONS])[("0",)])
 
@@ -93,7 +97,7 @@ def test_own_actions_come_back_from_what_rllib_sends(leaf: BoxSpec, transform: T
 )
 def test_choices_are_counted_from_zero(leaf: LeafSpec) -> None:
     low, high = leaf.bounds()
-    sent = np.random.default_rng(0).integers(low, high + 1, (50, *leaf.shape))
+    sent = np.random.default_rng(0).integers(low.astype(int), high.astype(int) + 1, (50, *leaf.shape))
     back, clipped = to_own(sent, "unsquash", leaf)
     assert (back == sent - low).all()
     assert not clipped.any()
@@ -146,7 +150,7 @@ def test_actions_that_own_connectors_change_are_not_known(ur5: Path, tmp_path: P
     episode = record(Policy.load(ur5), tmp_path / "run.mcap", explore=False)
     assert own_actions(episode).known.all()
     contract = episode.policy.contract
-    steps = (*contract.baked_in, BakedStep(step="mode"), BakedStep(step="user_connector"))
+    steps = (*contract.baked_in, BakedStep(step="mode", detail=""), BakedStep(step="user_connector", detail=""))
     episode.policy.contract = contract.model_copy(update={"baked_in": steps})
     assert not own_actions(episode).known.any()
 
