@@ -229,7 +229,7 @@ def learn(config: AlgorithmConfig, episodes: list[SingleAgentEpisode], epochs: i
         algorithm.offline_data.episodes = episodes
         for epoch in range(epochs):
             results = algorithm.train()["learners"]["default_policy"]
-            losses = "  ".join(f"{name} {float(results[name]):.4g}" for name in sorted(results) if "loss" in name)
+            losses = "  ".join(f"{name} {float(results[name]):.6g}" for name in sorted(results) if "loss" in name)
             print(f"pass {epoch + 1:>3} of {epochs}  {losses}", flush=True)
         algorithm.save_to_path(str(folder.resolve()))
     # An offline algorithm has no environment runner, and so none of what stands around its module.

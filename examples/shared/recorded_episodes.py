@@ -226,7 +226,7 @@ class RecordedEpisodes(OfflineData):
             rows = len(next(iter(columns.values())))
             states = [name for name in columns if Columns.STATE_IN in name]
             length = next(leaf.shape[1] for name, leaf in columns.items() if Columns.REWARDS in name) if states else 1
-            parts = max(1, round(rows * length / batch_size))
+            parts = min(rows, max(1, round(rows * length / batch_size)))
             for chosen in np.array_split(self._rng.permutation(rows), parts):
                 yield {name: leaf[torch.as_tensor(chosen)] for name, leaf in columns.items()}
 
