@@ -127,6 +127,29 @@ class DomainRandomization(gym.Wrapper[Array, Array, Array, Array]):
         return noise
 
 
+def make_randomized(
+    *,
+    env_id: str,
+    action_latency: tuple[int, int] = (0, 0),
+    observation_latency: tuple[int, int] = (0, 0),
+    observation_noise: float | Sequence[float] | Mapping[str, float] = 0.0,
+    payload: Range = (0.0, 0.0),
+    **arguments: Any,
+) -> DomainRandomization:
+    """Make `env_id` with `arguments` and wrap it: `rlservo/Randomized-v0`, for programs that make environments by id.
+
+    Raises what `gymnasium.make` and `DomainRandomization` raise.
+    """
+    env: gym.Env[Array, Array] = gym.make(env_id, disable_env_checker=True, **arguments)
+    return DomainRandomization(
+        env,
+        action_latency=action_latency,
+        observation_latency=observation_latency,
+        observation_noise=observation_noise,
+        payload=payload,
+    )
+
+
 def _range(name: str, value: Range) -> Range:
     low, high = value
     if not (math.isfinite(low) and math.isfinite(high) and 0.0 <= low <= high):

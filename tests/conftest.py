@@ -27,6 +27,7 @@ TOGETHER = {
     "tests/system/test_policies_under_load.py": "cluster",
     "tests/benchmarks/test_training_benchmark.py": "one Ray",
     "tests/examples/test_edge_environments.py": "one Ray",
+    "tests/examples/test_learn_from_recordings.py": "one Ray",
     "tests/examples/test_shipped_policies.py": "one Ray",
     "tests/examples/test_simple_trainer.py": "one Ray",
     "tests/examples/test_slurm.py": "one Ray",

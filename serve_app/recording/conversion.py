@@ -1,4 +1,4 @@
-"""Checks that a recording's conversions share: one policy at a time, whole episodes, a folder that is new."""
+"""What a recording's conversions share: one policy at a time, a folder that is new, Gymnasium's spaces."""
 
 from __future__ import annotations
 
@@ -6,8 +6,20 @@ import importlib
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
+
+import numpy as np
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.spaces import (
+    BoxSpec,
+    DictSpec,
+    DiscreteSpec,
+    MultiBinarySpec,
+    MultiDiscreteSpec,
+    SpaceSpec,
+    TupleSpec,
+)
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording
 
@@ -54,3 +66,23 @@ def episodes_of_one(recording: Recording, name: str | None) -> Iterator[Episode]
         yield episode
     if chosen is None:
         raise UsageError(f"the recording has no decisions of {'any policy' if name is None else f'policy {name!r}'}")
+
+
+def gym_space(spec: SpaceSpec) -> Any:
+    """Return the contract's space as Gymnasium's."""
+    from gymnasium import spaces
+
+    if isinstance(spec, DictSpec):
+        return spaces.Dict({key: gym_space(child) for key, child in spec.spaces.items()})
+    if isinstance(spec, TupleSpec):
+        return spaces.Tuple([gym_space(child) for child in spec.spaces])
+    if isinstance(spec, DiscreteSpec):
+        return spaces.Discrete(spec.n, start=spec.start)
+    if isinstance(spec, MultiDiscreteSpec):
+        return spaces.MultiDiscrete(np.reshape(spec.nvec, spec.shape), start=np.reshape(spec.start, spec.shape))
+    if isinstance(spec, MultiBinarySpec):
+        return spaces.MultiBinary(list(spec.shape))
+    assert isinstance(spec, BoxSpec)
+    low, high = spec.bounds()
+    kind = np.dtype(spec.dtype)
+    return spaces.Box(low.astype(kind), high.astype(kind), spec.shape, kind.type)

@@ -13,16 +13,7 @@ import numpy as np
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.nested import build_action
-from rlservo.export.contract.spaces import (
-    BoxSpec,
-    DictSpec,
-    DiscreteSpec,
-    MultiBinarySpec,
-    MultiDiscreteSpec,
-    SpaceSpec,
-    TupleSpec,
-)
-from rlservo.serve_app.recording.conversion import episodes_of_one, new_folder, optional_package
+from rlservo.serve_app.recording.conversion import episodes_of_one, gym_space, new_folder, optional_package
 from rlservo.serve_app.recording.episodes import Episode
 from rlservo.serve_app.recording.reader import Recording
 
@@ -69,8 +60,8 @@ def export_minari(recording: Recording, out: str | Path, *, name: str | None = N
         minari.create_dataset_from_buffers(
             identity,
             buffers,
-            observation_space=_space(contract.observation_space),
-            action_space=_space(contract.action_space),
+            observation_space=gym_space(contract.observation_space),
+            action_space=gym_space(contract.action_space),
             algorithm_name=contract.provenance.algorithm,
             description=f"Recorded with rlservo from {last.policy.title}",
             data_format="arrow",
@@ -89,25 +80,6 @@ def _is_whole(episode: Episode) -> bool:
         and np.isfinite(episode.reward).all()
         and (episode.acted | episode.fell_back).all()
     )
-
-
-def _space(spec: SpaceSpec) -> Any:
-    from gymnasium import spaces
-
-    if isinstance(spec, DictSpec):
-        return spaces.Dict({key: _space(child) for key, child in spec.spaces.items()})
-    if isinstance(spec, TupleSpec):
-        return spaces.Tuple([_space(child) for child in spec.spaces])
-    if isinstance(spec, DiscreteSpec):
-        return spaces.Discrete(spec.n, start=spec.start)
-    if isinstance(spec, MultiDiscreteSpec):
-        return spaces.MultiDiscrete(np.reshape(spec.nvec, spec.shape), start=np.reshape(spec.start, spec.shape))
-    if isinstance(spec, MultiBinarySpec):
-        return spaces.MultiBinary(list(spec.shape))
-    assert isinstance(spec, BoxSpec)
-    low, high = spec.bounds()
-    kind = np.dtype(spec.dtype)
-    return spaces.Box(low.astype(kind), high.astype(kind), spec.shape, kind.type)
 
 
 @contextmanager

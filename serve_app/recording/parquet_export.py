@@ -11,14 +11,16 @@ import numpy as np
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.recording.conversion import episodes_of_one, optional_package
 from rlservo.serve_app.recording.episodes import Episode
+from rlservo.serve_app.recording.own_actions import own_actions
 from rlservo.serve_app.recording.reader import Recording
 
 
 def export_parquet(recording: Recording, out: str | Path, *, name: str | None = None) -> int:
     """Write the new file `out` and return its rows; the contract is in the schema's metadata.
 
-    Columns: eps_id, t, time, obs..., actions..., own_actions..., action_logp, action_dist_inputs, rewards, terminateds,
-    truncateds, explore, fell_back, error, latency_ms, version. Raises UsageError and RecordingError.
+    Columns: eps_id, t, time, obs..., actions..., own_actions..., own_actions_clipped, action_logp, action_dist_inputs,
+    rewards, terminateds, truncateds, explore, fell_back, error, latency_ms, version. `actions` are what the robot
+    executed, `own_actions` what RLlib learns from (`own_actions.py`). Raises UsageError and RecordingError.
     """
     pa = optional_package("pyarrow", "an export to Parquet")
     pq = optional_package("pyarrow.parquet", "an export to Parquet")
@@ -53,16 +55,18 @@ def _columns(pa: Any, episode: Episode) -> Iterator[tuple[str, Any]]:
     yield "eps_id", pa.array([episode.id] * rows, pa.string())
     yield "t", pa.array(episode.steps)
     yield "time", pa.array(episode.wall_ns, pa.timestamp("ns", tz="UTC"))
-    own = np.isfinite(episode.logp)
+    drawn = np.isfinite(episode.logp)
+    own = own_actions(episode)
     for prefix, tensors, known in (
         ("obs", episode.obs, None),
         ("actions", episode.executed, episode.acted | episode.fell_back),
-        ("own_actions", episode.own_action, own),
+        ("own_actions", own.leaves, own.known),
     ):
         for tensor, leaf in tensors.items():
             yield prefix + tensor.removeprefix("obs").removeprefix("action"), _tensor(pa, leaf, known)
-    yield "action_logp", pa.array(episode.logp, pa.float64(), mask=~own)
-    inputs = [row.tolist() if known else None for row, known in zip(episode.dist_inputs, own, strict=True)]
+    yield "own_actions_clipped", pa.array(own.clipped)
+    yield "action_logp", pa.array(episode.logp, pa.float64(), mask=~drawn)
+    inputs = [row.tolist() if known else None for row, known in zip(episode.dist_inputs, drawn, strict=True)]
     yield "action_dist_inputs", pa.array(inputs, pa.list_(pa.float32()))
     yield "rewards", pa.array(episode.reward, pa.float64(), mask=~np.isfinite(episode.reward))
     yield "terminateds", pa.array(last & episode.terminated)

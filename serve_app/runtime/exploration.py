@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlservo.export.contract.action_transform import to_sent
 from rlservo.export.contract.contract import Distribution
 from rlservo.export.contract.log_probability import MAX_LOG_STD, MIN_LOG_STD
 from rlservo.export.contract.scores import parameter_count, split_parameters
@@ -61,12 +62,12 @@ def sample_action(
     rows = inputs.astype(np.float64)
     if isinstance(space, DiscreteSpec):
         chosen = _choose(rows, rng)
-        return chosen + space.start, chosen
+        return to_sent(chosen, distribution.transform, space), chosen
     if isinstance(space, MultiDiscreteSpec):
         parts = np.split(rows, np.cumsum(space.nvec)[:-1], axis=-1)
         chosen = np.stack([_choose(part, rng) for part in parts], axis=-1)
         own = chosen.reshape((-1, *space.shape))
-        return (chosen + np.array(space.start)).reshape(own.shape), own
+        return to_sent(own, distribution.transform, space), own
     assert isinstance(space, BoxSpec), "RLlib has no distribution for other spaces"
     mean, log_std = np.split(rows, 2, axis=-1)
     if distribution.kind == "squashed_gaussian":
@@ -75,12 +76,7 @@ def sample_action(
     if distribution.kind == "squashed_gaussian":
         sample = np.tanh(sample)
     sample = sample.reshape((-1, *space.shape))
-    low, high = space.bounds()
-    bounded = bool(np.isfinite(low).all() and np.isfinite(high).all())
-    if distribution.transform == "none" or (distribution.transform == "unsquash" and not bounded):
-        return sample, sample
-    sent = low + (sample + 1.0) * (high - low) / 2.0 if distribution.transform == "unsquash" else sample
-    return np.clip(sent, low, high), sample
+    return to_sent(sample, distribution.transform, space), sample
 
 
 def draw_action(

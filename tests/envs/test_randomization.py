@@ -116,3 +116,16 @@ def test_rewards_and_endings_are_of_what_really_happened() -> None:
 def test_impossible_randomisation_is_refused(env_id: str, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         DomainRandomization(gym.make(env_id), **arguments)
+
+
+def test_randomization_by_id_is_the_wrapper_around_the_named_environment() -> None:
+    by_id = gym.make("rlservo/Randomized-v0", env_id=ARM, action_latency=(3, 3), rs_state_to_info=False)
+    wrapped = DomainRandomization(gym.make(ARM, rs_state_to_info=False), action_latency=(3, 3))
+    for env in (by_id, wrapped):
+        _, info = env.reset(seed=3)
+        assert info["randomization"]["action_latency"] == 3
+    action = np.full(5, 0.1, np.float32)
+    for _ in range(5):
+        np.testing.assert_array_equal(by_id.step(action)[0], wrapped.step(action)[0])
+    with pytest.raises(ValueError, match="expected whole control cycles"):
+        gym.make("rlservo/Randomized-v0", env_id=ARM, action_latency=(0, 0.5))

@@ -22,9 +22,9 @@ LIST = "import gymnasium; print(sorted(name for name in gymnasium.registry if na
         pytest.param("import ray.rllib", marks=pytest.mark.slow),
     ],
 )
-def test_six_environments_are_registered_whatever_comes_first(first: str) -> None:
+def test_seven_environments_are_registered_whatever_comes_first(first: str) -> None:
     done = subprocess.run([sys.executable, "-c", f"{first}\n{LIST}"], capture_output=True, text=True, timeout=120)
-    assert done.stdout.count("rlservo/") == 6, done.stdout + done.stderr
+    assert done.stdout.count("rlservo/") == 7, done.stdout + done.stderr
     assert "Warning" not in done.stderr
 
 

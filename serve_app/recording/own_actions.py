@@ -1,0 +1,93 @@
+"""A module's own actions in a recorded episode: what RLlib's learners learn from.
+
+A record has the own action where it explored. Where it has none, or the robot did something else (a fallback, a step
+limit), the executed action is taken back through unsquash and clip.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.action_transform import is_invertible, to_own, to_sent, transform_of
+from rlservo.export.contract.scores import split_parameters
+from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, LeafSpec, MultiDiscreteSpec, leaf_specs
+from rlservo.serve_app.recording.episodes import Columns, Episode
+
+ROUNDING = 1e-5  # of a Box's span: an own action that is sent as what was executed, but for its float32
+
+
+@dataclass(frozen=True)
+class OwnActions:
+    """Own actions of an episode's decisions, of what the robot executed."""
+
+    leaves: Columns
+    """By tensor name, `[rows, *shape]`."""
+    known: NDArray[np.bool_]
+    """Rows whose own action is known; the others hold some number."""
+    recorded: NDArray[np.bool_]
+    """Rows whose own action, or its distribution, was recorded; those that are known beside them are computed."""
+    clipped: NDArray[np.bool_]
+    """Rows whose own action is computed and lies at the bound or anywhere beyond it: the bound stands for it."""
+
+
+def own_actions(episode: Episode) -> OwnActions:
+    """Return the own action of every row, as far as it can be known."""
+    contract = episode.policy.contract
+    transform = transform_of(contract)
+    specs = leaf_specs(contract.action_space, "action")
+    recorded = np.isfinite(episode.logp) & episode.acted & ~episode.fell_back
+    if not is_invertible(contract):
+        return OwnActions(episode.own_action, recorded, recorded, np.zeros_like(recorded))
+    for name, leaf in specs.items():
+        recorded &= _is_sent_as(to_sent(episode.own_action[name], transform, leaf), episode.executed[name], leaf)
+    leaves: Columns = {}
+    clipped = np.zeros(len(episode), np.bool_)
+    for name, leaf in specs.items():
+        inverse, at_bound = to_own(episode.executed[name], transform, leaf)
+        own = episode.own_action[name]
+        leaves[name] = np.where(recorded.reshape(-1, *[1] * (own.ndim - 1)), own, inverse)
+        clipped |= at_bound & ~recorded
+    known = episode.acted | episode.fell_back
+    return OwnActions(leaves, known, recorded, clipped & known)
+
+
+def modes(episode: Episode) -> OwnActions:
+    """Return what the policy would have done had it not explored: its distributions' most likely actions.
+
+    Rows that did not explore have their own action; no row is `known` that holds a fallback's.
+    """
+    own = own_actions(episode)
+    distribution = episode.policy.contract.distribution
+    drawn = np.isfinite(episode.logp)
+    if distribution is None or not drawn.any():
+        return replace(own, known=own.known & ~episode.fell_back)
+    leaves: Columns = {}
+    for name, leaf, inputs in split_parameters(episode.dist_inputs, episode.policy.contract.action_space):
+        if isinstance(leaf, DiscreteSpec):
+            mode = inputs.argmax(axis=-1)
+        elif isinstance(leaf, MultiDiscreteSpec):
+            parts = np.split(inputs, np.cumsum(leaf.nvec)[:-1], axis=-1)
+            mode = np.stack([part.argmax(axis=-1) for part in parts], axis=-1)
+        else:
+            mode = np.split(inputs, 2, axis=-1)[0]
+            mode = np.tanh(mode) if distribution.kind == "squashed_gaussian" else mode
+        before = own.leaves[name]
+        shape = (-1, *[1] * (before.ndim - 1))
+        leaves[name] = np.where(drawn.reshape(shape), mode.reshape(before.shape).astype(before.dtype), before)
+    known = own.known & ~episode.fell_back
+    return OwnActions(leaves, known, own.recorded | drawn, own.clipped & ~drawn)
+
+
+def _is_sent_as(sent: NDArray[Any], executed: NDArray[Any], leaf: LeafSpec) -> NDArray[np.bool_]:
+    """Return the rows in which what would be sent is what was executed, but for float32: no step limit was between."""
+    slack: NDArray[np.float64] | float = 0.0
+    if isinstance(leaf, BoxSpec):
+        low, high = leaf.bounds()
+        span = high - low
+        slack = ROUNDING * np.where(np.isfinite(span), span, np.maximum(1.0, np.abs(executed)))
+    same = np.abs(sent.astype(np.float64) - executed.astype(np.float64)) <= slack
+    return np.asarray(same.reshape(len(same), -1).all(axis=1), np.bool_)
