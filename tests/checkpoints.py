@@ -21,14 +21,21 @@ APP = ZOO / "app"  # the user's own code that some of the checkpoints need
 TRAINED_WITH = [ZOO, versions("ray", "torch", "gymnasium", "numpy")]
 
 
-def copy(folder: Path) -> None:
-    shutil.copytree(ZOO, folder / ZOO.name, ignore=shutil.ignore_patterns("__pycache__"))
+def training_code() -> Path:
+    """Return where the training scripts run: a copy that is there as long as their checkpoints, which name its files.
+
+    So any checkout with the same code has the same checkpoints, and may go.
+    """
+
+    def copy(folder: Path) -> None:
+        shutil.copytree(ZOO, folder / ZOO.name, ignore=shutil.ignore_patterns("__pycache__"))
+
+    return cached("zoo-code", [ZOO], copy) / ZOO.name
 
 
 def trained(script: str) -> Path:
     """Return the folder that a training script fills."""
-    # Pickles name their code's file: a copy that is there as long as they are, whatever becomes of this checkout.
-    code = cached("zoo-code", [ZOO], copy) / ZOO.name
+    code = training_code()
 
     def train(folder: Path) -> None:
         # With the token in its environment Ray writes none to the user's home.

@@ -13,6 +13,7 @@ import pytest
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from rich.console import Console
 
+from checkpoints import training_code
 from rlservo.export.commands.element_names import read_elements
 from rlservo.export.commands.export import export_checkpoint
 from rlservo.export.commands.prune import prune_checkpoint
@@ -145,7 +146,7 @@ def test_a_pruned_checkpoint_is_small_and_exports_to_the_same_policy(
 def test_a_pruned_checkpoint_names_no_folder_of_the_machine_it_was_trained_on(
     zoo: Path, app: Path, tmp_path: Path, notices: list[str]
 ) -> None:
-    trained_here = str(app.parent).encode()  # RLlib pickles the training script's functions, with their file
+    trained_here = str(training_code()).encode()  # RLlib pickles the training script's functions, with their file
     assert trained_here in (zoo / "pendulum" / "class_and_ctor_args.pkl").read_bytes()
     prune_checkpoint(zoo / "pendulum", tmp_path / "small", notify=notices.append)
     for file in (tmp_path / "small").rglob("*"):
