@@ -1,21 +1,36 @@
-"""Pictures of a simulator: `rgb_array` frames off screen, `human` in MuJoCo's viewer."""
+"""Pictures of a simulator: `rgb_array` frames off screen, `human` in MuJoCo's viewer, and what other viewers need."""
 
 from __future__ import annotations
 
 import threading
-from typing import Any
+from abc import abstractmethod
+from typing import Any, Literal, Protocol
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 RENDER_MODES = ("human", "rgb_array")
 
+Start = Literal["own", "random", "here"]
+Vector = NDArray[np.float64]
+
+
+class Simulation(Protocol):
+    """What a viewer draws."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+
 
 class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """An environment that shows its simulator; one that derives from it sets `_camera`."""
+    """An environment that shows its simulator; one that derives from it sets `_camera` and `simulation`.
 
+    Positions in the methods below are in MuJoCo's world.
+    """
+
+    simulation: Simulation
     _camera: Camera
 
     def __init__(self, render_mode: str | None, *, gui: bool) -> None:
@@ -32,6 +47,36 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def close(self) -> None:
         """Free the GL context and close the window."""
         self._camera.close()
+
+    @abstractmethod
+    def robot_position(self) -> Vector:
+        """Return where the part of the robot is that is to reach the target [m] (3,)."""
+
+    def target_position(self) -> Vector | None:
+        """Return where the target is [m] (3,), or what is to be avoided; None for a task without either."""
+        return None
+
+    def move_target(self, position: ArrayLike) -> None:
+        """Put the target somewhere else within the episode. Raises ValueError for a task without one."""
+        raise ValueError(f"{type(self).__name__} has no target to move to {np.asarray(position).tolist()}")
+
+    def beams(self) -> Vector:
+        """Return both ends of every laser beam [m] (n, 2, 3); none for a robot without lasers."""
+        return np.zeros((0, 2, 3))
+
+    def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:  # noqa: ARG002
+        """Return options of `reset` for an episode that starts as the task has it, at random, or where the robot is.
+
+        With `keep_target` the target stays as well. A task that cannot start so starts in its own way.
+        """
+        return {}
+
+    @abstractmethod
+    def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
+        """Put robot and target where row `row` of an episode's observations (n, size) has them: to look at, not to act.
+
+        What the observations do not tell is where a new environment has it.
+        """
 
     def _refresh_window(self) -> None:
         if self.render_mode == "human":
