@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import abstractmethod
-from typing import Any, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import gymnasium as gym
 import mujoco
@@ -29,6 +29,8 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Positions in the methods below are in MuJoCo's world.
     """
+
+    IS_PLANAR: ClassVar[bool] = False  # whether the robot drives on the floor, and everything that can be moved as well
 
     simulation: Simulation
     _camera: Camera
@@ -59,6 +61,18 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def move_target(self, position: ArrayLike) -> None:
         """Put the target somewhere else within the episode. Raises ValueError for a task without one."""
         raise ValueError(f"{type(self).__name__} has no target to move to {np.asarray(position).tolist()}")
+
+    def obstacle_positions(self) -> Vector:
+        """Return where the obstacles are that can be moved [m] (n, 3)."""
+        return np.zeros((0, 3))
+
+    def move_obstacle(self, index: int, position: ArrayLike) -> None:
+        """Put an obstacle somewhere else within the episode. Raises ValueError where there is none of that number."""
+        raise ValueError(f"{type(self).__name__} has no obstacle {index} to move to {np.asarray(position).tolist()}")
+
+    def viewpoint(self) -> tuple[Vector, Vector]:
+        """Return where the camera stands and what it looks at [m] (3,) each."""
+        return self._camera.viewpoint()
 
     def beams(self) -> Vector:
         """Return both ends of every laser beam [m] (n, 2, 3); none for a robot without lasers."""
@@ -114,6 +128,14 @@ class Camera:
             renderer = self._renderer = mujoco.Renderer(self._model, height=self._height, width=self._width)
         renderer.update_scene(self._data, camera=self._view)
         return np.asarray(renderer.render(), dtype=np.uint8)
+
+    def viewpoint(self) -> tuple[Vector, Vector]:
+        """Return where the camera stands and what it looks at [m] (3,) each."""
+        azimuth, elevation = np.radians([self._view.azimuth, self._view.elevation])
+        ahead = np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        return self._view.lookat - self._view.distance * ahead, self._view.lookat.copy()
 
     def show(self) -> None:
         """Open the viewer window at the first call, refresh it at the next ones. Needs a display."""

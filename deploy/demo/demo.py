@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rlservo.deploy.demo.picture import Robot, RobotRun, Trace, draw_picture, film
+from rlservo.deploy.terminal import ends_like_ctrl_c
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
@@ -77,7 +78,7 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
     console.rule("2  serve: both policies on one Ray Serve endpoint")
     runs: list[RobotRun] = []
     counts = ("--episodes", str(episodes), "--seed", str(FIRST_SEED))
-    with _ends_like_ctrl_c(), _server(console, repository, out / "server.log") as url:
+    with ends_like_ctrl_c(), _server(console, repository, out / "server.log") as url:
         console.rule(f"3  drive: {episodes} episodes each, every action over HTTP")
         for robot in ROBOTS:
             _show(console, "rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts)
@@ -155,21 +156,6 @@ def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
         finally:
             with console.status("stopping the server ..."):
                 _stop(server)
-
-
-@contextmanager
-def _ends_like_ctrl_c() -> Iterator[None]:
-    """Let SIGTERM and a closed terminal stop the server too, as Ctrl-C does."""
-
-    def interrupt(_number: int, _frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _end_with_parent() -> None:

@@ -46,6 +46,7 @@ class Mir100Navigation(RenderedEnv):
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
 
+    IS_PLANAR = True
     RESET_OPTIONS: ClassVar[tuple[str, ...]] = ("start_pose", "target_pose")
     WORLD: ClassVar[str]
     LASER_COUNT: ClassVar[int]  # how many of the readings are observed, evenly picked
@@ -169,6 +170,16 @@ class Mir100Navigation(RenderedEnv):
         x, y, _ = as_vector("position", position, 3).tolist()
         self.simulation.move_target((x, y, self.simulation.target[2]))
         self._previous_distance = None
+
+    def obstacle_positions(self) -> Vector:
+        """Return where the cubes are on the map [m] (n, 3)."""
+        return np.array([(x, y, 0.0) for x, y, _ in self.simulation.cubes]).reshape(-1, 3)
+
+    def move_obstacle(self, index: int, position: ArrayLike) -> None:
+        """Put a cube somewhere else on the map [m] (3,) within the episode, turned as it is."""
+        x, y, _ = as_vector("position", position, 3).tolist()
+        yaws = {number: yaw for number, (_, _, yaw) in enumerate(self.simulation.cubes)}
+        self.simulation.move_cube(index, (x, y, yaws.get(index, 0.0)))
 
     def beams(self) -> Vector:
         """Return both ends of every laser beam on the map [m] (n, 2, 3); none where there is nothing to see."""
