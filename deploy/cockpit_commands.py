@@ -32,6 +32,12 @@ def cockpit(
     env_arg: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
     ] = None,
+    recording: Annotated[
+        Path | None, typer.Option(help="Show a recording (.mcap); with --bundle also what that would have done.")
+    ] = None,
+    robot_server: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Show a robot server's simulation while a client drives it.")
+    ] = None,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Of the page, on 127.0.0.1.")] = PORT,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the first episode.")] = None,
     api_key: Annotated[
@@ -44,18 +50,29 @@ def cockpit(
 
     Example: `rlservo cockpit --url http://127.0.0.1:8000 --policy ur5`
     """
-    if (url is None) == (bundle is None):
-        raise UsageError("give either --url (a server) or --bundle (in process)")
+    shown = [url, recording, robot_server, None if recording is not None else bundle]
+    if sum(each is not None for each in shown) != 1:
+        raise UsageError(
+            "give one of --url (a server), --bundle (in process), --recording (with or without --bundle) and "
+            "--robot-server"
+        )
+    arguments = parse_env_arguments(env_arg or [])
     with needs_extra("cockpit"):
-        from rlservo.deploy.cockpit.run import run_drive
+        from rlservo.deploy.cockpit.run import run_drive, run_playback, run_watch
 
     with terminal.ends_like_ctrl_c(), contextlib.suppress(KeyboardInterrupt):
+        if recording is not None:
+            run_playback(recording, bundle=bundle, policy=policy, env_id=env, port=port, on_ready=_tell)
+            return
+        if robot_server is not None:
+            run_watch(robot_server, env_arguments=arguments, port=port, on_ready=_tell)
+            return
         run_drive(
             _source(url, bundle, api_key),
             policy=policy,
             version=version,
             env_id=env,
-            env_arguments=parse_env_arguments(env_arg or []),
+            env_arguments=arguments,
             port=port,
             seed=seed,
             on_ready=_tell,

@@ -132,9 +132,7 @@ class Camera:
     def viewpoint(self) -> tuple[Vector, Vector]:
         """Return where the camera stands and what it looks at [m] (3,) each."""
         azimuth, elevation = np.radians([self._view.azimuth, self._view.elevation])
-        ahead = np.array(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        )
+        ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         return self._view.lookat - self._view.distance * ahead, self._view.lookat.copy()
 
     def show(self) -> None:

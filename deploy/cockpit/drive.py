@@ -113,7 +113,8 @@ class Drive:
         self._policy = source.open(choice, self._link)
         try:
             contract = self._policy.contract
-            self._stage = Stage(env_id or home_of(contract), env_arguments or {}, contract)
+            arguments = {**(home_arguments(contract) if env_id is None else {}), **(env_arguments or {})}
+            self._stage = Stage(env_id or home_of(contract), arguments, contract)
         except BaseException:
             self._policy.close()
             raise
@@ -446,7 +447,7 @@ class Drive:
             if choice.name == self._choice.name:
                 self._stage.check(contract)
                 return self._stage
-            env_id, arguments = home_of(contract), {}
+            env_id, arguments = home_of(contract), home_arguments(contract)
         else:
             env_id = self._stage.env_id
         stage = Stage(env_id, arguments, contract)
@@ -493,3 +494,8 @@ def home_of(contract: Contract) -> str:
             f"cannot draw: name one of rlservo's simulators that it fits with --env"
         )
     return env_id
+
+
+def home_arguments(contract: Contract) -> dict[str, Any]:
+    """Return what of that environment's arguments decides how the robot looks."""
+    return {name: value for name, value in contract.provenance.env_config.items() if name == "ur_model"}

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import viser
 
-from rlservo.deploy.cockpit.drive import Cycle, Drive, View
+from rlservo.deploy.cockpit.drive import Drive, View
 from rlservo.deploy.cockpit.page import aim_cameras
 from rlservo.deploy.cockpit.policies import FALLBACKS, Choice, Link, PolicySource
-from rlservo.deploy.cockpit.readings import WINDOW, Elements, Plot
+from rlservo.deploy.cockpit.readings import Readings, escape
 from rlservo.deploy.cockpit.scenery import Scenery
 from rlservo.deploy.cockpit.stage import Disturbance, Stage
 from rlservo.envs.ur.parameters import UR_PARAMETERS
@@ -35,7 +35,7 @@ class DrivePanel:
         self._versions = source.versions()
         self._is_closed = threading.Event()
         self._scenery: Scenery | None = None
-        self._readings: _Readings | None = None
+        self._readings: Readings | None = None
         self._drawn: Stage | None = None
         self._drawn_contract: Contract | None = None
         gui = server.gui
@@ -103,7 +103,7 @@ class DrivePanel:
         if view.contract is not self._drawn_contract:
             self._rebuild_readings(view)
         assert self._readings is not None
-        words = self._readings.update(history, view)
+        words = self._readings.update(history, with_difference=view.ghost is not None)
         rate = f"{100 * view.successes / view.episodes:.0f}%" if view.episodes else "no episode yet"
         lines = [
             f"**{view.contract.name}** version {view.contract.version}, {view.phase}, {frames_per_s:.0f} frames/s",
@@ -111,8 +111,8 @@ class DrivePanel:
             f"Late: {view.late}. Fallback actions: {view.fallbacks}.",
         ]
         if view.trouble:
-            lines.append(f"⚠ **{_escape(view.trouble)}**")
-        lines += [f"⚠ {_escape(sentence)}" for sentence in words]
+            lines.append(f"⚠ **{escape(view.trouble)}**")
+        lines += [f"⚠ {escape(sentence)}" for sentence in words]
         content = "\n\n".join(lines)
         if self._status.content != content:
             self._status.content = content
@@ -139,7 +139,7 @@ class DrivePanel:
         if self._readings is not None:
             self._readings.remove()
         with self._readings_folder:
-            self._readings = _Readings(self._server.gui, view.contract)
+            self._readings = Readings(self._server.gui, view.contract)
         self._drawn_contract = view.contract
 
     # -- choices
@@ -212,54 +212,3 @@ class DrivePanel:
             if tuple(self._name.options) != tuple(self._versions):
                 self._name.options = tuple(self._versions)
             self._offer_versions()
-
-
-class _Readings:
-    """Table and plots of one policy."""
-
-    def __init__(self, gui: viser.GuiApi, contract: Contract) -> None:
-        self._observed = Elements.observed(contract)
-        acted = Elements.acted(contract)
-        has_value = any(tensor.name == "value" for tensor in contract.outputs)
-        self._action = Plot(gui, "Action", acted.names)
-        self._latency = Plot(gui, "Latency [ms]", ["latency", "late"])
-        self._distance = Plot(gui, "Distance from the target [m]", ["distance"])
-        self._value = Plot(gui, "Value (the critic's)", ["value"]) if has_value else None
-        self._difference = Plot(gui, "Ghost's action minus the action", acted.names)
-        self._table = gui.add_html("")
-
-    def update(self, history: list[Cycle], view: View) -> list[str]:
-        """Show the last cycles; return what is to be said of the last observation."""
-        if not history:
-            return []
-        shown = history[-WINDOW:]
-        x = [cycle.number for cycle in shown]
-        self._action.update(x, list(np.array([cycle.action for cycle in shown]).T))
-        late = [cycle.latency_ms if cycle.is_late else np.nan for cycle in shown]
-        self._latency.update(x, [[cycle.latency_ms for cycle in shown], late])
-        self._distance.update(x, [[_number(cycle.distance) for cycle in shown]])
-        if self._value is not None:
-            self._value.visible = any(cycle.value is not None for cycle in shown)
-            self._value.update(x, [[_number(cycle.value) for cycle in shown]])
-        self._difference.visible = view.ghost is not None
-        if view.ghost is not None:
-            nothing = np.full(len(shown[-1].action), np.nan)
-            rows = [nothing if cycle.difference is None else cycle.difference for cycle in shown]
-            self._difference.update(x, list(np.array(rows).T))
-        observation = shown[-1].obs.astype(np.float64).ravel()
-        self._table.content = self._observed.table(observation)
-        return [*shown[-1].warnings, *self._observed.words(observation)]
-
-    def remove(self) -> None:
-        for part in (self._action, self._latency, self._distance, self._value, self._difference, self._table):
-            if part is not None:
-                part.remove()
-
-
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
-
-
-def _escape(text: str) -> str:
-    """Return text that markdown leaves as it is."""
-    return "".join(f"\\{character}" if character in r"\`*_{}[]<>#|" else character for character in text)

@@ -10,6 +10,7 @@ import viser
 import viser.uplot
 from numpy.typing import NDArray
 
+from rlservo.deploy.cockpit.drive import Cycle
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.spaces import BoxSpec, LeafSpec
 from rlservo.serve_app.runtime.drift import SMALLEST_STD, training_moments
@@ -124,8 +125,66 @@ class Plot:
         columns = [np.asarray(values, np.float64) for values in series[: self._count]]
         self._plot.data = (np.asarray(x, np.float64), *columns)
 
+    @property
+    def visible(self) -> bool:
+        """Whether it is shown."""
+        return self._plot.visible
+
+    @visible.setter
+    def visible(self, visible: bool) -> None:
+        if self._plot.visible != visible:
+            self._plot.visible = visible
+
     def remove(self) -> None:
         self._plot.remove()
+
+
+class Readings:
+    """Table and plots of one policy."""
+
+    def __init__(
+        self, gui: viser.GuiApi, contract: Contract, difference: str = "Ghost's action minus the action"
+    ) -> None:
+        self._observed = Elements.observed(contract)
+        acted = Elements.acted(contract)
+        has_value = any(tensor.name == "value" for tensor in contract.outputs)
+        self._action = Plot(gui, "Action", acted.names)
+        self._latency = Plot(gui, "Latency [ms]", ["latency", "late"])
+        self._distance = Plot(gui, "Distance from the target [m]", ["distance"])
+        self._value = Plot(gui, "Value (the critic's)", ["value"]) if has_value else None
+        self._difference = Plot(gui, difference, acted.names)
+        self._table = gui.add_html("")
+
+    def update(self, history: Sequence[Cycle], *, with_difference: bool) -> list[str]:
+        """Show the last cycles; return what is to be said of the last observation."""
+        if not history:
+            return []
+        shown = history[-WINDOW:]
+        x = [cycle.number for cycle in shown]
+        self._action.update(x, list(np.array([cycle.action for cycle in shown]).T))
+        late = [cycle.latency_ms if cycle.is_late else np.nan for cycle in shown]
+        self._latency.update(x, [[cycle.latency_ms for cycle in shown], late])
+        self._distance.update(x, [[_number(cycle.distance) for cycle in shown]])
+        if self._value is not None:
+            self._value.visible = any(cycle.value is not None for cycle in shown)
+            self._value.update(x, [[_number(cycle.value) for cycle in shown]])
+        self._difference.visible = with_difference
+        if with_difference:
+            nothing = np.full(len(shown[-1].action), np.nan)
+            rows = [nothing if cycle.difference is None else cycle.difference for cycle in shown]
+            self._difference.update(x, list(np.array(rows).T))
+        observation = shown[-1].obs.astype(np.float64).ravel()
+        self._table.content = self._observed.table(observation)
+        return [*shown[-1].warnings, *self._observed.words(observation)]
+
+    def remove(self) -> None:
+        for part in (self._action, self._latency, self._distance, self._value, self._difference, self._table):
+            if part is not None:
+                part.remove()
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
 
 
 def _without_common_end(names: Sequence[str]) -> list[str]:
@@ -140,3 +199,8 @@ def _bounds(low: float, high: float) -> str:
     if not (np.isfinite(low) or np.isfinite(high)):
         return ""
     return f"{low:.3g} .. {high:.3g}"
+
+
+def escape(text: str) -> str:
+    """Return text that markdown leaves as it is."""
+    return "".join(f"\\{character}" if character in r"\`*_{}[]<>#|" else character for character in text)

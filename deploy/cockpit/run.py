@@ -5,12 +5,17 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
+import viser
+
 from rlservo.deploy.cockpit.drive import Drive
-from rlservo.deploy.cockpit.page import HOST, served_page, show
+from rlservo.deploy.cockpit.page import HOST, Shown, served_page, show
 from rlservo.deploy.cockpit.panel import DrivePanel
+from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
 from rlservo.deploy.cockpit.policies import Choice, PolicySource
+from rlservo.deploy.cockpit.watch import WatchPanel
 from rlservo.export.contract.errors import UnknownPolicyError, UsageError
 
 PRODUCTION = "production"
@@ -39,8 +44,47 @@ def run_drive(
         panel = DrivePanel(server, drive, source)
         cleanup.callback(panel.close)
         drive.start()
-        on_ready(f"http://{HOST}:{server.get_port()}")
-        show(panel, stop or threading.Event())
+        _serve(server, panel, on_ready, stop)
+
+
+def run_playback(
+    recording: Path,
+    *,
+    bundle: Path | None,
+    policy: str | None,
+    env_id: str | None,
+    port: int,
+    on_ready: OnReady,
+    stop: threading.Event | None = None,
+) -> None:
+    """Show a recording on a page until `stop`, or an interrupt."""
+    tape = Tape(recording, bundle=bundle, policy=policy)
+    with ExitStack() as cleanup:
+        server = cleanup.enter_context(served_page(port, f"rlservo cockpit: {recording.name}"))
+        panel = PlaybackPanel(server, tape, env_id=env_id)
+        cleanup.callback(panel.close)
+        _serve(server, panel, on_ready, stop)
+
+
+def run_watch(
+    address: str,
+    *,
+    env_arguments: Mapping[str, Any],
+    port: int,
+    on_ready: OnReady,
+    stop: threading.Event | None = None,
+) -> None:
+    """Show what a robot server's simulation does until `stop`, or an interrupt."""
+    with ExitStack() as cleanup:
+        server = cleanup.enter_context(served_page(port, f"rlservo cockpit: {address}"))
+        panel = WatchPanel(server, address, env_arguments)
+        cleanup.callback(panel.close)
+        _serve(server, panel, on_ready, stop)
+
+
+def _serve(server: viser.ViserServer, panel: Shown, on_ready: OnReady, stop: threading.Event | None) -> None:
+    on_ready(f"http://{HOST}:{server.get_port()}")
+    show(panel, stop or threading.Event())
 
 
 def _first_choice(source: PolicySource, policy: str | None, version: str | None) -> Choice:

@@ -81,7 +81,7 @@ class Scenery:
                 self._target.follow(after.target + self._lift)
             for handle, position in zip(self._handles, after.obstacles, strict=False):
                 handle.follow(position + self._lift)
-            self._draw_beams(after.beams)
+            self._draw_beams((before if share < 0.5 else after).beams)
             self._draw_path(before.robot + share * (after.robot - before.robot))
 
     def remove(self) -> None:
@@ -215,6 +215,8 @@ def _mesh(shape: Shape) -> Any:
     transform = trimesh.transformations.quaternion_matrix(shape.wxyz)
     transform[:3, 3] = shape.position
     mesh.apply_transform(transform)
+    if shape.kind not in ("sphere", "capsule"):
+        mesh.unmerge_vertices()  # edges are drawn as edges
     return mesh
 
 

@@ -198,7 +198,11 @@ class Mir100Navigation(RenderedEnv):
         """
         x, y, yaw = _dead_reckoning(observations[: row + 1].astype(np.float64))
         self.simulation.place((x, y, yaw), target=(0.0, 0.0, 0.0))
-        self._shown_readings = observations[row, 4:]
+        self.show_readings(observations[row, 4:])
+
+    def show_readings(self, readings: NDArray[np.floating[Any]]) -> None:
+        """Let `beams` have these readings [m] (n,), of beams picked evenly from all, instead of the simulation's."""
+        self._shown_readings = readings
 
     # -- what a task adds
 
