@@ -53,7 +53,7 @@ class Cycle:
     obs: NDArray[Any]
     action: NDArray[Any]
     latency_ms: float
-    is_late: bool  # beyond the deadline, or a control cycle
+    is_late: bool  # beyond the deadline or a control cycle, whichever is shorter
     fallback: str  # why the action is not the policy's, or nothing
     warnings: tuple[str, ...]
     value: float | None
@@ -79,6 +79,7 @@ class View:
     episodes: int
     successes: int
     late: int
+    late_beyond_ms: float
     fallbacks: int
 
 
@@ -301,7 +302,7 @@ class Drive:
         obs, value, difference = self._obs, self._value(), self._step_ghost(action)
         self._obs, self._reward, is_over, info = self._stage.step(action)
         self._before, self._after, self._since = self._after, self._stage.scene(), time.perf_counter()
-        is_late = bool(fallback) or latency_ms > min(self._link.deadline_ms, 1e3 * self._stage.cycle_s)
+        is_late = bool(fallback) or latency_ms > self._late_beyond_ms()
         self._late += is_late
         self._cycles += 1
         distance = None if self._after.target is None else float(np.linalg.norm(self._after.robot - self._after.target))
@@ -438,6 +439,9 @@ class Drive:
 
     # -- parts
 
+    def _late_beyond_ms(self) -> float:
+        return min(self._link.deadline_ms, 1e3 * self._stage.cycle_s)
+
     def _stages(self) -> list[Stage]:
         return [self._stage] if self._ghost is None else [self._stage, self._ghost.stage]
 
@@ -481,6 +485,7 @@ class Drive:
             episodes=self._episodes,
             successes=self._successes,
             late=self._late,
+            late_beyond_ms=self._late_beyond_ms(),
             fallbacks=self._fallbacks,
         )
 

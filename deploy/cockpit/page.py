@@ -60,7 +60,8 @@ def served_page(port: int, title: str) -> Iterator[viser.ViserServer]:
         # Shadows and reflections take five times as long to draw where there is no graphics card.
         server.scene.configure_default_lights(cast_shadow=False)
         server.scene.configure_environment_map(None)
-        server.scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(150, 150, 150))
+        server.scene.add_light_hemisphere("/sky", ground_color=(190, 190, 190), intensity=1.5)
+        server.gui.main_panel.dock_right()
         yield server
     finally:
         with _silence():

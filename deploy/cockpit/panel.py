@@ -72,7 +72,6 @@ class DrivePanel:
             self._payload = gui.add_slider("Payload [kg]", min=0.0, max=10.0, step=0.5, initial_value=0.0)
         with gui.add_folder("Ghost"):
             self._ghost = gui.add_dropdown("Second version", (NO_GHOST,))
-        self._readings_folder = gui.add_folder("What the policy sees and does")
         self._connect()
         self._offer_versions()
         self._looks = threading.Thread(target=self._look_again, name="cockpit-versions", daemon=True)
@@ -103,7 +102,7 @@ class DrivePanel:
         if view.contract is not self._drawn_contract:
             self._rebuild_readings(view)
         assert self._readings is not None
-        words = self._readings.update(history, with_difference=view.ghost is not None)
+        words = self._readings.update(history, late_beyond_ms=view.late_beyond_ms)
         rate = f"{100 * view.successes / view.episodes:.0f}%" if view.episodes else "no episode yet"
         lines = [
             f"**{view.contract.name}** version {view.contract.version}, {view.phase}, {frames_per_s:.0f} frames/s",
@@ -138,8 +137,7 @@ class DrivePanel:
     def _rebuild_readings(self, view: View) -> None:
         if self._readings is not None:
             self._readings.remove()
-        with self._readings_folder:
-            self._readings = Readings(self._server.gui, view.contract)
+        self._readings = Readings(self._server.gui, view.contract)
         self._drawn_contract = view.contract
 
     # -- choices

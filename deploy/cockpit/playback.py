@@ -116,8 +116,7 @@ class PlaybackPanel:
             self._speed = gui.add_slider("Speed", min=0.1, max=8.0, step=0.1, initial_value=1.0)
             moments = (NO_MOMENT, *(_moment_title(number, moment) for number, moment in enumerate(tape.moments)))
             self._moment = gui.add_dropdown("Worst moments", moments, visible=bool(tape.moments))
-        with gui.add_folder("What the policy saw and did"):
-            self._readings = Readings(gui, contract, "The bundle's action minus the recorded one")
+        self._readings = Readings(gui, contract, "The bundle's action minus the recorded one")
         self._choice.on_update(lambda event: self._go(titles.index(event.target.value), 0))
         self._slider.on_update(lambda event: self._scrub(event))
         self._moment.on_update(lambda event: self._jump(moments.index(event.target.value) - 1))
@@ -141,7 +140,7 @@ class PlaybackPanel:
     def refresh(self, frames_per_s: float) -> None:
         """Refresh numbers and plots."""
         row, episode = int(self._row), self._tape.episodes[self._episode]
-        words = self._readings.update(self._cycles[: row + 1], with_difference=bool(self._tape.differences))
+        words = self._readings.update(self._cycles[: row + 1], late_beyond_ms=1e3 * self._period_s)
         cycle = self._cycles[row]
         lines = [
             f"**{episode.policy.title}**, recorded; {frames_per_s:.0f} frames/s",

@@ -21,6 +21,7 @@ WINDOW = 200  # control cycles in a plot
 MOST_SERIES = 8
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#17becf")
 MOST_WORDS = 4
+PANEL_WIDTH = 320  # [pixels]
 
 Vector = NDArray[np.float64]
 
@@ -120,10 +121,13 @@ class Plot:
             height=height,
         )
 
-    def update(self, x: Sequence[float] | Vector, series: Sequence[Sequence[float] | Vector]) -> None:
-        """Show these values; None and not-a-number leave a gap."""
-        columns = [np.asarray(values, np.float64) for values in series[: self._count]]
-        self._plot.data = (np.asarray(x, np.float64), *columns)
+    def update(self, x: Sequence[float], series: Sequence[Sequence[float] | Vector]) -> None:
+        """Show these values, a moment each; those that are not known are left out, and where none is, the plot."""
+        columns = np.array([x, *series[: self._count]], np.float64)
+        known = columns[:, np.isfinite(columns).all(axis=0)]
+        self.visible = known.shape[1] > 0
+        if self.visible:
+            self._plot.data = tuple(known)
 
     @property
     def visible(self) -> bool:
@@ -135,12 +139,9 @@ class Plot:
         if self._plot.visible != visible:
             self._plot.visible = visible
 
-    def remove(self) -> None:
-        self._plot.remove()
-
 
 class Readings:
-    """Table and plots of one policy."""
+    """Plots of what one policy did, and a table of what it sees, in a panel beside the scene."""
 
     def __init__(
         self, gui: viser.GuiApi, contract: Contract, difference: str = "Ghost's action minus the action"
@@ -148,39 +149,38 @@ class Readings:
         self._observed = Elements.observed(contract)
         acted = Elements.acted(contract)
         has_value = any(tensor.name == "value" for tensor in contract.outputs)
-        self._action = Plot(gui, "Action", acted.names)
-        self._latency = Plot(gui, "Latency [ms]", ["latency", "late"])
-        self._distance = Plot(gui, "Distance from the target [m]", ["distance"])
-        self._value = Plot(gui, "Value (the critic's)", ["value"]) if has_value else None
-        self._difference = Plot(gui, difference, acted.names)
-        self._table = gui.add_html("")
+        self._panel = gui.add_panel()
+        with self._panel.add_tab("Plots"):
+            self._distance = Plot(gui, "Distance from the target [m]", ["distance"])
+            self._action = Plot(gui, "Action", acted.names)
+            self._difference = Plot(gui, difference, acted.names)
+            self._value = Plot(gui, "Value (the critic's)", ["value"]) if has_value else None
+            self._latency = Plot(gui, "Latency [ms]", ["latency", "late beyond"])
+        with self._panel.add_tab("Observation"):
+            self._table = gui.add_html("")
+        self._panel.dock_left()
+        self._panel.set_width(PANEL_WIDTH)
 
-    def update(self, history: Sequence[Cycle], *, with_difference: bool) -> list[str]:
+    def update(self, history: Sequence[Cycle], *, late_beyond_ms: float) -> list[str]:
         """Show the last cycles; return what is to be said of the last observation."""
         if not history:
             return []
         shown = history[-WINDOW:]
         x = [cycle.number for cycle in shown]
-        self._action.update(x, list(np.array([cycle.action for cycle in shown]).T))
-        late = [cycle.latency_ms if cycle.is_late else np.nan for cycle in shown]
-        self._latency.update(x, [[cycle.latency_ms for cycle in shown], late])
+        nothing = np.full(len(shown[-1].action), np.nan)
+        differences = [nothing if cycle.difference is None else cycle.difference for cycle in shown]
         self._distance.update(x, [[_number(cycle.distance) for cycle in shown]])
+        self._action.update(x, np.array([cycle.action for cycle in shown]).T)
+        self._difference.update(x, np.array(differences).T)
         if self._value is not None:
-            self._value.visible = any(cycle.value is not None for cycle in shown)
             self._value.update(x, [[_number(cycle.value) for cycle in shown]])
-        self._difference.visible = with_difference
-        if with_difference:
-            nothing = np.full(len(shown[-1].action), np.nan)
-            rows = [nothing if cycle.difference is None else cycle.difference for cycle in shown]
-            self._difference.update(x, list(np.array(rows).T))
+        self._latency.update(x, [[cycle.latency_ms for cycle in shown], [late_beyond_ms] * len(shown)])
         observation = shown[-1].obs.astype(np.float64).ravel()
         self._table.content = self._observed.table(observation)
         return [*shown[-1].warnings, *self._observed.words(observation)]
 
     def remove(self) -> None:
-        for part in (self._action, self._latency, self._distance, self._value, self._difference, self._table):
-            if part is not None:
-                part.remove()
+        self._panel.remove()
 
 
 def _number(value: float | None) -> float:

@@ -40,7 +40,7 @@ def run_drive(
         choice = _first_choice(source, policy, version)
         drive = Drive(source, choice, env_id=env_id, env_arguments=env_arguments, seed=seed)
         cleanup.callback(drive.close)
-        server = cleanup.enter_context(served_page(port, f"rlservo cockpit: {choice.name}"))
+        server = cleanup.enter_context(served_page(port, "rlservo cockpit"))
         panel = DrivePanel(server, drive, source)
         cleanup.callback(panel.close)
         drive.start()

@@ -17,7 +17,7 @@ SHOWN_BEAMS = 128  # of a thousand
 PATH_LENGTH = 400  # control cycles
 BEAM_COLOUR, PATH_COLOUR, GHOST_COLOUR = (220, 60, 50), (40, 120, 220), (60, 130, 240)
 GHOST_OPACITY = 0.35
-HANDLE_SIZE, PLANAR_HANDLE_SIZE = 0.22, 0.7  # [m]
+HANDLE_SIZE, PLANAR_HANDLE_SIZE = 0.3, 1.0  # [m]
 
 Move = Callable[[NDArray[np.float64]], None]
 MoveOne = Callable[[int, NDArray[np.float64]], None]

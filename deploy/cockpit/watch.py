@@ -41,8 +41,7 @@ class WatchPanel:
         self._states: deque[RobotState] = deque([state], maxlen=WINDOW)
         gui = server.gui
         self._status = gui.add_markdown("")
-        self._plot_folder = gui.add_folder("State")
-        with self._plot_folder:
+        with gui.add_folder("State"):
             self._names = _plotted(state)
             self._plot = Plot(gui, "Last looks, 20 a second", self._names)
             self._table = gui.add_html("")

@@ -83,7 +83,7 @@ def show_state(env: RenderedEnv, state: RobotState) -> None:
 def quantities(state: RobotState) -> dict[str, tuple[float, str]]:
     """Return what is worth a look of a state: value and unit by name."""
     if state.names:
-        return {name: (value, _unit(name)) for name, value in state.names.items()}
+        return {name: (value, _unit(name)) for name, value in sorted(state.names.items())}
     names = ("target_x", "target_y", "target_yaw", "x", "y", "yaw", "linear_velocity", "angular_velocity")
     units = ("m", "m", "rad", "m", "m", "rad", "m/s", "rad/s")
     found = dict(zip(names, zip(state.values, units, strict=False), strict=False))
