@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import abstractmethod
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
 import mujoco
@@ -17,22 +17,14 @@ Start = Literal["own", "random", "here"]
 Vector = NDArray[np.float64]
 
 
-class Simulation(Protocol):
-    """What a viewer draws."""
-
-    model: mujoco.MjModel
-    data: mujoco.MjData
-
-
 class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """An environment that shows its simulator; one that derives from it sets `_camera` and `simulation`.
+    """An environment that shows its simulator; one that derives from it sets `_camera`.
 
     Positions in the methods below are in MuJoCo's world.
     """
 
     IS_PLANAR: ClassVar[bool] = False  # whether the robot drives on the floor, and everything that can be moved as well
 
-    simulation: Simulation
     _camera: Camera
 
     def __init__(self, render_mode: str | None, *, gui: bool) -> None:
@@ -49,6 +41,16 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def close(self) -> None:
         """Free the GL context and close the window."""
         self._camera.close()
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The simulator's model."""
+        return self._camera.model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """The simulator's state."""
+        return self._camera.data
 
     @abstractmethod
     def robot_position(self) -> Vector:
@@ -112,7 +114,7 @@ class Camera:
         width: int = 640,
         height: int = 480,
     ) -> None:
-        self._model, self._data = model, data
+        self.model, self.data = model, data
         self._width, self._height = width, height
         self._view = mujoco.MjvCamera()
         self._view.lookat[:] = lookat
@@ -125,8 +127,8 @@ class Camera:
         """Return the current view as (height, width, 3) uint8."""
         renderer = self._renderer
         if renderer is None:
-            renderer = self._renderer = mujoco.Renderer(self._model, height=self._height, width=self._width)
-        renderer.update_scene(self._data, camera=self._view)
+            renderer = self._renderer = mujoco.Renderer(self.model, height=self._height, width=self._width)
+        renderer.update_scene(self.data, camera=self._view)
         return np.asarray(renderer.render(), dtype=np.uint8)
 
     def viewpoint(self) -> tuple[Vector, Vector]:
@@ -141,7 +143,7 @@ class Camera:
             import mujoco.viewer  # opens a display connection when imported, so only where one is wanted
 
             before = set(threading.enumerate())
-            self._viewer = mujoco.viewer.launch_passive(self._model, self._data)
+            self._viewer = mujoco.viewer.launch_passive(self.model, self.data)
             self._viewer_threads = set(threading.enumerate()) - before
             self._viewer.cam.lookat[:] = self._view.lookat
             self._viewer.cam.distance = self._view.distance

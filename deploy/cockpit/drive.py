@@ -325,7 +325,8 @@ class Drive:
 
     def _act(self) -> Any:
         has_reward = any(tensor.name == REWARD for tensor in self._policy.contract.inputs)
-        return self._policy.act(self._obs, **({REWARD: self._reward} if has_reward else {}))
+        reward: dict[str, Any] = {REWARD: self._reward} if has_reward else {}
+        return self._policy.act(self._obs, **reward)
 
     def _wait_for_server(self, error: RlservoError) -> None:
         """Say it, and ask again soon: the robot stands, and what it sees has not changed."""

@@ -83,6 +83,12 @@ def show(shown: Shown, stop: threading.Event) -> None:
             shown.refresh((len(frames) - 1) / span_s if span_s > 0 else 0.0)
 
 
+def set_value(handle: Any, value: Any) -> None:
+    """Let a choice or a slider have a value. (mypy does not see viser's setter.)"""
+    if handle.value != value:
+        handle.value = value
+
+
 def aim_cameras(server: viser.ViserServer, position: NDArray[np.float64], look_at: NDArray[np.float64]) -> None:
     """Let everybody who looks, and who will, stand there and look at that, as near as a browser's wider lens wants."""
     position = look_at + NEARER * (position - look_at)

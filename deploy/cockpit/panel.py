@@ -13,7 +13,7 @@ import numpy as np
 import viser
 
 from rlservo.deploy.cockpit.drive import Drive, View
-from rlservo.deploy.cockpit.page import aim_cameras
+from rlservo.deploy.cockpit.page import aim_cameras, set_value
 from rlservo.deploy.cockpit.policies import FALLBACKS, Choice, Link, PolicySource
 from rlservo.deploy.cockpit.readings import Readings, escape
 from rlservo.deploy.cockpit.scenery import Scenery
@@ -130,7 +130,7 @@ class DrivePanel:
         aim_cameras(self._server, *env.viewpoint())
         self._drop.visible = len(env.obstacle_positions()) > 0
         self._robot.visible = not env.IS_PLANAR
-        self._robot.value = view.stage.arguments.get("ur_model", "ur5")
+        set_value(self._robot, view.stage.arguments.get("ur_model", "ur5"))
         self._payload.visible = not env.IS_PLANAR
         self._drawn = view.stage
 
@@ -159,7 +159,7 @@ class DrivePanel:
 
     def _choose_policy(self) -> None:
         self._offer_versions()
-        self._version.value = self._versions[self._name.value][0]
+        set_value(self._version, self._versions[self._name.value][0])
         self._choose()
 
     def _choose(self, env_arguments: dict[str, Any] | None = None) -> None:
@@ -198,7 +198,8 @@ class DrivePanel:
 
     def _offer_versions(self) -> None:
         versions = tuple(self._versions.get(self._name.value, ()))
-        for dropdown, options in ((self._version, versions), (self._ghost, (NO_GHOST, *versions))):
+        ghosts: Any = self._ghost  # typed by what it had at first
+        for dropdown, options in ((self._version, versions), (ghosts, (NO_GHOST, *versions))):
             if options and tuple(dropdown.options) != options:
                 dropdown.options = options
 

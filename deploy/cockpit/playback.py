@@ -13,7 +13,7 @@ import viser
 from numpy.typing import NDArray
 
 from rlservo.deploy.cockpit.drive import Cycle, home_arguments, home_of
-from rlservo.deploy.cockpit.page import aim_cameras
+from rlservo.deploy.cockpit.page import aim_cameras, set_value
 from rlservo.deploy.cockpit.readings import Readings, escape
 from rlservo.deploy.cockpit.scenery import Scenery
 from rlservo.deploy.cockpit.stage import Scene, Stage
@@ -150,8 +150,7 @@ class PlaybackPanel:
             lines.append(f"⚠ **The action is not the policy's.** {escape(cycle.fallback)}")
         lines += [f"⚠ {escape(sentence)}" for sentence in words]
         self._status.content = "\n\n".join(lines)
-        if self._slider.value != row:
-            self._slider.value = row
+        set_value(self._slider, row)
 
     def close(self) -> None:
         """Close the simulator."""

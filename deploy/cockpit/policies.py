@@ -83,7 +83,7 @@ class ServedPolicies(PolicySource):
         try:
             _ = client.contract  # settles the version, or says now why not
             if link.fallback in ("hold", "zero", "stop"):
-                return WithFallback(client, link.fallback)  # type: ignore[arg-type]  # narrowed by the line above
+                return WithFallback(client, link.fallback)
         except BaseException:
             client.close()
             raise

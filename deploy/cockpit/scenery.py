@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import trimesh
 import viser
+import viser.transforms
 from numpy.typing import NDArray
 
 from rlservo.deploy.cockpit.stage import Scene, Stage
@@ -36,7 +37,7 @@ class Scenery:
     ) -> None:
         """Draw a stage; `on_target` and `on_obstacle` (index, position) are called while somebody drags a handle."""
         self._server = server
-        env, model = stage.env, stage.env.simulation.model
+        env, model = stage.env, stage.env.model
         self._robot = _Bodies(server, "/robot", stage, ghost=False)
         self._ghost = _Bodies(server, "/ghost", stage, ghost=True)
         self._lift = np.array([0.0, 0.0, 0.05 if env.IS_PLANAR else 0.0])  # of the handles, off the floor
@@ -121,7 +122,7 @@ class _Bodies:
     """The shapes of a model, each body's under a frame of its own. A ghost is translucent, and the robot alone."""
 
     def __init__(self, server: viser.ViserServer, prefix: str, stage: Stage, *, ghost: bool) -> None:
-        model, data = stage.env.simulation.model, stage.env.simulation.data
+        model, data = stage.env.model, stage.env.data
         moving = moving_bodies(model)
         fixed = body_poses(data, list(range(model.nbody)))
         self._root = server.scene.add_frame(prefix, show_axes=False, visible=not ghost)
@@ -212,9 +213,8 @@ def _mesh(shape: Shape) -> Any:
         mesh = trimesh.creation.box(extents=(2 * x, 2 * y, 2 * z))
     else:
         mesh = trimesh.Trimesh(shape.vertices, shape.faces)
-    transform = trimesh.transformations.quaternion_matrix(shape.wxyz)
-    transform[:3, 3] = shape.position
-    mesh.apply_transform(transform)
+    turn = viser.transforms.SO3(shape.wxyz)
+    mesh.apply_transform(viser.transforms.SE3.from_rotation_and_translation(turn, shape.position).as_matrix())
     if shape.kind not in ("sphere", "capsule"):
         mesh.unmerge_vertices()  # edges are drawn as edges
     return mesh

@@ -53,7 +53,7 @@ class Stage:
             self._made.close()
             raise UsageError(f"the cockpit draws rlservo's own simulators (rlservo/...): {env_id} is none of them")
         self.env = env
-        self._bodies = moving_bodies(env.simulation.model)
+        self._bodies = moving_bodies(env.model)
         self._disturbed: DomainRandomization = DomainRandomization(self._made)
         self.cycle_s = 0.1
         if contract is not None:
@@ -68,10 +68,10 @@ class Stage:
         """Change the disturbances, from the next episode on. Raises ValueError for what the robot cannot have."""
         self._disturbed = DomainRandomization(
             self._made,
-            action_latency=(disturbance.action_latency,) * 2,
-            observation_latency=(disturbance.observation_latency,) * 2,
+            action_latency=(disturbance.action_latency, disturbance.action_latency),
+            observation_latency=(disturbance.observation_latency, disturbance.observation_latency),
             observation_noise=disturbance.noise,
-            payload=(disturbance.payload,) * 2,
+            payload=(disturbance.payload, disturbance.payload),
         )
 
     def begin(self, *, start: Start = "own", keep_target: bool = False, seed: int | None = None) -> Any:
@@ -96,7 +96,7 @@ class Stage:
         """Return where everything is."""
         env = self.env
         return Scene(
-            poses=body_poses(env.simulation.data, self._bodies),
+            poses=body_poses(env.data, self._bodies),
             robot=env.robot_position(),
             target=env.target_position(),
             obstacles=env.obstacle_positions(),

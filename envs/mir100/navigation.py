@@ -51,7 +51,6 @@ class Mir100Navigation(RenderedEnv):
     WORLD: ClassVar[str]
     LASER_COUNT: ClassVar[int]  # how many of the readings are observed, evenly picked
     SUCCESS_REWARD: ClassVar[float]
-    simulation: Mir100Simulation
     VIEW: ClassVar[dict[str, Any]]  # where the camera stands
 
     def __init__(

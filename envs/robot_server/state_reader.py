@@ -86,7 +86,9 @@ def quantities(state: RobotState) -> dict[str, tuple[float, str]]:
         return {name: (value, _unit(name)) for name, value in sorted(state.names.items())}
     names = ("target_x", "target_y", "target_yaw", "x", "y", "yaw", "linear_velocity", "angular_velocity")
     units = ("m", "m", "rad", "m", "m", "rad", "m/s", "rad/s")
-    found = dict(zip(names, zip(state.values, units, strict=False), strict=False))
+    found: dict[str, tuple[float, str]] = {
+        name: (value, unit) for name, value, unit in zip(names, state.values, units, strict=False)
+    }
     found["nearest_beam"] = (min(state.values[SCAN], default=math.nan), "m")
     found["in_collision"] = (state.values[SCAN.stop], "1")
     return found

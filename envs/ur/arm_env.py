@@ -40,8 +40,6 @@ Vector = NDArray[np.float64]
 class URArmEnv(RenderedEnv):
     """Move a UR arm by one command per joint and cycle; the tasks that derive from it hold the data sheets."""
 
-    simulation: URSimulation
-
     # Not a ClassVar: each instance states its own rate.
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
 
