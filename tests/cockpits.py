@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+import uvicorn
 from numpy.typing import NDArray
 from onnx import numpy_helper
 
@@ -74,6 +75,29 @@ class Browser:
         """Choose an option of a dropdown."""
         self.page.get_by_label(label, exact=True).first.click()
         self.page.get_by_role("option", name=option, exact=True).click()
+
+
+@contextlib.contextmanager
+def served_on(app: Any, port: int) -> Iterator[None]:
+    """Serve an ASGI application from a thread on a port, where it was served before, or will be again."""
+    server = uvicorn.Server(
+        uvicorn.Config(app, port=port, log_level="critical", access_log=False, timeout_graceful_shutdown=1)
+    )
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        wait_for(lambda: server.started or not thread.is_alive(), "the server")
+        assert thread.is_alive(), f"port {port} could not be served on"
+        yield
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+@pytest.fixture
+def free_port() -> int:
+    """A port that nobody has."""
+    return free_ports(1)[0]
 
 
 @pytest.fixture(scope="session")
@@ -143,12 +167,6 @@ def cockpit_of(make_panel: Callable[[Any], Any]) -> Iterator[Cockpit]:
             stop.set()
             thread.join()
             panel.close()
-
-
-@pytest.fixture
-def served_cockpit() -> Callable[[Callable[[Any], Any]], contextlib.AbstractContextManager[Cockpit]]:
-    """`cockpit_of`."""
-    return cockpit_of
 
 
 @pytest.fixture(scope="session")
