@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import os
 import shutil
 import threading
 import time
@@ -17,6 +19,7 @@ import pytest
 import uvicorn
 from numpy.typing import NDArray
 from onnx import numpy_helper
+from PIL import Image
 
 from bundles import write_bundle
 from rlservo.export.contract import bundle as bundle_files
@@ -30,7 +33,13 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 )
-PATIENCE_S = 120.0  # a browser that draws in software on a busy machine
+# The scene is the largest canvas; the others are plots.
+CORNER_OF_SCENE = """() => {
+    const boxes = [...document.querySelectorAll("canvas")].map(canvas => canvas.getBoundingClientRect());
+    const scene = boxes.sort((one, other) => other.width * other.height - one.width * one.height)[0];
+    return [scene.x, scene.y];
+}"""
+PATIENCE_S = float(os.environ.get("RLSERVO_PATIENCE_S", 180.0))  # a browser that draws in software on a busy machine
 
 
 def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
@@ -60,7 +69,9 @@ class Browser:
         wait_for(lambda: text in self.text(), f"{text!r} in the page")
 
     def drag(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> None:
-        """Drag with the mouse from one pixel to another, slowly."""
+        """Drag with the mouse from one pixel of the scene to another, slowly."""
+        corner = np.array(self.page.evaluate(CORNER_OF_SCENE))
+        start, end = corner + start, corner + end
         mouse = self.page.mouse
         mouse.move(*start)
         self.page.wait_for_timeout(500)  # until the handle has seen the mouse: it draws a frame in a while
@@ -71,10 +82,39 @@ class Browser:
         self.page.wait_for_timeout(500)
         mouse.up()
 
-    def choose(self, label: str, option: str) -> None:
-        """Choose an option of a dropdown."""
+    def click(self, name: str, *, role: str = "button") -> None:
+        self.page.get_by_role(role, name=name, exact=True).first.click()
+
+    def choose(self, label: str, option: str | None) -> None:
+        """Choose an option of a dropdown, by its name or the second one there is."""
         self.page.get_by_label(label, exact=True).first.click()
-        self.page.get_by_role("option", name=option, exact=True).click()
+        options = self.page.get_by_role("option")
+        (options.nth(1) if option is None else options.get_by_text(option, exact=True).first).click()
+
+    def fill(self, label: str, number: str) -> None:
+        """Type a number beside a slider."""
+        row = self.page.locator("label", has_text=label).locator("xpath=../../..")
+        field = row.locator("input[inputmode=decimal]")
+        field.fill(number)
+        field.press("Enter")
+
+    def plots(self) -> int:
+        """Return how many plots are shown."""
+        return int(self.page.locator(".uplot").count())
+
+    def picture_of_plot(self, index: int) -> str:
+        """Return what a plot looks like, to be compared."""
+        script = "index => document.querySelectorAll('.uplot canvas')[index].toDataURL()"
+        return str(self.page.evaluate(script, index))
+
+    def scene(self) -> NDArray[np.uint8]:
+        """Return the picture of the scene, without the panels beside it."""
+        size = self.page.viewport_size
+        clip = {"x": 340, "y": 160, "width": size["width"] - 680, "height": size["height"] - 160}
+        return np.asarray(Image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("RGB"))
+
+    def close(self) -> None:
+        self.page.context.close()
 
 
 @contextlib.contextmanager
@@ -100,7 +140,7 @@ def free_port() -> int:
     return free_ports(1)[0]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # while it is there, no asyncio.run of another test's could work in this thread
 def chromium() -> Iterator[Any]:
     """The browser, or a skip with the reason."""
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -113,20 +153,21 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
-@pytest.fixture
-def browser(chromium: Any) -> Iterator[Callable[..., Browser]]:
-    """Open a window of a size."""
-    with contextlib.ExitStack() as cleanup:
+Windows = Callable[[int, int], Browser]
 
-        def make(width: int = 900, height: int = 600) -> Browser:
-            context = chromium.new_context(viewport={"width": width, "height": height})
-            cleanup.callback(context.close)
-            opened = Browser(context.new_page())
-            opened.page.on("request", lambda request: opened.requests.append(request.url))
-            opened.page.on("websocket", lambda socket: opened.requests.append(socket.url))
-            return opened
 
-        yield make
+@pytest.fixture(scope="module")
+def windows(chromium: Any) -> Windows:
+    """Open a window of a size. Whoever opens one closes it."""
+
+    def make(width: int, height: int) -> Browser:
+        context = chromium.new_context(viewport={"width": width, "height": height})
+        opened = Browser(context.new_page())
+        opened.page.on("request", lambda request: opened.requests.append(request.url))
+        opened.page.on("websocket", lambda socket: opened.requests.append(socket.url))
+        return opened
+
+    return make
 
 
 @dataclass
@@ -138,7 +179,7 @@ class Cockpit:
     panel: Any
 
     def pixel(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where a point of the world is in the browser's window."""
+        """Return where a point of the world is in the scene of the first browser."""
         camera = next(iter(self.server.get_clients().values())).camera
         ahead = camera.look_at - camera.position
         ahead = ahead / np.linalg.norm(ahead)
