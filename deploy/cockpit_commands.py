@@ -79,6 +79,15 @@ def cockpit(
         )
 
 
+def drive_on_page(url: str, port: int) -> None:
+    """Show what a server's policies drive, on a page, until an interrupt."""
+    with needs_extra("cockpit"):
+        from rlservo.deploy.cockpit.run import run_drive
+
+    source = _source(url, None, None)
+    run_drive(source, policy=None, version=None, env_id=None, env_arguments={}, port=port, seed=None, on_ready=_tell)
+
+
 def _source(url: str | None, bundle: Path | None, api_key: str | None) -> PolicySource:
     from rlservo.deploy.cockpit.policies import BundledPolicies, ServedPolicies
 

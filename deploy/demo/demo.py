@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -53,9 +53,12 @@ ROBOTS = (
 )
 
 
-def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -> None:
+def run_demo(
+    out: Path, *, checkpoints: Path, episodes: int, console: Console, cockpit: Callable[[str], None] | None = None
+) -> None:
     """Run the demo and leave bundles, `demo.png` and the server's log in `out`.
 
+    `cockpit` takes the place of the episodes: it is given the server's address, and the server runs until it returns.
     Raises UsageError when the checkpoints are not there, RlservoError when a step fails; the server is always stopped.
     """
     for robot in ROBOTS:
@@ -79,6 +82,11 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
     runs: list[RobotRun] = []
     counts = ("--episodes", str(episodes), "--seed", str(FIRST_SEED))
     with ends_like_ctrl_c(), _server(console, repository, out / "server.log") as url:
+        if cockpit is not None:
+            console.rule("3  drive: choose the robot on the page, drag its target")
+            with suppress(KeyboardInterrupt):
+                cockpit(url)
+            return
         console.rule(f"3  drive: {episodes} episodes each, every action over HTTP")
         for robot in ROBOTS:
             _show(console, "rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts)
@@ -95,6 +103,9 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
     console.rule("4  result")
     console.print(_table(runs))
     console.print(f"picture: {picture}   bundles: {repository}   {time.monotonic() - start:.0f} s in all", markup=False)
+    console.print(
+        f"drive them yourself, in the browser: rlservo cockpit --bundle {shlex.quote(str(repository))}", markup=False
+    )
 
 
 class _Recorder(ActingPolicy):
