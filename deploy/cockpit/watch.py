@@ -36,7 +36,8 @@ class WatchPanel:
         except RobotServerError as error:
             self._reader.close()
             raise UnavailableError(str(error)) from error
-        self._trouble = ""
+        self.trouble = ""
+        """What is wrong, or nothing."""
         self._is_closed = threading.Event()
         self._states: deque[RobotState] = deque([state], maxlen=WINDOW)
         gui = server.gui
@@ -48,6 +49,11 @@ class WatchPanel:
         self._looks = threading.Thread(target=self._look, name="cockpit-robot-server", daemon=True)
         self._looks.start()
 
+    @property
+    def scene(self) -> Scene:
+        """Where everything was at the last look."""
+        return self._scenes[1]
+
     def draw(self) -> None:
         """Draw a frame of the scene."""
         before, after, since = self._scenes
@@ -58,8 +64,8 @@ class WatchPanel:
         states = list(self._states)
         shown = quantities(states[-1])
         lines = [f"**robot server {self._reader.address}**, {frames_per_s:.0f} frames/s"]
-        if self._trouble:
-            lines.append(f"⚠ **{escape(self._trouble)}**")
+        if self.trouble:
+            lines.append(f"⚠ **{escape(self.trouble)}**")
         self._status.content = "\n\n".join(lines)
         rows = [quantities(state) for state in states]
         self._plot.update(range(len(rows)), [[row[name][0] for row in rows] for name in self._names])
@@ -98,11 +104,11 @@ class WatchPanel:
                 state = self._reader.read()
                 scene = self._shown(state)
             except RobotServerError as error:
-                self._trouble, wait_s = f"{error}; looking again", RETRY_S
+                self.trouble, wait_s = f"{error}; looking again", RETRY_S
                 continue
             self._states.append(state)
             self._scenes = self._scenes[1], scene, time.perf_counter()
-            self._trouble, wait_s = "", PERIOD_S
+            self.trouble, wait_s = "", PERIOD_S
 
 
 def _plotted(state: RobotState) -> list[str]:

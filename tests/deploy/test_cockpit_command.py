@@ -8,11 +8,12 @@ import socket
 import subprocess
 import sys
 import urllib.request
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
-viser = pytest.importorskip("viser", reason="the cockpit draws with viser")
+pytest.importorskip("viser", reason="the cockpit draws with viser")
 
 from servers import free_ports, running
 
@@ -33,7 +34,7 @@ def handshake(port: int, origin: str) -> int:
         "Upgrade": "websocket",
         "Sec-WebSocket-Version": "13",
         "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
-        "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
+        "Sec-WebSocket-Protocol": f"viser-v{version('viser')}",
         "Origin": origin,
     }
     connection.request("GET", "/", headers=headers)

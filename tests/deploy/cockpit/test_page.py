@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("viser", reason="the cockpit draws with viser")
 
@@ -30,7 +32,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::DeprecationW
 
 ENV = "rlservo/EndEffectorPositioningURSim-v0"
 ARROW_M = 0.19  # from the target to where its handle's arrow is taken
-# Where the pictures of the README go: RLSERVO_PICTURES=examples pytest tests/deploy/cockpit/test_page.py
+# Where the README's picture goes: RLSERVO_PICTURES=examples pytest tests/deploy/cockpit/test_page.py -k picture
 PICTURES = os.environ.get("RLSERVO_PICTURES")
 
 
@@ -122,6 +124,28 @@ def test_a_second_browser_may_watch_on_a_phone_and_go(cockpit: Cockpit, window: 
     wait_for(lambda: len(cockpit.server.get_clients()) == 1, "the phone is gone")
     first = window.text()
     wait_for(lambda: window.text() != first, "the first browser's numbers go on")
+
+
+def test_a_picture_for_the_readme(cockpit: Cockpit, drive: Drive, windows: Windows, tmp_path: Path) -> None:
+    window = windows(1280, 720)
+    window.open(cockpit.address)
+    window.page.get_by_role("alert").locator("button").first.click()  # that it draws in software
+    drive.drag_target(np.array([-0.35, 0.45, 0.35]))
+    drive.do(lambda: drive.begin("own", keep_target=True))
+    drive.do(lambda: drive.choose_ghost(Choice("ur5", "2")))
+    drive.do(drive.play)
+    start = drive.history[-1].number
+    wait_for(lambda: drive.history[-1].number > start + 16 and drive.view.ghost is not None, "both are on their way")
+    drive.do(drive.pause)
+    window.wait_for("paused")
+    window.page.wait_for_timeout(3000)  # until the last frame is drawn
+    file = Path(PICTURES or tmp_path) / "cockpit.png"
+    picture = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
+    picture.quantize(128).save(file, optimize=True)
+    window.close()
+    drive.do(lambda: drive.choose_ghost(None))
+    drive.do(drive.play)
+    assert len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 500  # no empty page
 
 
 def test_out_of_distribution_is_coloured_and_said(drive: Drive, window: Browser) -> None:
