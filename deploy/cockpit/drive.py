@@ -76,6 +76,7 @@ class View:
     phase: Phase
     sentence: str  # what goes on
     trouble: str  # what is wrong, or nothing
+    refusal: str  # why the last command was not followed, or nothing
     episodes: int
     successes: int
     late: int
@@ -131,7 +132,7 @@ class Drive:
         self._is_users_target = False
         self._speed = 1.0
         self._due = self._since = time.perf_counter()
-        self._sentence = self._trouble = ""
+        self._sentence = self._trouble = self._refusal = ""
         self._episodes = self._successes = self._late = self._fallbacks = self._cycles = 0
         self._reward = 0.0
         self.history: deque[Cycle] = deque(maxlen=HISTORY)
@@ -175,8 +176,10 @@ class Drive:
     def step(self) -> None:
         """Let one control cycle pass, and pause."""
         self.play()
-        self._cycle()
-        self.pause()
+        try:
+            self._cycle()
+        finally:
+            self.pause()
 
     def begin(self, start: Start, *, keep_target: bool = False) -> None:
         """Begin an episode now; later ones that do not go on from where the robot is start alike."""
@@ -261,22 +264,25 @@ class Drive:
                 command = self._commands.get(timeout=max(0.0, wait_s)) if wait_s > 0 else self._commands.get_nowait()
             except queue.Empty:
                 if self._phase == "driving":
-                    self._guarded(self._cycle)
+                    self._trouble = self._guarded(self._cycle) or self._trouble
+                    self.view = self._view()
                 continue
             if command is None:
                 return
-            self._guarded(command)
+            self._refusal = self._guarded(command)
+            self.view = self._view()
 
-    def _guarded(self, command: Callable[[], None]) -> None:
-        """Run something; what it raises is said in the page, and the thread goes on."""
+    def _guarded(self, command: Callable[[], None]) -> str:
+        """Run something; return what it raises in words: the thread goes on."""
         try:
             command()
         except (RlservoError, ValueError) as error:
-            self._trouble = getattr(error, "message", None) or str(error)
+            return str(getattr(error, "message", None) or error)
         except Exception as error:  # an environment is anyone's code, and a thread that ends says nothing
             logger.exception("the cockpit's drive failed")
-            self._trouble, self._phase = f"{type(error).__name__}: {error}", "paused"
-        self.view = self._view()
+            self._phase = "paused"
+            return f"{type(error).__name__}: {error}"
+        return ""
 
     def _cycle(self) -> None:
         """Let one control cycle pass, or begin the next episode."""
@@ -300,7 +306,7 @@ class Drive:
             self._fallbacks += 1
         self._trouble = fallback
         obs, value, difference = self._obs, self._value(), self._step_ghost(action)
-        self._obs, self._reward, is_over, info = self._stage.step(action)
+        self._obs, self._reward, terminated, truncated, info = self._stage.step(action)
         self._before, self._after, self._since = self._after, self._stage.scene(), time.perf_counter()
         is_late = bool(fallback) or latency_ms > self._late_beyond_ms()
         self._late += is_late
@@ -320,8 +326,8 @@ class Drive:
                 difference=difference,
             )
         )
-        if is_over:
-            self._end(info)
+        if terminated or truncated:
+            self._end(info, is_arrival=terminated and bool(success_of(info)))
 
     def _act(self) -> Any:
         has_reward = any(tensor.name == REWARD for tensor in self._policy.contract.inputs)
@@ -384,7 +390,8 @@ class Drive:
             return None
         ghost.before = ghost.after
         if not ghost.is_over:
-            ghost.obs, _, ghost.is_over, _ = ghost.stage.step(own)
+            ghost.obs, _, terminated, truncated, _ = ghost.stage.step(own)
+            ghost.is_over = terminated or truncated
             ghost.after = ghost.stage.scene()
         difference: NDArray[Any] = np.atleast_1d(np.asarray(follows) - np.asarray(action))
         return difference
@@ -405,12 +412,12 @@ class Drive:
             ghost.before = ghost.after = ghost.stage.scene()
         self._sentence = f"Episode {self._episodes + 1} runs."
 
-    def _end(self, info: Mapping[str, Any]) -> None:
+    def _end(self, info: Mapping[str, Any], *, is_arrival: bool) -> None:
         """Count an episode, and say how it goes on: from where the robot is, but after a failure."""
         is_success, status = bool(success_of(info)), info.get("final_status")
         self._episodes += 1
         self._successes += is_success
-        if is_success and self._is_users_target:
+        if is_arrival and self._is_users_target:
             self._phase = "arrived"
             self._sentence = "Arrived. Drag the target on, or let a new one be drawn."
             return
@@ -483,6 +490,7 @@ class Drive:
             phase=self._phase,
             sentence=self._sentence,
             trouble=self._trouble,
+            refusal=self._refusal,
             episodes=self._episodes,
             successes=self._successes,
             late=self._late,

@@ -109,9 +109,13 @@ class DrivePanel:
             f"{view.sentence} Reached: **{view.successes} of {view.episodes}** ({rate}).",
             f"Late: {view.late}. Fallback actions: {view.fallbacks}.",
         ]
-        if view.trouble:
-            lines.append(f"⚠ **{escape(view.trouble)}**")
+        lines += [f"⚠ **{escape(sentence)}**" for sentence in (view.refusal, view.trouble) if sentence]
         lines += [f"⚠ {escape(sentence)}" for sentence in words]
+        if view.refusal:  # show what drives on, not what was chosen in vain
+            set_value(self._name, self._drive.choice.name)
+            self._offer_versions()
+            set_value(self._version, self._drive.choice.version)
+            set_value(self._robot, view.stage.arguments.get("ur_model", "ur5"))
         content = "\n\n".join(lines)
         if self._status.content != content:
             self._status.content = content
@@ -132,6 +136,7 @@ class DrivePanel:
         self._robot.visible = not env.IS_PLANAR
         set_value(self._robot, view.stage.arguments.get("ur_model", "ur5"))
         self._payload.visible = not env.IS_PLANAR
+        set_value(self._ghost, NO_GHOST)
         self._drawn = view.stage
 
     def _rebuild_readings(self, view: View) -> None:

@@ -45,15 +45,19 @@ class Tape:
         else:
             for followed in islice(Follower(bundle).follow(recording, policy), MOST_EPISODES):
                 self.episodes.append(followed.episode)
+                if "action" not in followed.action:
+                    raise UsageError(
+                        f"the actions of {followed.episode.policy.title} are nested: no robot of ours has such"
+                    )
                 difference = followed.action["action"] - followed.episode.action["action"]
                 difference = difference.reshape(len(followed.episode), -1).astype(np.float64)
                 difference[~followed.known] = np.nan
                 self.differences.append(difference)
         if not self.episodes:
             raise UsageError(f"{path} has no decisions of {f'policy {policy!r}' if policy else 'any policy'}")
+        self.contract = self.episodes[0].policy.contract
         if bundle is not None:
             self.moments = replay(recording, bundle, name=policy).worst
-        self.contract = self.episodes[0].policy.contract
 
     def find(self, moment: Moment) -> tuple[int, int]:
         """Return episode and row of a moment; the first ones where it is beyond the episodes in memory."""
@@ -96,6 +100,7 @@ class PlaybackPanel:
         self._tape = tape
         contract = tape.contract
         home = env_id or home_of(contract)
+        Stage(home, home_arguments(contract), contract).close()  # or the sentence that says what does not fit
         self._stage = Stage(EMPTY_FLOOR if "Mir100" in home else home, home_arguments(contract))
         self._stage.begin()
         self._period_s = 1.0 / (contract.control_rate_hz or 10.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -18,6 +19,7 @@ SHOWN_BEAMS = 128  # of a thousand
 PATH_LENGTH = 400  # control cycles
 BEAM_COLOUR, PATH_COLOUR, GHOST_COLOUR = (220, 60, 50), (40, 120, 220), (60, 130, 240)
 GHOST_OPACITY = 0.35
+HELD_S = 1.0  # after the last movement
 HANDLE_SIZE, PLANAR_HANDLE_SIZE = 0.3, 1.0  # [m]
 
 Move = Callable[[NDArray[np.float64]], None]
@@ -170,18 +172,18 @@ class _Handle:
         self._control = server.scene.add_transform_controls(
             name, scale=size, active_axes=(True, True, not is_planar), disable_rotations=True, depth_test=False
         )
-        self._is_held = False
+        self._held_until = 0.0  # a browser that goes away while it drags never lets go
         self._control.on_update(lambda event: self._moved(event, on_move))
 
     def follow(self, position: NDArray[np.float64]) -> None:
-        if not self._is_held and not np.allclose(self._control.position, position, atol=1e-6):
+        if time.monotonic() > self._held_until and not np.allclose(self._control.position, position, atol=1e-6):
             self._control.position = position
 
     def remove(self) -> None:
         self._control.remove()
 
     def _moved(self, event: viser.TransformControlsEvent, on_move: Move) -> None:
-        self._is_held = event.phase != "end"
+        self._held_until = 0.0 if event.phase == "end" else time.monotonic() + HELD_S
         on_move(np.array(event.target.position, np.float64))
 
 

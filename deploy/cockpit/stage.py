@@ -87,10 +87,10 @@ class Stage:
         options = other.env.reset_options(start="here", keep_target=True)
         return self._disturbed.reset(options=options)[0]
 
-    def step(self, action: Any) -> tuple[Any, float, bool, dict[str, Any]]:
-        """Let one control cycle pass; return observation, reward, whether the episode is over, and info."""
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Let one control cycle pass; return observation, reward, terminated, truncated, info."""
         obs, reward, terminated, truncated, info = self._disturbed.step(action)
-        return obs, float(reward), terminated or truncated, info
+        return obs, float(reward), terminated, truncated, info
 
     def scene(self) -> Scene:
         """Return where everything is."""

@@ -103,7 +103,7 @@ class WatchPanel:
             try:
                 state = self._reader.read()
                 scene = self._shown(state)
-            except RobotServerError as error:
+            except (RobotServerError, ValueError) as error:
                 self.trouble, wait_s = f"{error}; looking again", RETRY_S
                 continue
             self._states.append(state)

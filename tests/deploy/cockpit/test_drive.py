@@ -113,8 +113,12 @@ def test_a_policy_of_another_robot_brings_that_along(drives: Callable[..., Drive
 def test_what_does_not_fit_is_said_and_nothing_changes(drives: Callable[..., Drive], two_versions: Path) -> None:
     drive = drives()
     drive.do(lambda: drive.choose(Choice("nobody", "1")))
-    wait_for(lambda: "no bundle nobody/1" in drive.view.trouble, "the sentence")
-    assert drive.view.contract.name == "ur5"
+    wait_for(lambda: "no bundle nobody/1" in drive.view.refusal, "the sentence")
+    cycles = drive.history[-1].number if drive.history else 0
+    wait_for(lambda: len(drive.history) and drive.history[-1].number > cycles + 3, "it drives on")
+    assert "no bundle nobody/1" in drive.view.refusal and drive.view.contract.name == "ur5"
+    drive.do(lambda: drive.set_speed(1.0))
+    wait_for(lambda: drive.view.refusal == "", "another command is followed")
     with pytest.raises(UsageError, match="does not fit rlservo/NoObstacle"):
         Drive(BundledPolicies(two_versions), Choice("ur5", "1"), env_id="rlservo/NoObstacleNavigationMir100Sim-v0")
     with pytest.raises(UsageError, match="CartPole-v1 is none of them"):

@@ -131,17 +131,18 @@ def test_a_picture_for_the_readme(cockpit: Cockpit, drive: Drive, windows: Windo
     window.open(cockpit.address)
     window.page.get_by_role("alert").locator("button").first.click()  # that it draws in software
     drive.drag_target(np.array([-0.35, 0.45, 0.35]))
-    drive.do(lambda: drive.begin("own", keep_target=True))
-    drive.do(lambda: drive.choose_ghost(Choice("ur5", "2")))
     drive.do(drive.play)
+    window.choose("Second version", "2")
+    wait_for(lambda: drive.view.ghost is not None, "the ghost")
+    drive.do(lambda: drive.begin("own", keep_target=True))
     start = drive.history[-1].number
-    wait_for(lambda: drive.history[-1].number > start + 16 and drive.view.ghost is not None, "both are on their way")
+    wait_for(lambda: drive.history[-1].number > start + 18, "both are on their way")
     drive.do(drive.pause)
     window.wait_for("paused")
     window.page.wait_for_timeout(3000)  # until the last frame is drawn
     file = Path(PICTURES or tmp_path) / "cockpit.png"
     picture = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
-    picture.quantize(128).save(file, optimize=True)
+    picture.quantize(256).save(file, optimize=True)
     window.close()
     drive.do(lambda: drive.choose_ghost(None))
     drive.do(drive.play)
