@@ -12,15 +12,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rlservo.deploy.cockpit.ghost import Ghost
 from rlservo.deploy.cockpit.policies import Choice, Link, PolicySource
-from rlservo.deploy.cockpit.stage import Disturbance, Scene, Stage
-from rlservo.envs.registration import NAMESPACE
+from rlservo.deploy.cockpit.stage import Disturbance, Stage, home_arguments, home_of
+from rlservo.deploy.cockpit.view import Cycle, Phase, View
 from rlservo.envs.rendering import Start
 from rlservo.export.contract.contract import REWARD, Contract
 from rlservo.export.contract.errors import (
@@ -30,7 +31,6 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
     UsageError,
 )
-from rlservo.serve_app.interface import ActingPolicy
 from rlservo.serve_app.rollout.episode import success_of
 from rlservo.serve_app.rollout.fallback import StoppedError, WithFallback
 from rlservo.serve_app.runtime.policy import Policy
@@ -41,57 +41,6 @@ HISTORY = 600  # control cycles
 DWELL_S = 1.0  # between an episode's end and the next one
 RETRY_S = 0.5  # between two requests while the server does not answer
 IDLE_S = 0.2  # between two looks at the commands while nothing moves
-
-Phase = Literal["driving", "paused", "arrived"]
-
-
-@dataclass(frozen=True)
-class Cycle:
-    """One control cycle: what the policy saw and did."""
-
-    number: int  # since the drive began
-    obs: NDArray[Any]
-    action: NDArray[Any]
-    latency_ms: float
-    is_late: bool  # beyond the deadline or a control cycle, whichever is shorter
-    fallback: str  # why the action is not the policy's, or nothing
-    warnings: tuple[str, ...]
-    value: float | None
-    distance: float | None  # [m], of the robot from the target
-    difference: NDArray[Any] | None  # of the ghost's policy's action for the same observation
-
-
-@dataclass(frozen=True)
-class View:
-    """Everything that is drawn of one moment."""
-
-    stage: Stage
-    contract: Contract
-    before: Scene
-    after: Scene
-    since: float  # time.perf_counter() when `after` was reached
-    period_s: float  # on the wall, until the next cycle
-    ghost: tuple[Scene, Scene] | None
-    ghost_contract: Contract | None
-    phase: Phase
-    sentence: str  # what goes on
-    trouble: str  # what is wrong, or nothing
-    refusal: str  # why the last command was not followed, or nothing
-    episodes: int
-    successes: int
-    late: int
-    late_beyond_ms: float
-    fallbacks: int
-
-
-@dataclass
-class _Ghost:
-    policy: ActingPolicy
-    stage: Stage
-    obs: Any
-    before: Scene
-    after: Scene
-    is_over: bool = False
 
 
 class Drive:
@@ -121,7 +70,7 @@ class Drive:
             self._policy.close()
             raise
         self._disturbance = Disturbance()
-        self._ghost: _Ghost | None = None
+        self._ghost: Ghost | None = None
         self._commands: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._dragged: NDArray[np.float64] | None = None  # where the target was dragged to, and has not been put yet
@@ -246,13 +195,11 @@ class Drive:
             return
         policy = self._source.open(choice, Link(self._link.deadline_ms))
         try:
-            stage = Stage(self._stage.env_id, self._stage.arguments, policy.contract)
+            self._ghost = Ghost(policy, self._stage)
         except BaseException:
             policy.close()
             raise
-        stage.disturb(self._disturbance)
-        scene = stage.scene()
-        self._ghost = _Ghost(policy, stage, None, scene, scene)
+        self._ghost.stage.disturb(self._disturbance)
         self._begin("here", keep_target=True)
 
     # -- the thread
@@ -379,22 +326,11 @@ class Drive:
 
     def _step_ghost(self, action: Any) -> NDArray[Any] | None:
         """Let the ghost take its step; return how its action differs for what the robot sees."""
-        ghost = self._ghost
-        if ghost is None:
-            return None
-        # Two rows, two episodes side by side: one follows the robot's observations, one the ghost's own.
         try:
-            follows, own = ghost.policy.act(np.stack([self._obs, ghost.obs]))
+            return None if self._ghost is None else self._ghost.step(self._obs, action)
         except RlservoError as error:
             self._trouble = f"the ghost: {error.message}"
             return None
-        ghost.before = ghost.after
-        if not ghost.is_over:
-            ghost.obs, _, terminated, truncated, _ = ghost.stage.step(own)
-            ghost.is_over = terminated or truncated
-            ghost.after = ghost.stage.scene()
-        difference: NDArray[Any] = np.atleast_1d(np.asarray(follows) - np.asarray(action))
-        return difference
 
     # -- episodes
 
@@ -405,11 +341,8 @@ class Drive:
         self._reward = 0.0
         self._after = self._stage.scene()
         self._before = self._after
-        ghost = self._ghost
-        if ghost is not None:
-            ghost.obs, ghost.is_over = ghost.stage.begin_like(self._stage), False
-            ghost.policy.reset()
-            ghost.before = ghost.after = ghost.stage.scene()
+        if self._ghost is not None:
+            self._ghost.begin(self._stage)
         self._sentence = f"Episode {self._episodes + 1} runs."
 
     def _end(self, info: Mapping[str, Any], *, is_arrival: bool) -> None:
@@ -472,8 +405,7 @@ class Drive:
 
     def _drop_ghost(self) -> None:
         if self._ghost is not None:
-            self._ghost.policy.close()
-            self._ghost.stage.close()
+            self._ghost.close()
             self._ghost = None
 
     def _view(self) -> View:
@@ -485,8 +417,8 @@ class Drive:
             after=self._after,
             since=self._since,
             period_s=self._stage.cycle_s / self._speed,
-            ghost=None if ghost is None else (ghost.before, ghost.after),
-            ghost_contract=None if ghost is None else ghost.policy.contract,
+            ghost=None if ghost is None else ghost.scenes,
+            ghost_contract=None if ghost is None else ghost.contract,
             phase=self._phase,
             sentence=self._sentence,
             trouble=self._trouble,
@@ -497,19 +429,3 @@ class Drive:
             late_beyond_ms=self._late_beyond_ms(),
             fallbacks=self._fallbacks,
         )
-
-
-def home_of(contract: Contract) -> str:
-    """Return the environment that a policy was trained in. Raises UsageError where it is none of ours."""
-    env_id = contract.provenance.env_id
-    if env_id is None or not env_id.startswith(f"{NAMESPACE}/"):
-        raise UsageError(
-            f"policy '{contract.name}' was trained in {env_id or 'an environment it does not name'}, which the cockpit "
-            f"cannot draw: name one of rlservo's simulators that it fits with --env"
-        )
-    return env_id
-
-
-def home_arguments(contract: Contract) -> dict[str, Any]:
-    """Return what of that environment's arguments decides how the robot looks."""
-    return {name: value for name, value in contract.provenance.env_config.items() if name == "ur_model"}

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import viser
 
-from rlservo.deploy.cockpit.drive import Drive, View
+from rlservo.deploy.cockpit.drive import Drive
 from rlservo.deploy.cockpit.page import aim_cameras, set_value
 from rlservo.deploy.cockpit.policies import FALLBACKS, Choice, Link, PolicySource
 from rlservo.deploy.cockpit.readings import Readings, escape
 from rlservo.deploy.cockpit.scenery import Scenery
 from rlservo.deploy.cockpit.stage import Disturbance, Stage
+from rlservo.deploy.cockpit.view import View
 from rlservo.envs.ur.parameters import UR_PARAMETERS
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError

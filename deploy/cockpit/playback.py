@@ -12,11 +12,11 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from rlservo.deploy.cockpit.drive import Cycle, home_arguments, home_of
 from rlservo.deploy.cockpit.page import aim_cameras, set_value
 from rlservo.deploy.cockpit.readings import Readings, escape
 from rlservo.deploy.cockpit.scenery import Scenery
-from rlservo.deploy.cockpit.stage import Scene, Stage
+from rlservo.deploy.cockpit.stage import Scene, Stage, home_arguments, home_of
+from rlservo.deploy.cockpit.view import Cycle
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording

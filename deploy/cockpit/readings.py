@@ -10,7 +10,7 @@ import viser
 import viser.uplot
 from numpy.typing import NDArray
 
-from rlservo.deploy.cockpit.drive import Cycle
+from rlservo.deploy.cockpit.view import Cycle
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.spaces import BoxSpec, LeafSpec
 from rlservo.serve_app.runtime.drift import SMALLEST_STD, training_moments

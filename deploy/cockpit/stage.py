@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rlservo.envs.checks import InvalidResetError
 from rlservo.envs.randomization import DomainRandomization
+from rlservo.envs.registration import NAMESPACE
 from rlservo.envs.rendering import RenderedEnv, Start
 from rlservo.envs.shapes import Poses, body_poses, moving_bodies
 from rlservo.export.contract.contract import Contract
@@ -105,3 +106,19 @@ class Stage:
 
     def close(self) -> None:
         self._made.close()
+
+
+def home_of(contract: Contract) -> str:
+    """Return the environment that a policy was trained in. Raises UsageError where it is none of ours."""
+    env_id = contract.provenance.env_id
+    if env_id is None or not env_id.startswith(f"{NAMESPACE}/"):
+        raise UsageError(
+            f"policy '{contract.name}' was trained in {env_id or 'an environment it does not name'}, which the cockpit "
+            f"cannot draw: name one of rlservo's simulators that it fits with --env"
+        )
+    return env_id
+
+
+def home_arguments(contract: Contract) -> dict[str, Any]:
+    """Return what of that environment's arguments decides how the robot looks."""
+    return {name: value for name, value in contract.provenance.env_config.items() if name == "ur_model"}
