@@ -86,6 +86,13 @@ def test_bad_input_is_one_sentence_and_exit_code_2(shipped: Path, tmp_path: Path
         assert (code, expected in sentence) == (1, True), sentence
 
 
+def test_the_tunnel_to_the_internet_is_closed() -> None:
+    from rlservo.deploy.cockpit.page import served_page
+
+    with served_page(free_ports(1)[0], "a test") as server:
+        assert server.request_share_url() is None
+
+
 def test_without_viser_the_sentence_names_the_extra(shipped: Path) -> None:
     program = (
         "import sys; sys.modules['viser'] = None; from rlservo.deploy.cli import main; "

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from cockpits import wait_for
+from cockpits import served_on, wait_for
 from rlservo.deploy.cockpit.drive import Drive
 from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, Link, ServedPolicies
 from rlservo.deploy.cockpit.stage import Disturbance
@@ -143,11 +142,7 @@ def test_disturbances_begin_with_an_episode_where_the_robot_stands(drives: Calla
     assert np.abs(seen[-1] + (0, 0, 0.1) - drive.view.after.robot).max() > 1e-4  # noisy, and not where it is
 
 
-def test_a_server_that_goes_away_is_waited_for_and_driven_on_with(
-    two_versions: Path, served: Callable[[Any], AbstractContextManager[int]], free_port: int
-) -> None:
-    from cockpits import served_on
-
+def test_a_server_that_goes_away_is_waited_for_and_driven_on_with(two_versions: Path, free_port: int) -> None:
     store = load_store(two_versions)
     app = create_app(lambda: store, ServerSettings())
     source = ServedPolicies(f"http://127.0.0.1:{free_port}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -163,16 +164,14 @@ def test_nothing_was_asked_of_another_machine(window: Browser) -> None:
     assert hosts == {"127.0.0.1"} and len(window.requests) >= 2
 
 
-def test_thirty_frames_are_drawn_a_second_where_the_machine_lets_it(cockpit: Cockpit, drive: Drive) -> None:
-    """The work of a frame, simulation included: 20 a second need it to be below 50 ms."""
-    import time
-
+def test_a_frame_takes_far_less_than_a_twentieth_of_a_second(cockpit: Cockpit) -> None:
+    """Of processor time: what a busy machine makes of it on the wall is not the cockpit's doing."""
     spent = []
     for _ in range(100):
         began = time.thread_time()
         cockpit.panel.draw()
         spent.append(time.thread_time() - began)
-    assert np.median(spent) < 0.05
+    assert np.median(spent) < 0.025
 
 
 def test_a_server_that_goes_away_is_said_and_comes_back(app: Any, windows: Windows, free_port: int) -> None:
