@@ -44,9 +44,9 @@ def cockpit(
         str | None, typer.Option(envvar="RLSERVO_API_KEY", help="Rather in the variable: others see arguments.")
     ] = None,
 ) -> None:
-    """Show a robot that a policy drives on a page in the browser, until Ctrl-C.
+    """Show in the browser how a policy drives a robot.
 
-    Drag its target, and read what the policy sees.
+    Drag its target, and read what the policy sees. Ctrl-C ends it.
 
     Example: `rlservo cockpit --url http://127.0.0.1:8000 --policy ur5`
     """
