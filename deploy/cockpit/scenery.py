@@ -19,6 +19,7 @@ SHOWN_BEAMS = 128  # of a thousand
 PATH_LENGTH = 400  # control cycles
 BEAM_COLOUR, PATH_COLOUR, GHOST_COLOUR = (220, 60, 50), (40, 120, 220), (60, 130, 240)
 GHOST_OPACITY = 0.35
+TARGET_LIFT, OBSTACLE_LIFT = 0.1, 0.55  # [m], of handles that move on the floor: above what they move
 HELD_S = 1.0  # after the last movement
 HANDLE_SIZE, PLANAR_HANDLE_SIZE = 0.3, 1.0  # [m]
 
@@ -42,7 +43,8 @@ class Scenery:
         env, model = stage.env, stage.env.model
         self._robot = _Bodies(server, "/robot", stage, ghost=False)
         self._ghost = _Bodies(server, "/ghost", stage, ghost=True)
-        self._lift = np.array([0.0, 0.0, 0.05 if env.IS_PLANAR else 0.0])  # of the handles, off the floor
+        self._lift = np.array([0.0, 0.0, TARGET_LIFT if env.IS_PLANAR else 0.0])
+        self._obstacle_lift = np.array([0.0, 0.0, OBSTACLE_LIFT])
         self._beams = server.scene.add_line_segments("/beams", _no_lines(), BEAM_COLOUR, thickness=0.004)
         self._path = server.scene.add_line_segments("/path", _no_lines(), PATH_COLOUR, thickness=0.008)
         self._points: list[NDArray[np.float64]] = []
@@ -59,7 +61,7 @@ class Scenery:
                     f"/obstacle_{index}",
                     size,
                     env.IS_PLANAR,
-                    lambda at, index=index: on_obstacle(index, at - self._lift),  # type: ignore[misc]
+                    lambda at, index=index: on_obstacle(index, at - self._obstacle_lift),  # type: ignore[misc]
                 )
             )
         extent = float(model.stat.extent)
@@ -83,7 +85,7 @@ class Scenery:
             if self._target is not None and after.target is not None:
                 self._target.follow(after.target + self._lift)
             for handle, position in zip(self._handles, after.obstacles, strict=False):
-                handle.follow(position + self._lift)
+                handle.follow(position + self._obstacle_lift)
             self._draw_beams((before if share < 0.5 else after).beams)
             self._draw_path(before.robot + share * (after.robot - before.robot))
 

@@ -23,6 +23,7 @@ from rlservo.deploy.cockpit.drive import Drive
 from rlservo.deploy.cockpit.panel import DrivePanel
 from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
 from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, ServedPolicies
+from rlservo.deploy.cockpit.scenery import OBSTACLE_LIFT, TARGET_LIFT
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
@@ -191,6 +192,36 @@ def test_a_server_that_goes_away_is_said_and_comes_back(app: Any, windows: Windo
             wait_for(lambda: "waiting for the policy" not in window.text(), "it is back")
             cycles = drive.history[-1].number
             wait_for(lambda: drive.history[-1].number > cycles + 3, "the robot moves again")
+
+
+def test_target_and_cubes_of_a_mir100_are_dragged_and_dropped(two_versions: Path, windows: Windows) -> None:
+    source = BundledPolicies(two_versions)
+    with ExitStack() as cleanup:
+        drive = Drive(source, Choice("mir100_obstacle_avoidance", "1"), seed=3)
+        cleanup.callback(drive.close)
+        drive.start()
+        cockpit = cleanup.enter_context(cockpit_of(lambda server: DrivePanel(server, drive, source)))
+        window = windows(1200, 700)
+        cleanup.callback(window.close)
+        window.open(cockpit.address)
+        window.click("Pause")
+        window.wait_for("paused")
+        left = np.array([0.0, 1.0, 0.0])
+
+        def place(of: str) -> Any:
+            return drive.view.after.target if of == "target" else drive.view.after.obstacles[1]
+
+        for of, lift in (("target", TARGET_LIFT), ("cube", OBSTACLE_LIFT)):
+            before = place(of)
+            handle = before + (0.0, 0.0, lift)
+            window.drag(cockpit.pixel(handle + 0.6 * left), cockpit.pixel(handle + 1.0 * left))
+            wait_for(
+                lambda of=of, before=before: place(of)[1] > before[1] + 0.2, f"the {of} is where it was dragged to"
+            )
+            assert np.allclose(place(of)[[0, 2]], before[[0, 2]], atol=1e-3)
+        window.click("Drop a cube ahead")
+        robot = drive.view.after.robot
+        wait_for(lambda: np.linalg.norm(drive.view.after.obstacles - robot, axis=1).min() < 1.31, "a cube is near")
 
 
 def test_a_recording_scrubs_and_jumps_to_the_worst_moment(two_versions: Path, windows: Windows, tmp_path: Path) -> None:
