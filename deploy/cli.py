@@ -14,6 +14,7 @@ import typer
 import rlservo
 from rlservo.deploy import (
     cluster_commands,
+    cockpit_commands,
     export_commands,
     log_commands,
     policy_commands,
@@ -65,6 +66,7 @@ for command in (
     serve_commands.key,
     serve_commands.rollout,
     serve_commands.demo,
+    cockpit_commands.cockpit,
     robot_commands.server_manager,
     log_commands.replay,
     log_commands.estimate,

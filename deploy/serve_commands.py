@@ -191,6 +191,10 @@ def demo(
     checkpoints: Annotated[Path, typer.Option(help="Folder of the shipped checkpoints.")] = Path(
         "examples/checkpoints"
     ),
+    cockpit: Annotated[
+        bool, typer.Option("--cockpit", help="Instead of episodes, a page on which to drive both robots, until Ctrl-C.")
+    ] = False,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Of that page, on 127.0.0.1.")] = 8090,
 ) -> None:
     """Export two policies, serve them and drive both robots. The checkpoints are those that ship with the project.
 
@@ -200,7 +204,18 @@ def demo(
     with needs_extra("all"):
         from rlservo.deploy.demo.demo import run_demo
 
-    run_demo(out, checkpoints=checkpoints, episodes=episodes, console=terminal.output())
+    def open_cockpit(url: str) -> None:
+        from rlservo.deploy.cockpit_commands import drive_on_page
+
+        drive_on_page(url, port)
+
+    run_demo(
+        out,
+        checkpoints=checkpoints,
+        episodes=episodes,
+        console=terminal.output(),
+        cockpit=open_cockpit if cockpit else None,
+    )
 
 
 def _acting_policy(

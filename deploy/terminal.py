@@ -6,6 +6,7 @@ Importing rich takes as long as everything else that `rlservo --help` needs.
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -48,6 +49,22 @@ def needs_extra(name: str) -> Iterator[None]:
         raise UsageError(
             f"this command needs the Python package {error.name!r}: pip install 'rlservo[{name}]'"
         ) from error
+
+
+@contextmanager
+def ends_like_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM and a closed terminal interrupt what runs inside too, as Ctrl-C does."""
+
+    def interrupt(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    # SIGINT as well: a shell's background job starts with it ignored.
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def note(line: str) -> None:

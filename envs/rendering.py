@@ -1,20 +1,29 @@
-"""Pictures of a simulator: `rgb_array` frames off screen, `human` in MuJoCo's viewer."""
+"""Pictures of a simulator: `rgb_array` frames off screen, `human` in MuJoCo's viewer, and what other viewers need."""
 
 from __future__ import annotations
 
 import threading
-from typing import Any
+from abc import abstractmethod
+from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 RENDER_MODES = ("human", "rgb_array")
 
+Start = Literal["own", "random", "here"]
+Vector = NDArray[np.float64]
+
 
 class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """An environment that shows its simulator; one that derives from it sets `_camera`."""
+    """An environment that shows its simulator; one that derives from it sets `_camera`.
+
+    Positions in the methods below are in MuJoCo's world.
+    """
+
+    IS_PLANAR: ClassVar[bool] = False  # whether the robot drives on the floor, and everything that can be moved as well
 
     _camera: Camera
 
@@ -32,6 +41,58 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def close(self) -> None:
         """Free the GL context and close the window."""
         self._camera.close()
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The simulator's model."""
+        return self._camera.model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """The simulator's state."""
+        return self._camera.data
+
+    @abstractmethod
+    def robot_position(self) -> Vector:
+        """Return where the part of the robot is that is to reach the target [m] (3,)."""
+
+    def target_position(self) -> Vector | None:
+        """Return where the target is [m] (3,), or what is to be avoided; None for a task without either."""
+        return None
+
+    def move_target(self, position: ArrayLike) -> None:
+        """Put the target somewhere else within the episode. Raises ValueError for a task without one."""
+        raise ValueError(f"{type(self).__name__} has no target to move to {np.asarray(position).tolist()}")
+
+    def obstacle_positions(self) -> Vector:
+        """Return where the obstacles are that can be moved [m] (n, 3)."""
+        return np.zeros((0, 3))
+
+    def move_obstacle(self, index: int, position: ArrayLike) -> None:
+        """Put an obstacle somewhere else within the episode. Raises ValueError where there is none of that number."""
+        raise ValueError(f"{type(self).__name__} has no obstacle {index} to move to {np.asarray(position).tolist()}")
+
+    def viewpoint(self) -> tuple[Vector, Vector]:
+        """Return where the camera stands and what it looks at [m] (3,) each."""
+        return self._camera.viewpoint()
+
+    def beams(self) -> Vector:
+        """Return both ends of every laser beam [m] (n, 2, 3); none for a robot without lasers."""
+        return np.zeros((0, 2, 3))
+
+    def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:  # noqa: ARG002
+        """Return options of `reset` for an episode that starts as the task has it, at random, or where the robot is.
+
+        With `keep_target` the target stays as well. A task that cannot start so starts in its own way.
+        """
+        return {}
+
+    @abstractmethod
+    def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
+        """Put robot and target where row `row` of an episode's observations (n, size) has them: to look at, not to act.
+
+        What the observations do not tell is where a new environment has it.
+        """
 
     def _refresh_window(self) -> None:
         if self.render_mode == "human":
@@ -53,7 +114,7 @@ class Camera:
         width: int = 640,
         height: int = 480,
     ) -> None:
-        self._model, self._data = model, data
+        self.model, self.data = model, data
         self._width, self._height = width, height
         self._view = mujoco.MjvCamera()
         self._view.lookat[:] = lookat
@@ -66,9 +127,15 @@ class Camera:
         """Return the current view as (height, width, 3) uint8."""
         renderer = self._renderer
         if renderer is None:
-            renderer = self._renderer = mujoco.Renderer(self._model, height=self._height, width=self._width)
-        renderer.update_scene(self._data, camera=self._view)
+            renderer = self._renderer = mujoco.Renderer(self.model, height=self._height, width=self._width)
+        renderer.update_scene(self.data, camera=self._view)
         return np.asarray(renderer.render(), dtype=np.uint8)
+
+    def viewpoint(self) -> tuple[Vector, Vector]:
+        """Return where the camera stands and what it looks at [m] (3,) each."""
+        azimuth, elevation = np.radians([self._view.azimuth, self._view.elevation])
+        ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        return self._view.lookat - self._view.distance * ahead, self._view.lookat.copy()
 
     def show(self) -> None:
         """Open the viewer window at the first call, refresh it at the next ones. Needs a display."""
@@ -76,7 +143,7 @@ class Camera:
             import mujoco.viewer  # opens a display connection when imported, so only where one is wanted
 
             before = set(threading.enumerate())
-            self._viewer = mujoco.viewer.launch_passive(self._model, self._data)
+            self._viewer = mujoco.viewer.launch_passive(self.model, self.data)
             self._viewer_threads = set(threading.enumerate()) - before
             self._viewer.cam.lookat[:] = self._view.lookat
             self._viewer.cam.distance = self._view.distance

@@ -69,7 +69,11 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "minari": ("serve_app/recording/minari_export.py",),
     "httpx": (),
     "httpcore": ("serve_app/client/deadline_backend.py", "serve_app/client/http_transport.py"),
-    "websockets": ("serve_app/client/websocket_connection.py", "serve_app/ray_serve/http_connections.py"),
+    "websockets": (
+        "deploy/cockpit/page.py", "serve_app/client/websocket_connection.py", "serve_app/ray_serve/http_connections.py",
+    ),
+    "viser": ("deploy/cockpit/",),
+    "trimesh": ("deploy/cockpit/scenery.py",),
     "pickle": ("export/checkpoints/unpickle.py",),
     "onnxruntime": ("export/contract/ort_session.py", "serve_app/runtime/"),
     "asyncio": (

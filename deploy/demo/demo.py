@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rlservo.deploy.demo.picture import Robot, RobotRun, Trace, draw_picture, film
+from rlservo.deploy.terminal import ends_like_ctrl_c
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
@@ -52,9 +53,12 @@ ROBOTS = (
 )
 
 
-def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -> None:
+def run_demo(
+    out: Path, *, checkpoints: Path, episodes: int, console: Console, cockpit: Callable[[str], None] | None = None
+) -> None:
     """Run the demo and leave bundles, `demo.png` and the server's log in `out`.
 
+    `cockpit` takes the place of the episodes: it is given the server's address, and the server runs until it returns.
     Raises UsageError when the checkpoints are not there, RlservoError when a step fails; the server is always stopped.
     """
     for robot in ROBOTS:
@@ -77,7 +81,12 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
     console.rule("2  serve: both policies on one Ray Serve endpoint")
     runs: list[RobotRun] = []
     counts = ("--episodes", str(episodes), "--seed", str(FIRST_SEED))
-    with _ends_like_ctrl_c(), _server(console, repository, out / "server.log") as url:
+    with ends_like_ctrl_c(), _server(console, repository, out / "server.log") as url:
+        if cockpit is not None:
+            console.rule("3  drive: choose the robot on the page, drag its target")
+            with suppress(KeyboardInterrupt):
+                cockpit(url)
+            return
         console.rule(f"3  drive: {episodes} episodes each, every action over HTTP")
         for robot in ROBOTS:
             _show(console, "rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts)
@@ -94,6 +103,9 @@ def run_demo(out: Path, *, checkpoints: Path, episodes: int, console: Console) -
     console.rule("4  result")
     console.print(_table(runs))
     console.print(f"picture: {picture}   bundles: {repository}   {time.monotonic() - start:.0f} s in all", markup=False)
+    console.print(
+        f"drive them yourself, in the browser: rlservo cockpit --bundle {shlex.quote(str(repository))}", markup=False
+    )
 
 
 class _Recorder(ActingPolicy):
@@ -155,21 +167,6 @@ def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
         finally:
             with console.status("stopping the server ..."):
                 _stop(server)
-
-
-@contextmanager
-def _ends_like_ctrl_c() -> Iterator[None]:
-    """Let SIGTERM and a closed terminal stop the server too, as Ctrl-C does."""
-
-    def interrupt(_number: int, _frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _end_with_parent() -> None:

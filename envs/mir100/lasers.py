@@ -70,6 +70,24 @@ class LaserScanners:
             readings[:] = distances
         np.clip(readings, LASER_MIN, LASER_MAX, out=readings)
 
+    def ends(self, readings: Vector) -> Vector:
+        """Return where beams begin and end in the map frame [m] (n, 2, 3): all, or as many picked evenly from all."""
+        picked = pick_beams(len(readings))
+        x, y, yaw = self._data.qpos.tolist()
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        robot_to_map = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])  # transposed, as above
+        origins = np.repeat(
+            [FRONT_SCANNER.position, BACK_SCANNER.position], [FRONT_SCANNER.count, BACK_SCANNER.count], axis=0
+        )[picked]
+        ends = np.stack([origins, origins + readings[:, None] * self._in_robot[picked]], axis=1)
+        in_map: Vector = ends @ robot_to_map + (x, y, 0.0)
+        return in_map
+
+
+def pick_beams(count: int) -> NDArray[np.intp]:
+    """Return the indices of `count` beams picked evenly from all, as robo-gym picks those it observes."""
+    return np.rint(np.linspace(0, BEAM_COUNT - 1, count)).astype(np.intp)
+
 
 class _Beams:
     """One scanner's share of the arrays, in the form MuJoCo wants them."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.checks import ElementInfo, EnvDescription, as_vector, check_action, check_option_names
+from rlservo.envs.mir100.lasers import pick_beams
 from rlservo.envs.mir100.parameters import (
-    BEAM_COUNT,
     CYCLE_S,
     LASER_MAX,
     LASER_NOISE,
@@ -26,7 +26,7 @@ from rlservo.envs.mir100.parameters import (
 )
 from rlservo.envs.mir100.simulation import Mir100Simulation, wrap_angle
 from rlservo.envs.mir100.worlds import Pose
-from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
+from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv, Start
 
 LINEAR_SCALE, ANGULAR_SCALE = 0.5, 0.7  # [m/s], [rad/s], of an action of 1
 SUCCESS_DISTANCE = 0.2  # [m]
@@ -36,9 +36,9 @@ VELOCITY_TOLERANCE = 0.1  # [m/s], [rad/s], of the observation bounds above the 
 PROGRESS_REWARD = 50.0  # [1/m]
 LINEAR_COST, ANGULAR_COST = 0.30, 0.03  # of an action of 1
 FAILURE_REWARD = -200.0
-RESET_OPTIONS = ("start_pose", "target_pose")
 
 Observation = NDArray[np.float32]
+Vector = NDArray[np.float64]
 
 
 class Mir100Navigation(RenderedEnv):
@@ -46,6 +46,8 @@ class Mir100Navigation(RenderedEnv):
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
 
+    IS_PLANAR = True
+    RESET_OPTIONS: ClassVar[tuple[str, ...]] = ("start_pose", "target_pose")
     WORLD: ClassVar[str]
     LASER_COUNT: ClassVar[int]  # how many of the readings are observed, evenly picked
     SUCCESS_REWARD: ClassVar[float]
@@ -86,7 +88,8 @@ class Mir100Navigation(RenderedEnv):
         self.action_space = self._action_box
 
         self._camera = Camera(self.simulation.model, self.simulation.data, **self.VIEW)
-        self._observed_beams = np.rint(np.linspace(0, BEAM_COUNT - 1, self.LASER_COUNT)).astype(np.intp)
+        self._observed_beams = pick_beams(self.LASER_COUNT)
+        self._shown_readings: NDArray[np.floating[Any]] | None = None  # of an observation that is looked at
         self._previous_distance: float | None = None
         self._steps = 0
 
@@ -112,12 +115,12 @@ class Mir100Navigation(RenderedEnv):
         """Start an episode; the class's docstring lists the options."""
         super().reset(seed=seed)
         options = options or {}
-        check_option_names(options, RESET_OPTIONS)
+        check_option_names(options, self.RESET_OPTIONS)
         start_pose, target_pose = options.get("start_pose"), options.get("target_pose")
         start = self._random_start() if start_pose is None else as_vector("start_pose", start_pose, 3).tolist()
         target = self._random_target(start) if target_pose is None else as_vector("target_pose", target_pose, 3)
         self.simulation.rng = self.np_random
-        self._place(start, target.tolist() if isinstance(target, np.ndarray) else target)
+        self._place(start, target.tolist() if isinstance(target, np.ndarray) else target, options)
         self._steps = 0
         self._previous_distance = None
         self._refresh_window()
@@ -149,6 +152,57 @@ class Mir100Navigation(RenderedEnv):
         self._refresh_window()
         return self._observation(distance, bearing), reward, terminated, truncated, info
 
+    # -- for viewers
+
+    def robot_position(self) -> Vector:
+        """Return base_link's position on the map [m] (3,)."""
+        x, y, _ = self.simulation.pose
+        return np.array([x, y, 0.0])
+
+    def target_position(self) -> Vector:
+        """Return where the target is on the map [m] (3,)."""
+        x, y, _ = self.simulation.target
+        return np.array([x, y, 0.0])
+
+    def move_target(self, position: ArrayLike) -> None:
+        """Put the target somewhere else on the map [m] (3,) within the episode; the next step scores no progress."""
+        x, y, _ = as_vector("position", position, 3).tolist()
+        self.simulation.move_target((x, y, self.simulation.target[2]))
+        self._previous_distance = None
+
+    def obstacle_positions(self) -> Vector:
+        """Return where the cubes are on the map [m] (n, 3)."""
+        return np.array([(x, y, 0.0) for x, y, _ in self.simulation.cubes]).reshape(-1, 3)
+
+    def move_obstacle(self, index: int, position: ArrayLike) -> None:
+        """Put a cube somewhere else on the map [m] (3,) within the episode, turned as it is."""
+        x, y, _ = as_vector("position", position, 3).tolist()
+        yaws = {number: yaw for number, (_, _, yaw) in enumerate(self.simulation.cubes)}
+        self.simulation.move_cube(index, (x, y, yaws.get(index, 0.0)))
+
+    def beams(self) -> Vector:
+        """Return both ends of every laser beam on the map [m] (n, 2, 3); none where there is nothing to see."""
+        return self.simulation.beams(self._shown_readings)
+
+    def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:
+        """Return the options of an episode that starts as asked for, the target where it is with `keep_target`."""
+        options: dict[str, Any] = {"target_pose": self.simulation.target} if keep_target else {}
+        return {**options, "start_pose": self.simulation.pose} if start == "here" else options
+
+    def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
+        """Put the robot where an episode's observations have it: round the target, which stands at the origin.
+
+        Where the robot looks is not observed: it is what it turned since the episode began, from its velocities.
+        Between the fixes of a target that is observed rarely, the way is summed up likewise.
+        """
+        x, y, yaw = _dead_reckoning(observations[: row + 1].astype(np.float64))
+        self.simulation.place((x, y, yaw), target=(0.0, 0.0, 0.0))
+        self.show_readings(observations[row, 4:])
+
+    def show_readings(self, readings: NDArray[np.floating[Any]]) -> None:
+        """Let `beams` have these readings [m] (n,), of beams picked evenly from all, instead of the simulation's."""
+        self._shown_readings = readings
+
     # -- what a task adds
 
     @abstractmethod
@@ -160,8 +214,8 @@ class Mir100Navigation(RenderedEnv):
         """Draw x and y of a target; the base class draws again while it is too near the start."""
 
     @abstractmethod
-    def _place(self, start: Sequence[float], target: Sequence[float]) -> None:
-        """Put everything in its place. Raises InvalidResetError where that cannot be."""
+    def _place(self, start: Sequence[float], target: Sequence[float], options: Mapping[str, Any]) -> None:
+        """Put everything in its place; `options` has what only this task knows. Raises InvalidResetError."""
 
     @abstractmethod
     def _failure(self) -> str | None:
@@ -190,3 +244,17 @@ class Mir100Navigation(RenderedEnv):
         if self.LASER_COUNT:
             observation[4:] = self.simulation.scan[self._observed_beams]
         return observation
+
+
+def _dead_reckoning(observations: Vector) -> Pose:
+    """Return the pose after an episode's observations (n, 4 or more), the target at the origin, the first yaw 0."""
+    turned = (observations[1:, 3] + observations[:-1, 3]) * CYCLE_S / 2
+    yaws = np.concatenate([[0.0], np.cumsum(turned)])
+    fix = int(np.flatnonzero(observations[:, 0] > 0.0)[-1]) if (observations[:, 0] > 0.0).any() else 0
+    distance, bearing = observations[fix, 0:2]
+    x = -distance * math.cos(yaws[fix] + bearing)
+    y = -distance * math.sin(yaws[fix] + bearing)
+    ways = observations[fix + 1 :, 2] * CYCLE_S
+    x += float(ways @ np.cos(yaws[fix + 1 :]))
+    y += float(ways @ np.sin(yaws[fix + 1 :]))
+    return x, y, float(yaws[-1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from rlservo.envs.mir100.navigation import Mir100Navigation
@@ -86,7 +86,7 @@ class NoObstacleNavigationMir100Sim(Mir100Navigation):
         x, y = self.np_random.uniform(-1.0, 1.0, 2).tolist()
         return x, y
 
-    def _place(self, start: Sequence[float], target: Sequence[float]) -> None:
+    def _place(self, start: Sequence[float], target: Sequence[float], options: Mapping[str, Any]) -> None:  # noqa: ARG002
         self.simulation.place(start, target=target)
 
     def _failure(self) -> str | None:

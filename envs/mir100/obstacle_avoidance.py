@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from rlservo.envs.checks import InvalidResetError
+import numpy as np
+
+from rlservo.envs.checks import InvalidResetError, as_vector
 from rlservo.envs.mir100.navigation import Mir100Navigation
 from rlservo.envs.mir100.parameters import LENGTH, WIDTH
 from rlservo.envs.mir100.simulation import ROOM_VIEW
 from rlservo.envs.mir100.worlds import LAB_6X8, Pose
+from rlservo.envs.rendering import Start
 
 SAFETY_RADIUS = 0.40  # [m], of a corner of the robot from a cube's centre
 MIN_READING = 0.15  # [m]
@@ -69,8 +73,8 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
     robot starts within +-2 m in x and 2.1 to 3.1 m from the middle in y, on either side and in any direction; the
     target is drawn in the same way on the other side. The cubes (0.5 m) stand at x -2.4 .. -1.5, -0.5 .. 0.5 and
     1.5 .. 2.4 m, y -1 .. 1 m, turned at random. Cubes in the way of a `start_pose` are drawn again; a pose that fails
-    wherever they stand is refused with `InvalidResetError`. The room is 5.70 x 7.70 m inside, its middle at
-    (-0.027, 0.014).
+    wherever they stand is refused with `InvalidResetError`. Of our own: `cubes` (three poses) says where they stand.
+    The room is 5.70 x 7.70 m inside, its middle at (-0.027, 0.014).
 
     ## Constructor
 
@@ -86,6 +90,7 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
     immediate.
     """
 
+    RESET_OPTIONS = (*Mir100Navigation.RESET_OPTIONS, "cubes")
     WORLD = LAB_6X8.name
     LASER_COUNT = 16
     SUCCESS_REWARD = 100.0
@@ -106,16 +111,24 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
         draw = self.np_random.uniform
         return [(draw(*column), draw(-1.0, 1.0), draw(-math.pi, math.pi)) for column in CUBE_COLUMNS]
 
-    def _place(self, start: Sequence[float], target: Sequence[float]) -> None:
-        for _ in range(REDRAWS):
-            self.simulation.place(start, target=target, cubes=self._random_cubes())
+    def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:
+        """Return the options of an episode that starts as asked for; with the robot the cubes stay where they are."""
+        options = super().reset_options(start=start, keep_target=keep_target)
+        return {**options, "cubes": self.simulation.cubes} if start == "here" else options
+
+    def _place(self, start: Sequence[float], target: Sequence[float], options: Mapping[str, Any]) -> None:
+        given = options.get("cubes")
+        cubes = None if given is None else as_vector("cubes", np.ravel(given), 3 * len(CUBE_COLUMNS)).reshape(-1, 3)
+        for _ in range(REDRAWS if cubes is None else 1):
+            self.simulation.place(start, target=target, cubes=self._random_cubes() if cubes is None else cubes)
             if self._failure() is None:
                 return
         contacts = " and ".join(self.simulation.contacts())
         raise InvalidResetError(
             f"reset option 'start_pose' is {[round(value, 3) for value in start]}: the robot "
             f"{f'touches {contacts}' if contacts else f'is within {MIN_READING} m of something'} there, "
-            f"wherever the cubes stand; expected a pose inside the room, clear of the walls"
+            f"{'wherever the cubes stand' if cubes is None else 'with these cubes'}; expected a pose inside the room, "
+            f"clear of the walls"
         )
 
     def _failure(self) -> str | None:

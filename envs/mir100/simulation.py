@@ -98,6 +98,21 @@ class Mir100Simulation:
         self.in_collision = data.ncon > 0
         return self.in_collision
 
+    def move_target(self, pose: ArrayLike) -> None:
+        """Put the target somewhere else while the robot goes on. Raises ValueError for what is no pose."""
+        self._target = _pose("target", pose)
+        _place_mocap(self.data, self._target_mocap, self._target)
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def move_cube(self, index: int, pose: ArrayLike) -> None:
+        """Put a cube somewhere else while the robot goes on. Raises ValueError for what is no pose, or no cube."""
+        if not 0 <= index < len(self._cubes):
+            raise ValueError(f"cube {index} does not exist: world {self.world.name!r} has {len(self._cubes)}")
+        self._cubes[index] = _pose(f"cube {index}", pose)
+        _place_mocap(self.data, self._cube_mocaps[index], self._cubes[index])
+        mujoco.mj_kinematics(self.model, self.data)
+        self._scan_is_fresh = False
+
     # -- moving
 
     def command(self, linear: float, angular: float) -> bool:
@@ -178,6 +193,16 @@ class Mir100Simulation:
         """
         self._bring_scan_up_to_date()
         return self._lasers.readings
+
+    def beams(self, readings: ArrayLike | None = None) -> Vector:
+        """Return both ends of the laser beams in the map frame [m] (n, 2, 3), as the scan has them.
+
+        Of `readings` (n,) of beams picked evenly from all, as an observation has them, where given. None where the
+        world has nothing that a beam could meet.
+        """
+        if readings is not None:
+            return self._lasers.ends(np.asarray(readings, dtype=np.float64))
+        return self._lasers.ends(self.scan) if self._sees_something else np.zeros((0, 2, 3))
 
     @property
     def is_blocked(self) -> bool:

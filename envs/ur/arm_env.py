@@ -25,10 +25,12 @@ from rlservo.envs.checks import (
     element,
 )
 from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
+from rlservo.envs.ur.model import BASE_HEIGHT
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
 from rlservo.envs.ur.simulation import VIEW, URSimulation
 
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
+BASE: NDArray[np.float64] = np.array([0.0, 0.0, BASE_HEIGHT])  # [m], base_link in MuJoCo's world
 POSITION_BOUND = 1.1  # of a normalised joint position: its limit and robo-gym's tolerance
 
 Observation = NDArray[np.float32]
@@ -148,6 +150,12 @@ class URArmEnv(RenderedEnv):
             info["rs_state"] = self.simulation.state(self.RS_MODE)
         self._refresh_window()
         return observation, reward, terminated, truncated, info
+
+    # -- for viewers
+
+    def robot_position(self) -> Vector:
+        """Return tool0's position in MuJoCo's world [m] (3,)."""
+        return self.simulation.tool_position + BASE
 
     # -- what a task adds
 

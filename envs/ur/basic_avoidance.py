@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.checks import InvalidResetError, as_vector
-from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
+from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
 from rlservo.envs.ur.object_paths import object_path
 from rlservo.envs.ur.parameters import JOINTS
 
@@ -112,6 +113,24 @@ class BasicAvoidanceURSim(URArmEnv):
         elbow = np.full(3, np.inf) if self._include_polar_to_elbow else np.zeros(3)
         high = np.concatenate([np.full(3, np.inf), np.full(12, POSITION_BOUND), elbow])
         return -high, high
+
+    # -- for viewers
+
+    def target_position(self) -> Vector:
+        """Return where the ball is in MuJoCo's world [m] (3,)."""
+        return self.simulation.object_position(0) + BASE
+
+    def move_target(self, position: ArrayLike) -> None:
+        """Put the ball somewhere else in MuJoCo's world [m] (3,), where it stays for the rest of the episode."""
+        self.simulation.place_object(0, as_vector("position", position, 3) - BASE)
+
+    def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
+        """Put arm and ball where an observation has them."""
+        sim = self.simulation
+        sim.place(observations[row, 3:9] * LIMITS)
+        r, theta, phi = observations[row, 0:3].tolist()
+        in_tool = r * np.array([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)])
+        sim.place_object(0, sim.tool_position + sim.tool_rotation @ in_tool)
 
     # -- a new episode
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector
 from rlservo.envs.ur.parameters import JOINTS
@@ -79,6 +80,10 @@ class EmptyEnvironmentURSim(URArmEnv):
     def _observation_bounds(self) -> tuple[Vector, Vector]:
         high = np.concatenate([np.full(6, POSITION_BOUND), np.full(6, np.inf)])
         return -high, high
+
+    def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
+        """Put the arm where an observation has it."""
+        self.simulation.place(observations[row, :6] * LIMITS)
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         del options  # the start pose is the only one

@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.checks import InvalidResetError, as_vector
-from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
+from rlservo.envs.rendering import Start
+from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
 from rlservo.envs.ur.parameters import JOINTS
 
 START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
@@ -119,6 +121,32 @@ class EndEffectorPositioningURSim(URArmEnv):
         infinite = np.full(6, np.inf)
         high = np.concatenate([infinite[:3], np.full(6, POSITION_BOUND), infinite, infinite, np.full(6, 1.01)])
         return -high, high
+
+    # -- for viewers
+
+    def target_position(self) -> Vector:
+        """Return where the target is in MuJoCo's world [m] (3,)."""
+        return self._target + BASE
+
+    def move_target(self, position: ArrayLike) -> None:
+        """Put the target somewhere else in MuJoCo's world [m] (3,) within the episode."""
+        self._target = as_vector("position", position, 3) - BASE
+        self.simulation.place_object(0, self._target)
+
+    def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:
+        """Return the options of an episode that starts as asked for, the target where it is with `keep_target`."""
+        options: dict[str, Any] = {"ee_target_pose": [*self._target.tolist(), 0.0, 0.0, 0.0]} if keep_target else {}
+        if start == "here":
+            joints = np.clip(self.simulation.joint_positions, -LIMITS, LIMITS)
+            options |= {"joint_positions": joints.tolist(), "randomize_start": False}
+        elif start == "random":
+            options["randomize_start"] = True
+        return options
+
+    def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
+        """Put arm and target where an observation has them."""
+        self.simulation.place(observations[row, 3:9] * LIMITS)
+        self.move_target(observations[row, 15:18] + BASE)
 
     # -- a new episode
 

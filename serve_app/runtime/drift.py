@@ -39,16 +39,12 @@ class Drift:
     @classmethod
     def of(cls, contract: Contract) -> Self | None:
         """Return the statistics for a policy, or None where its contract has no filter over the raw observation."""
-        space = contract.observation_space
-        step = contract.baked_in[0] if contract.baked_in else None
-        if step is None or step.step != FILTER or not isinstance(space, BoxSpec):
-            return None
-        mean, std = (np.asarray(step.values.get(name, ()), np.float64).ravel() for name in ("mean", "std"))
-        if not mean.size == std.size == space.size or not (np.isfinite(mean).all() and np.isfinite(std).all()):
+        space, moments = contract.observation_space, training_moments(contract)
+        if moments is None or not isinstance(space, BoxSpec):
             return None
         names = [element.name for element in space.elements]
         labels = names if len(set(names)) == space.size else [label for _, label in iter_elements(space)]
-        return cls(tuple(labels), mean, std)
+        return cls(tuple(labels), *moments)
 
     def add(self, obs: NDArray[Any]) -> None:
         """Count checked observations `[batch, ...]` in; a parser does so with one call in `EVERY`."""
@@ -70,3 +66,18 @@ class Drift:
         """Standard deviation of z per element: 1 where the observations vary as they did in training."""
         spread: NDArray[np.float64] = np.sqrt(np.maximum(self._square - self._shift**2, 0.0))
         return spread
+
+
+def training_moments(contract: Contract) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return each observed element's mean and standard deviation in training, flat.
+
+    None where the contract has no filter over the raw observation.
+    """
+    space = contract.observation_space
+    step = contract.baked_in[0] if contract.baked_in else None
+    if step is None or step.step != FILTER or not isinstance(space, BoxSpec):
+        return None
+    mean, std = (np.asarray(step.values.get(name, ()), np.float64).ravel() for name in ("mean", "std"))
+    if not mean.size == std.size == space.size or not (np.isfinite(mean).all() and np.isfinite(std).all()):
+        return None
+    return mean, std

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     import onnxruntime
 
 logger = logging.getLogger(__name__)
+VALUE = "value"  # the graph's output of the critic, where it was exported
 SHOWN_HASH = 12  # hexadecimal digits: enough to tell the graphs apart that ever bear one name and version
 NOTICE_EVERY_S = 60.0  # an observation out of bounds comes a hundred times a second, and is worth a line a minute
 Network = Callable[[dict[str, NDArray[Any]]], dict[str, NDArray[Any]]]
@@ -313,6 +314,16 @@ class Policy(Closeable):
             action, _ = self._step_limit.apply(action, last)
         inputs = computed["action_dist_inputs"] if explores else None
         return Answer(action, inputs, self._state_tensors.next_state(computed, done))
+
+    def value(self, obs: Observation) -> NDArray[Any] | None:
+        """Return the critic's value of each observation `[batch]`; None where the graph has none, or remembers."""
+        if self.is_stateful or all(tensor.name != VALUE for tensor in self._contract.outputs):
+            return None
+        feed, _, _ = self._observations.parse(obs)
+        if {tensor.name for tensor in self._contract.inputs} != set(feed):
+            return None  # it also sees rewards
+        value: NDArray[Any] = self._run([VALUE], feed)[0]
+        return value
 
     def parse(self, obs: Observation) -> Observed:
         """Return an observation as the network's tensors. Raises ObservationError."""

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 
 import pytest
+
+from servers import free_ports, running
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -37,10 +41,29 @@ def test_demo_reaches_the_targets_draws_a_picture_and_leaves_nothing(tmp_path: P
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
         assert done.stdout.count(f"{episodes} of {episodes} ") == 2
+        assert done.stdout.rstrip().endswith(f"rlservo cockpit --bundle {out / 'policies'}")
         assert (out / "demo.png").read_bytes().startswith(b"\x89PNG")
         assert (out / "policies" / "ur5" / "1" / "contract.json").is_file()
         assert (out / "policies" / "mir100" / "1" / "contract.json").is_file()
         assert processes_naming(str(out)) == []
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+def test_demo_with_the_cockpit_serves_both_robots_on_a_page_until_ctrl_c(tmp_path: Path) -> None:
+    pytest.importorskip("viser", reason="the cockpit draws with viser")
+    out = tmp_path / "demo"
+    (port,) = free_ports(1)
+    command = [sys.executable, "-m", "rlservo.deploy.cli", "demo", "--out", str(out), "--cockpit", "--port", str(port)]
+    with running(command, port) as run:
+        assert run.process.stdout is not None
+        said = [next((line for line in run.process.stdout if line.startswith("cockpit at ")), "nothing")]
+        assert said == [f"cockpit at http://127.0.0.1:{port}; Ctrl-C stops\n"]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=60) as reply:
+            assert reply.status == 200
+        run.process.send_signal(signal.SIGINT)
+        assert run.process.wait(120) == 0
+    assert processes_naming(str(out)) == []
 
 
 def test_demo_outside_a_checkout_says_what_is_missing(tmp_path: Path) -> None:

@@ -1,0 +1,129 @@
+"""The page: viser's server on loopback, and a loop that draws thirty times a second until it is told to stop."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import re
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+import viser
+import websockets.asyncio.server
+from numpy.typing import NDArray
+
+from rlservo.export.contract.errors import UsageError
+
+HOST = "127.0.0.1"
+FRAME_S = 1 / 30
+NEARER = 0.62  # tan(45 / 2) / tan(75 / 2), about: MuJoCo's angle of view to viser's
+PANEL_S = 0.2  # between two refreshes of numbers and plots
+# Pages that may talk to the cockpit: its own, also through a forwarded port. Programs send no Origin.
+ORIGINS = [re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?"), None]
+
+
+class Shown(Protocol):
+    """What a page shows."""
+
+    def draw(self) -> None:
+        """Draw a frame of the scene."""
+        ...
+
+    def refresh(self, frames_per_s: float) -> None:
+        """Refresh numbers and plots."""
+        ...
+
+
+class _Server(viser.ViserServer):
+    """viser's server without its tunnel to the internet."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
+        """Refuse: a page can ask for it, with or without the button."""
+        return None
+
+
+@contextlib.contextmanager
+def served_page(port: int, title: str) -> Iterator[viser.ViserServer]:
+    """Serve an empty page until the block ends. Raises UsageError where the port is taken."""
+    _check_port(port)
+    with _silence(), _only_our_origins():  # its own banner names a port that ours names as well
+        server = _Server(HOST, port, label=title, verbose=False)
+    try:
+        server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=False)
+        # Shadows and reflections take five times as long to draw where there is no graphics card.
+        server.scene.configure_default_lights(cast_shadow=False)
+        server.scene.configure_environment_map(None)
+        server.scene.add_light_hemisphere("/sky", ground_color=(190, 190, 190), intensity=1.5)
+        server.gui.main_panel.dock_right()
+        yield server
+    finally:
+        with _silence():
+            server.stop()
+
+
+def show(shown: Shown, stop: threading.Event) -> None:
+    """Draw until `stop`. A frame that is late is left out."""
+    frames: deque[float] = deque(maxlen=60)
+    due = refresh_at = time.perf_counter()
+    while not stop.wait(max(0.0, due - time.perf_counter())):
+        now = time.perf_counter()
+        due = max(due + FRAME_S, now)
+        shown.draw()
+        frames.append(now)
+        if now >= refresh_at:
+            refresh_at = now + PANEL_S
+            span_s = now - frames[0]
+            shown.refresh((len(frames) - 1) / span_s if span_s > 0 else 0.0)
+
+
+def set_value(handle: Any, value: Any) -> None:
+    """Let a choice or a slider have a value. (mypy does not see viser's setter.)"""
+    if handle.value != value:
+        handle.value = value
+
+
+def aim_cameras(server: viser.ViserServer, position: NDArray[np.float64], look_at: NDArray[np.float64]) -> None:
+    """Let everybody who looks, and who will, stand there and look at that, as near as a browser's wider lens wants."""
+    position = look_at + NEARER * (position - look_at)
+    server.initial_camera.position, server.initial_camera.look_at = position, look_at
+    for client in server.get_clients().values():
+        client.camera.position, client.camera.look_at = position, look_at
+
+
+def _check_port(port: int) -> None:
+    """Refuse a port that is taken: viser would quietly take the next one."""
+    try:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((HOST, port))
+    except OSError as error:
+        reason = "the port is taken: give another with --port" if error.errno == errno.EADDRINUSE else error.strerror
+        raise UsageError(f"the cockpit cannot listen on {HOST}:{port}: {reason}") from error
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+@contextlib.contextmanager
+def _only_our_origins() -> Iterator[None]:
+    """Let only pages of this machine open a WebSocket: viser has no option for websockets' own check.
+
+    Any other web page in the same browser could drive the robot.
+    """
+    server: Any = websockets.asyncio.server
+    serve = server.serve
+    server.serve = partial(serve, origins=ORIGINS)
+    try:
+        yield
+    finally:
+        server.serve = serve

@@ -1,0 +1,101 @@
+"""Runs the cockpit: opens what is to be seen, serves the page, draws until Ctrl-C."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import viser
+
+from rlservo.deploy.cockpit.drive import Drive
+from rlservo.deploy.cockpit.page import HOST, Shown, served_page, show
+from rlservo.deploy.cockpit.panel import DrivePanel
+from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
+from rlservo.deploy.cockpit.policies import Choice, PolicySource
+from rlservo.deploy.cockpit.watch import WatchPanel
+from rlservo.export.contract.errors import UnknownPolicyError, UsageError
+
+PRODUCTION = "production"
+OnReady = Callable[[str], None]
+
+
+def run_drive(
+    source: PolicySource,
+    *,
+    policy: str | None,
+    version: str | None,
+    env_id: str | None,
+    env_arguments: Mapping[str, Any],
+    port: int,
+    seed: int | None,
+    on_ready: OnReady,
+    stop: threading.Event | None = None,
+) -> None:
+    """Let a policy drive a robot on a page until `stop`, or an interrupt. Everything that was opened is closed."""
+    with ExitStack() as cleanup:
+        cleanup.callback(source.close)
+        choice = _first_choice(source, policy, version)
+        drive = Drive(source, choice, env_id=env_id, env_arguments=env_arguments, seed=seed)
+        cleanup.callback(drive.close)
+        server = cleanup.enter_context(served_page(port, "rlservo cockpit"))
+        panel = DrivePanel(server, drive, source)
+        cleanup.callback(panel.close)
+        drive.start()
+        _serve(server, panel, on_ready, stop)
+
+
+def run_playback(
+    recording: Path,
+    *,
+    bundle: Path | None,
+    policy: str | None,
+    env_id: str | None,
+    port: int,
+    on_ready: OnReady,
+    stop: threading.Event | None = None,
+) -> None:
+    """Show a recording on a page until `stop`, or an interrupt."""
+    tape = Tape(recording, bundle=bundle, policy=policy)
+    with ExitStack() as cleanup:
+        server = cleanup.enter_context(served_page(port, f"rlservo cockpit: {recording.name}"))
+        panel = PlaybackPanel(server, tape, env_id=env_id)
+        cleanup.callback(panel.close)
+        _serve(server, panel, on_ready, stop)
+
+
+def run_watch(
+    address: str,
+    *,
+    env_arguments: Mapping[str, Any],
+    port: int,
+    on_ready: OnReady,
+    stop: threading.Event | None = None,
+) -> None:
+    """Show what a robot server's simulation does until `stop`, or an interrupt."""
+    with ExitStack() as cleanup:
+        server = cleanup.enter_context(served_page(port, f"rlservo cockpit: {address}"))
+        panel = WatchPanel(server, address, env_arguments)
+        cleanup.callback(panel.close)
+        _serve(server, panel, on_ready, stop)
+
+
+def _serve(server: viser.ViserServer, panel: Shown, on_ready: OnReady, stop: threading.Event | None) -> None:
+    on_ready(f"http://{HOST}:{server.get_port()}")
+    show(panel, stop or threading.Event())
+
+
+def _first_choice(source: PolicySource, policy: str | None, version: str | None) -> Choice:
+    """Return what drives at first: of the policy, or the first one, the version that clients get who ask for none."""
+    versions = source.versions()
+    if not versions:
+        raise UnknownPolicyError("the server has no policy loaded")
+    if policy is not None and policy not in versions:
+        raise UsageError(f"there is no policy {policy!r}: expected one of {', '.join(versions)}")
+    name = policy or next(iter(versions))
+    default = PRODUCTION if PRODUCTION in versions[name] else versions[name][0]
+    if version is not None and version not in versions[name]:
+        raise UsageError(f"policy {name!r} has no version {version!r}: expected one of {', '.join(versions[name])}")
+    return Choice(name, version or default)

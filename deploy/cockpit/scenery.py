@@ -1,0 +1,228 @@
+"""The scene in the browser: a MuJoCo model's shapes as viser nodes, handles, laser beams and the robot's path."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import trimesh
+import viser
+import viser.transforms
+from numpy.typing import NDArray
+
+from rlservo.deploy.cockpit.stage import Scene, Stage
+from rlservo.envs.shapes import Poses, Shape, body_poses, moving_bodies, visible_shapes
+
+SHOWN_BEAMS = 128  # of a thousand
+PATH_LENGTH = 400  # control cycles
+BEAM_COLOUR, PATH_COLOUR, GHOST_COLOUR = (220, 60, 50), (40, 120, 220), (60, 130, 240)
+GHOST_OPACITY = 0.35
+TARGET_LIFT, OBSTACLE_LIFT = 0.1, 0.55  # [m], of handles that move on the floor: above what they move
+HELD_S = 1.0  # after the last movement
+HANDLE_SIZE, PLANAR_HANDLE_SIZE = 0.3, 1.0  # [m]
+
+Move = Callable[[NDArray[np.float64]], None]
+MoveOne = Callable[[int, NDArray[np.float64]], None]
+
+
+class Scenery:
+    """Everything of one robot that is drawn; `remove` takes it away."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        stage: Stage,
+        *,
+        on_target: Move | None,
+        on_obstacle: MoveOne | None,
+    ) -> None:
+        """Draw a stage; `on_target` and `on_obstacle` (index, position) are called while somebody drags a handle."""
+        self._server = server
+        env, model = stage.env, stage.env.model
+        self._robot = _Bodies(server, "/robot", stage, ghost=False)
+        self._ghost = _Bodies(server, "/ghost", stage, ghost=True)
+        self._lift = np.array([0.0, 0.0, TARGET_LIFT if env.IS_PLANAR else 0.0])
+        self._obstacle_lift = np.array([0.0, 0.0, OBSTACLE_LIFT])
+        self._beams = server.scene.add_line_segments("/beams", _no_lines(), BEAM_COLOUR, thickness=0.004)
+        self._path = server.scene.add_line_segments("/path", _no_lines(), PATH_COLOUR, thickness=0.008)
+        self._points: list[NDArray[np.float64]] = []
+        self._drawn_beams: NDArray[np.float64] | None = None
+        self._handles: list[_Handle] = []
+        size = PLANAR_HANDLE_SIZE if env.IS_PLANAR else HANDLE_SIZE
+        self._target: _Handle | None = None
+        if on_target is not None and env.target_position() is not None:
+            self._target = _Handle(server, "/target", size, env.IS_PLANAR, lambda at: on_target(at - self._lift))
+        for index in range(len(env.obstacle_positions()) if on_obstacle is not None else 0):
+            self._handles.append(
+                _Handle(
+                    server,
+                    f"/obstacle_{index}",
+                    size,
+                    env.IS_PLANAR,
+                    lambda at, index=index: on_obstacle(index, at - self._obstacle_lift),  # type: ignore[misc]
+                )
+            )
+        extent = float(model.stat.extent)
+        self._floor = server.scene.add_grid(
+            "/floor",
+            width=4 * extent,
+            height=4 * extent,
+            cell_size=0.5,
+            section_size=1.0,
+            plane_color=(225, 229, 233),
+            plane_opacity=1.0,
+        )
+
+    def draw(self, before: Scene, after: Scene, share: float, ghost: tuple[Scene, Scene] | None) -> None:
+        """Draw the moment a share of the way from one control cycle to the next."""
+        with self._server.atomic():
+            self._robot.place(before.poses.towards(after.poses, share))
+            self._ghost.show(ghost is not None)
+            if ghost is not None:
+                self._ghost.place(ghost[0].poses.towards(ghost[1].poses, share))
+            if self._target is not None and after.target is not None:
+                self._target.follow(after.target + self._lift)
+            for handle, position in zip(self._handles, after.obstacles, strict=False):
+                handle.follow(position + self._obstacle_lift)
+            self._draw_beams((before if share < 0.5 else after).beams)
+            self._draw_path(before.robot + share * (after.robot - before.robot))
+
+    def remove(self) -> None:
+        """Take everything away again."""
+        self._robot.remove()
+        self._ghost.remove()
+        for handle in (self._target, *self._handles):
+            if handle is not None:
+                handle.remove()
+        for node in (self._beams, self._path, self._floor):
+            node.remove()
+
+    def _draw_beams(self, beams: NDArray[np.float64]) -> None:
+        if self._drawn_beams is beams:
+            return
+        self._drawn_beams = beams
+        shown = beams[:: max(1, len(beams) // SHOWN_BEAMS)]
+        self._beams.visible = len(shown) > 0
+        if len(shown):
+            self._beams.points = shown.astype(np.float32)
+
+    def _draw_path(self, position: NDArray[np.float64]) -> None:
+        last = self._points[-1] if self._points else None
+        moved = None if last is None else float(np.linalg.norm(position - last))
+        if moved is not None and moved < 0.01:
+            return
+        if moved is not None and moved > 0.5:  # put somewhere else
+            self._points.clear()
+        self._points = [*self._points[-PATH_LENGTH:], position]
+        if len(self._points) > 1:
+            points = np.array(self._points, np.float32)
+            self._path.points = np.stack([points[:-1], points[1:]], axis=1)
+        self._path.visible = len(self._points) > 1
+
+
+class _Bodies:
+    """The shapes of a model, each body's under a frame of its own. A ghost is translucent, and the robot alone."""
+
+    def __init__(self, server: viser.ViserServer, prefix: str, stage: Stage, *, ghost: bool) -> None:
+        model, data = stage.env.model, stage.env.data
+        moving = moving_bodies(model)
+        fixed = body_poses(data, list(range(model.nbody)))
+        self._root = server.scene.add_frame(prefix, show_axes=False, visible=not ghost)
+        self._frames: dict[int, viser.FrameHandle] = {}
+        for body, shapes in _by_body(visible_shapes(model)).items():
+            is_robot = model.body_mocapid[body] < 0 and body in moving
+            if ghost and not is_robot:
+                continue
+            frame = server.scene.add_frame(
+                f"{prefix}/{body}", show_axes=False, position=fixed.positions[body], wxyz=fixed.wxyz[body]
+            )
+            if body in moving:
+                self._frames[moving.index(body)] = frame
+            for index, (rgba, alike) in enumerate(_by_colour(shapes).items()):
+                mesh = trimesh.util.concatenate([_mesh(shape) for shape in alike])
+                red, green, blue, alpha = rgba
+                colour = GHOST_COLOUR if ghost else (int(255 * red), int(255 * green), int(255 * blue))
+                opacity = GHOST_OPACITY if ghost else alpha if alpha < 1.0 else None
+                server.scene.add_mesh_simple(
+                    f"{prefix}/{body}/{index}", mesh.vertices, mesh.faces, color=colour, opacity=opacity
+                )
+        self._placed: Poses | None = None
+
+    def place(self, poses: Poses) -> None:
+        for row, frame in self._frames.items():
+            placed = self._placed
+            if placed is None or not np.array_equal(placed.positions[row], poses.positions[row]):
+                frame.position = poses.positions[row]
+            if placed is None or not np.array_equal(placed.wxyz[row], poses.wxyz[row]):
+                frame.wxyz = poses.wxyz[row]
+        self._placed = poses
+
+    def show(self, visible: bool) -> None:
+        if self._root.visible != visible:
+            self._root.visible = visible
+
+    def remove(self) -> None:
+        self._root.remove()
+
+
+class _Handle:
+    """Something to drag with the mouse or a finger; it stays under the finger that holds it."""
+
+    def __init__(self, server: viser.ViserServer, name: str, size: float, is_planar: bool, on_move: Move) -> None:
+        self._control = server.scene.add_transform_controls(
+            name, scale=size, active_axes=(True, True, not is_planar), disable_rotations=True, depth_test=False
+        )
+        self._held_until = 0.0  # a browser that goes away while it drags never lets go
+        self._control.on_update(lambda event: self._moved(event, on_move))
+
+    def follow(self, position: NDArray[np.float64]) -> None:
+        if time.monotonic() > self._held_until and not np.allclose(self._control.position, position, atol=1e-6):
+            self._control.position = position
+
+    def remove(self) -> None:
+        self._control.remove()
+
+    def _moved(self, event: viser.TransformControlsEvent, on_move: Move) -> None:
+        self._held_until = 0.0 if event.phase == "end" else time.monotonic() + HELD_S
+        on_move(np.array(event.target.position, np.float64))
+
+
+def _by_body(shapes: list[Shape]) -> dict[int, list[Shape]]:
+    found: dict[int, list[Shape]] = {}
+    for shape in shapes:
+        if shape.kind != "plane":  # the floor is a grid
+            found.setdefault(shape.body, []).append(shape)
+    return found
+
+
+def _by_colour(shapes: list[Shape]) -> dict[tuple[float, float, float, float], list[Shape]]:
+    found: dict[tuple[float, float, float, float], list[Shape]] = {}
+    for shape in shapes:
+        found.setdefault(shape.rgba, []).append(shape)
+    return found
+
+
+def _mesh(shape: Shape) -> Any:
+    """Return a shape as a mesh in its body's frame."""
+    x, y, z = shape.size
+    if shape.kind == "sphere":
+        mesh = trimesh.creation.icosphere(radius=x, subdivisions=3)
+    elif shape.kind == "capsule":
+        mesh = trimesh.creation.capsule(radius=x, height=2 * y, count=(24, 24))
+    elif shape.kind == "cylinder":
+        mesh = trimesh.creation.cylinder(radius=x, height=2 * y, sections=32)
+    elif shape.kind == "box":
+        mesh = trimesh.creation.box(extents=(2 * x, 2 * y, 2 * z))
+    else:
+        mesh = trimesh.Trimesh(shape.vertices, shape.faces)
+    turn = viser.transforms.SO3(shape.wxyz)
+    mesh.apply_transform(viser.transforms.SE3.from_rotation_and_translation(turn, shape.position).as_matrix())
+    if shape.kind not in ("sphere", "capsule"):
+        mesh.unmerge_vertices()  # edges are drawn as edges
+    return mesh
+
+
+def _no_lines() -> NDArray[np.float32]:
+    return np.zeros((1, 2, 3), np.float32)

@@ -1,0 +1,124 @@
+"""A simulated robot on show: its environment, the disturbances round it, and where everything is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.envs.checks import InvalidResetError
+from rlservo.envs.randomization import DomainRandomization
+from rlservo.envs.registration import NAMESPACE
+from rlservo.envs.rendering import RenderedEnv, Start
+from rlservo.envs.shapes import Poses, body_poses, moving_bodies
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.rollout.environment import check_fit, control_rate_of, make_env
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What `DomainRandomization` adds, the same in every episode."""
+
+    action_latency: int = 0  # control cycles
+    observation_latency: int = 0  # control cycles
+    noise: float = 0.0  # standard deviation, of every observed element in its own unit
+    payload: float = 0.0  # [kg]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Where things are at one moment."""
+
+    poses: Poses  # of `moving_bodies`
+    robot: Vector  # [m], (3,), what is to reach the target
+    target: Vector | None
+    obstacles: Vector  # [m], (n, 3)
+    beams: Vector  # [m], (n, 2, 3)
+
+
+class Stage:
+    """One robot in one environment."""
+
+    def __init__(self, env_id: str, arguments: Mapping[str, Any], contract: Contract | None = None) -> None:
+        """Raise UsageError where there is no such environment, it is none of ours, or the policy does not fit it."""
+        self.env_id, self.arguments = env_id, dict(arguments)
+        self._made = make_env(env_id, self.arguments, render=False)
+        env = self._made.unwrapped
+        if not isinstance(env, RenderedEnv):
+            self._made.close()
+            raise UsageError(f"the cockpit draws rlservo's own simulators (rlservo/...): {env_id} is none of them")
+        self.env = env
+        self._bodies = moving_bodies(env.model)
+        self._disturbed: DomainRandomization = DomainRandomization(self._made)
+        self.cycle_s = 0.1
+        if contract is not None:
+            self.check(contract)
+            self.cycle_s = 1.0 / (control_rate_of(self._made, self.arguments, contract) or 10.0)
+
+    def check(self, contract: Contract) -> None:
+        """Raise UsageError where a policy's observations or actions are others than the environment's."""
+        check_fit(contract, self._made, self.arguments)
+
+    def disturb(self, disturbance: Disturbance) -> None:
+        """Change the disturbances, from the next episode on. Raises ValueError for what the robot cannot have."""
+        self._disturbed = DomainRandomization(
+            self._made,
+            action_latency=(disturbance.action_latency, disturbance.action_latency),
+            observation_latency=(disturbance.observation_latency, disturbance.observation_latency),
+            observation_noise=disturbance.noise,
+            payload=(disturbance.payload, disturbance.payload),
+        )
+
+    def begin(self, *, start: Start = "own", keep_target: bool = False, seed: int | None = None) -> Any:
+        """Begin an episode and return its first observation. One that cannot start so starts as the task has it."""
+        options = self.env.reset_options(start=start, keep_target=keep_target)
+        try:
+            return self._disturbed.reset(seed=seed, options=options)[0]
+        except InvalidResetError:
+            return self._disturbed.reset(options=self.env.reset_options(keep_target=keep_target))[0]
+
+    def begin_like(self, other: Stage) -> Any:
+        """Begin an episode where another robot of the same kind stands, with the same target."""
+        options = other.env.reset_options(start="here", keep_target=True)
+        return self._disturbed.reset(options=options)[0]
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Let one control cycle pass; return observation, reward, terminated, truncated, info."""
+        obs, reward, terminated, truncated, info = self._disturbed.step(action)
+        return obs, float(reward), terminated, truncated, info
+
+    def scene(self) -> Scene:
+        """Return where everything is."""
+        env = self.env
+        return Scene(
+            poses=body_poses(env.data, self._bodies),
+            robot=env.robot_position(),
+            target=env.target_position(),
+            obstacles=env.obstacle_positions(),
+            beams=env.beams(),
+        )
+
+    def close(self) -> None:
+        self._made.close()
+
+
+def home_of(contract: Contract) -> str:
+    """Return the environment that a policy was trained in. Raises UsageError where it is none of ours."""
+    env_id = contract.provenance.env_id
+    if env_id is None or not env_id.startswith(f"{NAMESPACE}/"):
+        raise UsageError(
+            f"policy '{contract.name}' was trained in {env_id or 'an environment it does not name'}, which the cockpit "
+            f"cannot draw: name one of rlservo's simulators that it fits with --env"
+        )
+    return env_id
+
+
+def home_arguments(contract: Contract) -> dict[str, Any]:
+    """Return what of that environment's arguments decides how the robot looks."""
+    return {name: value for name, value in contract.provenance.env_config.items() if name == "ur_model"}

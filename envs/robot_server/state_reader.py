@@ -1,0 +1,102 @@
+"""Reads a robot server's state beside the client that drives it, and shows it on an environment's simulator."""
+
+from __future__ import annotations
+
+import math
+
+import grpc
+import numpy as np
+
+from rlservo.envs.mir100.navigation import Mir100Navigation
+from rlservo.envs.mir100.parameters import BEAM_COUNT
+from rlservo.envs.rendering import RenderedEnv
+from rlservo.envs.robot_server.messages import ROBOT_SERVER, Empty, State
+from rlservo.envs.robot_server.mir100_robot import CUBES, ROBOT, STATE_LENGTH, TARGET
+from rlservo.envs.robot_server.robot import RobotState
+from rlservo.envs.ur.arm_env import LIMITS, URArmEnv
+from rlservo.envs.ur.parameters import JOINTS
+
+SCAN = slice(8, 8 + BEAM_COUNT)
+OBJECT = [f"object_0_to_ref_translation_{axis}" for axis in "xyz"]
+
+
+class RobotServerError(ConnectionError):
+    """The robot server does not answer, or with what is no state."""
+
+
+class StateReader:
+    """A connection to a robot server that only looks: GetState changes nothing.
+
+    A robot server that waits for a client's end (`--orphan-timeout`) waits for this one's too.
+    """
+
+    def __init__(self, address: str) -> None:
+        """`address` is HOST:PORT; nothing is sent before the first `read`."""
+        self.address = address
+        self._channel = grpc.insecure_channel(address, options=[("grpc.max_reconnect_backoff_ms", 1000)])
+        self._call = self._channel.unary_unary(f"/{ROBOT_SERVER}/GetState")
+
+    def read(self, timeout_s: float = 1.0) -> RobotState:
+        """Return the state of this moment. Raises RobotServerError."""
+        try:
+            message = State.FromString(self._call(Empty().SerializeToString(), timeout=timeout_s))
+        except grpc.RpcError as error:
+            raise RobotServerError(f"no robot server answers at {self.address}: {error.code().name.lower()}") from error
+        if not message.success:
+            raise RobotServerError(f"the robot server at {self.address} could not tell its state: see its log")
+        return RobotState(values=list(message.state), names=dict(message.state_dict))
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._channel.close()
+
+
+def env_of(state: RobotState) -> str:
+    """Return the environment that has the robot and the world of a state. Raises RobotServerError."""
+    if f"{JOINTS[0]}_joint_position" in state.names:
+        has_object = OBJECT[0] in state.names
+        return f"rlservo/{'EndEffectorPositioning' if has_object else 'EmptyEnvironment'}URSim-v0"
+    if len(state.values) == STATE_LENGTH:
+        has_cubes = any(state.values[CUBES])
+        return f"rlservo/{'ObstacleAvoidance' if has_cubes else 'NoObstacleNavigation'}Mir100Sim-v0"
+    raise RobotServerError(
+        f"the state has {len(state.values)} numbers: expected a UR arm's by name, or a MiR100's 1030"
+    )
+
+
+def show_state(env: RenderedEnv, state: RobotState) -> None:
+    """Put everything where the state has it: to look at, not to act. Raises RobotServerError for another robot's."""
+    if isinstance(env, URArmEnv) and f"{JOINTS[0]}_joint_position" in state.names:
+        joints = np.array([state.names[f"{joint}_joint_position"] for joint in JOINTS])
+        env.simulation.place(np.clip(joints, -LIMITS, LIMITS))
+        if env.simulation.object_count and OBJECT[0] in state.names:
+            env.simulation.place_object(0, [state.names[name] for name in OBJECT])
+    elif isinstance(env, Mir100Navigation) and len(state.values) == STATE_LENGTH:
+        values = np.array(state.values)
+        cubes = values[CUBES].reshape(-1, 3) if len(env.simulation.cubes) else None
+        env.simulation.place(values[ROBOT], target=values[TARGET], cubes=cubes)
+        env.show_readings(values[SCAN] if cubes is not None else np.zeros(0))
+    else:
+        raise RobotServerError("the robot server has another robot by now")
+
+
+def quantities(state: RobotState) -> dict[str, tuple[float, str]]:
+    """Return what is worth a look of a state: value and unit by name."""
+    if state.names:
+        return {name: (value, _unit(name)) for name, value in sorted(state.names.items())}
+    names = ("target_x", "target_y", "target_yaw", "x", "y", "yaw", "linear_velocity", "angular_velocity")
+    units = ("m", "m", "rad", "m", "m", "rad", "m/s", "rad/s")
+    found: dict[str, tuple[float, str]] = {
+        name: (value, unit) for name, value, unit in zip(names, state.values, units, strict=False)
+    }
+    found["nearest_beam"] = (min(state.values[SCAN], default=math.nan), "m")
+    found["in_collision"] = (state.values[SCAN.stop], "1")
+    return found
+
+
+def _unit(name: str) -> str:
+    if name.endswith("joint_velocity"):
+        return "rad/s"
+    if name.endswith("joint_position"):
+        return "rad"
+    return "m" if "translation" in name else "1"

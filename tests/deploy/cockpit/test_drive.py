@@ -1,0 +1,175 @@
+"""The drive without a page: a policy drives a simulated robot, and what is asked of it happens between cycles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cockpits import served_on, wait_for
+from rlservo.deploy.cockpit.drive import Drive
+from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, Link, ServedPolicies
+from rlservo.deploy.cockpit.stage import Disturbance
+from rlservo.export.contract.errors import UnavailableError, UsageError
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.server.settings import ServerSettings
+from stores import load_store
+
+pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+
+FAST = 4.0
+REACHABLE = np.array([0.35, 0.25, 0.6])  # [m], in MuJoCo's world
+
+
+@pytest.fixture
+def drives(two_versions: Path) -> Iterator[Callable[..., Drive]]:
+    opened: list[Drive] = []
+
+    def start(name: str = "ur5", **options: Any) -> Drive:
+        drive = Drive(BundledPolicies(two_versions), Choice(name, "1"), seed=5, **options)
+        opened.append(drive)
+        drive.start()
+        drive.do(lambda: drive.set_speed(FAST))
+        return drive
+
+    yield start
+    for drive in opened:
+        drive.close()
+
+
+def test_the_arm_follows_its_target_and_waits_there(drives: Callable[..., Drive]) -> None:
+    drive = drives()
+    drive.drag_target(REACHABLE)
+    wait_for(lambda: drive.view.phase == "arrived", "the arm arrives")
+    view = drive.view
+    assert view.after.target is not None and np.allclose(view.after.target, REACHABLE)
+    assert np.linalg.norm(view.after.robot - REACHABLE) <= 0.1
+    assert view.successes == view.episodes >= 1
+    cycles = len(drive.history)
+    drive.drag_target(REACHABLE + (0.0, -0.4, 0.0))
+    wait_for(lambda: drive.view.phase == "driving", "it goes on")
+    wait_for(lambda: len(drive.history) > cycles + 5, "it moves")
+    distances = [cycle.distance for cycle in drive.history]
+    assert distances[cycles] is not None and distances[-1] is not None and distances[cycles] > 0.2
+
+
+def test_a_new_target_is_drawn_where_nobody_put_one(drives: Callable[..., Drive]) -> None:
+    drive = drives()
+    wait_for(lambda: drive.view.episodes >= 2, "two episodes")
+    assert drive.view.successes >= 1 and drive.view.phase == "driving"
+
+
+def test_paused_time_stands_still_but_for_a_step(drives: Callable[..., Drive]) -> None:
+    drive = drives()
+    wait_for(lambda: len(drive.history) > 2, "it drives")
+    drive.do(drive.pause)
+    wait_for(lambda: drive.view.phase == "paused", "it stands")
+    cycles = drive.history[-1].number
+    drive.do(drive.step)
+    wait_for(lambda: drive.history[-1].number == cycles + 1, "one cycle")
+    drive.drag_target(REACHABLE)
+    wait_for(lambda: np.allclose(drive.view.after.target, REACHABLE), "the target moves all the same")
+    assert drive.view.phase == "paused" and drive.history[-1].number == cycles + 1
+
+
+def test_the_ghost_of_the_same_version_does_the_same_and_another_one_differs(drives: Callable[..., Drive]) -> None:
+    drive = drives()
+    drive.do(lambda: drive.choose_ghost(Choice("ur5", "1")))
+    wait_for(lambda: drive.view.ghost is not None and drive.history[-1].difference is not None, "a ghost")
+    start = len(drive.history)
+    wait_for(lambda: len(drive.history) > start + 5, "both drive")
+    assert max(np.abs(cycle.difference).max() for cycle in list(drive.history)[start:]) < 1e-5
+    view = drive.view
+    assert view.ghost is not None and np.allclose(view.ghost[1].robot, view.after.robot, atol=1e-3)
+    drive.do(lambda: drive.choose_ghost(Choice("ur5", "2")))
+    wait_for(lambda: drive.view.ghost_contract is not None and drive.view.ghost_contract.version == "2", "version 2")
+    wait_for(lambda: np.abs(drive.history[-1].difference).max() > 1e-3, "another action")
+    drive.do(lambda: drive.choose_ghost(None))
+    wait_for(lambda: drive.view.ghost is None, "no ghost")
+
+
+@pytest.mark.parametrize("model", ["ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e", "ur16e"])
+def test_every_arm_can_be_driven(drives: Callable[..., Drive], model: str) -> None:
+    drive = drives(env_arguments={"ur_model": model})
+    wait_for(lambda: len(drive.history) > 3, "it drives")
+    assert drive.view.trouble == ""
+
+
+def test_a_policy_of_another_robot_brings_that_along(drives: Callable[..., Drive]) -> None:
+    drive = drives()
+    drive.do(lambda: drive.choose(Choice("mir100_obstacle_avoidance", "1")))
+    wait_for(lambda: drive.view.contract.name == "mir100_obstacle_avoidance", "the MiR100")
+    wait_for(lambda: len(drive.history) > 3, "it drives")
+    assert drive.view.after.beams.shape == (1012, 2, 3) and len(drive.view.after.obstacles) == 3
+    drive.do(drive.pause)
+    drive.do(lambda: drive.move_obstacle(1, np.array([1.0, 3.0, 0.0])))
+    wait_for(lambda: np.allclose(drive.view.after.obstacles[1, :2], (1.0, 3.0)), "the cube is there")
+
+
+def test_what_does_not_fit_is_said_and_nothing_changes(drives: Callable[..., Drive], two_versions: Path) -> None:
+    drive = drives()
+    drive.do(lambda: drive.choose(Choice("nobody", "1")))
+    wait_for(lambda: "no bundle nobody/1" in drive.view.refusal, "the sentence")
+    cycles = drive.history[-1].number if drive.history else 0
+    wait_for(lambda: len(drive.history) and drive.history[-1].number > cycles + 3, "it drives on")
+    assert "no bundle nobody/1" in drive.view.refusal and drive.view.contract.name == "ur5"
+    drive.do(lambda: drive.set_speed(1.0))
+    wait_for(lambda: drive.view.refusal == "", "another command is followed")
+    with pytest.raises(UsageError, match="does not fit rlservo/NoObstacle"):
+        Drive(BundledPolicies(two_versions), Choice("ur5", "1"), env_id="rlservo/NoObstacleNavigationMir100Sim-v0")
+    with pytest.raises(UsageError, match="CartPole-v1 is none of them"):
+        Drive(BundledPolicies(two_versions), Choice("ur5", "1"), env_id="CartPole-v1")
+
+
+def test_disturbances_begin_with_an_episode_where_the_robot_stands(drives: Callable[..., Drive]) -> None:
+    drive = drives()
+    wait_for(lambda: len(drive.history) > 5, "it drives")
+    drive.do(drive.pause)
+    wait_for(lambda: drive.view.phase == "paused", "it stands")
+    robot, target = drive.view.after.robot, drive.view.after.target
+    drive.do(lambda: drive.disturb(Disturbance(action_latency=3, noise=0.05, payload=2.0)))
+    drive.do(drive.step)
+    cycles = drive.history[-1].number
+    wait_for(lambda: drive.history[-1].number > cycles or drive.view.phase == "paused", "a step")
+    assert np.allclose(drive.view.after.robot, robot, atol=0.05)
+    assert target is not None and np.allclose(drive.view.after.target, target)
+    drive.do(drive.play)
+    wait_for(lambda: drive.history[-1].number > cycles + 3, "it drives")
+    seen = np.array([cycle.obs[18:21] for cycle in list(drive.history)[-3:]])
+    assert np.abs(seen[-1] + (0, 0, 0.1) - drive.view.after.robot).max() > 1e-4  # noisy, and not where it is
+
+
+def test_a_server_that_goes_away_is_waited_for_and_driven_on_with(two_versions: Path, free_port: int) -> None:
+    store = load_store(two_versions)
+    app = create_app(lambda: store, ServerSettings())
+    source = ServedPolicies(f"http://127.0.0.1:{free_port}")
+    with pytest.raises(UnavailableError):
+        source.versions()
+    with served_on(app, free_port):
+        versions = source.versions()["ur5"]
+        assert {"production", "2", "1"} == set(versions) and versions.index("2") < versions.index("1")
+        drive = Drive(source, Choice("ur5", "production"), seed=5)
+        drive.start()
+        wait_for(lambda: len(drive.history) > 3, "it drives")
+        assert drive.view.contract.version == "2" and drive.view.trouble == ""
+    try:
+        wait_for(lambda: drive.view.trouble.startswith("waiting for the policy"), "it is said")
+        cycles = drive.history[-1].number
+        drive.do(lambda: drive.set_speed(1.0))  # an answered command shows the thread is alive
+        wait_for(lambda: drive.view.period_s > 0, "a view")
+        assert drive.history[-1].number <= cycles + 1
+        with served_on(app, free_port):
+            wait_for(lambda: drive.view.trouble == "" and drive.history[-1].number > cycles + 3, "it drives on")
+            drive.do(lambda: drive.choose(Choice("ur5", "1"), Link(deadline_ms=500.0, fallback="hold")))
+            wait_for(lambda: drive.view.contract.version == "1", "version 1")
+            cycles = drive.history[-1].number
+            wait_for(lambda: drive.history[-1].number > cycles + 3, "it drives")
+        cycles = drive.history[-1].number
+        wait_for(lambda: drive.view.fallbacks > 2, "the last action is held")
+        assert drive.history[-1].number > cycles and drive.history[-1].is_late and drive.history[-1].fallback
+    finally:
+        drive.close()
+        source.close()

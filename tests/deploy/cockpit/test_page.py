@@ -1,0 +1,247 @@
+"""The cockpit's page in a real browser: what a person with a mouse can do, and see."""
+
+from __future__ import annotations
+
+import io
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("viser", reason="the cockpit draws with viser")
+
+from cockpits import Browser, Cockpit, Windows, cockpit_of, served_on, wait_for
+from rlservo.deploy.cockpit.drive import Drive
+from rlservo.deploy.cockpit.panel import DrivePanel
+from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
+from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, ServedPolicies
+from rlservo.deploy.cockpit.scenery import OBSTACLE_LIFT, TARGET_LIFT
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.rollout.control_loop import rollout
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.settings import ServerSettings
+from stores import load_store
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
+
+ENV = "rlservo/EndEffectorPositioningURSim-v0"
+ARROW_M = 0.19  # from the target to where its handle's arrow is taken
+# Where the README's picture goes: RLSERVO_PICTURES=examples pytest tests/deploy/cockpit/test_page.py -k picture
+PICTURES = os.environ.get("RLSERVO_PICTURES")
+
+
+@pytest.fixture(scope="module")
+def app(two_versions: Path) -> Any:
+    """A policy server's application, made where no browser is driven."""
+    with ThreadPoolExecutor(1) as elsewhere:
+        store = elsewhere.submit(load_store, two_versions).result()
+    return create_app(lambda: store, ServerSettings())
+
+
+@pytest.fixture(scope="module")
+def drive(two_versions: Path) -> Iterator[Drive]:
+    drive = Drive(BundledPolicies(two_versions), Choice("ur5", "1"), seed=5)
+    drive.start()
+    yield drive
+    drive.close()
+
+
+@pytest.fixture(scope="module")
+def cockpit(drive: Drive, two_versions: Path) -> Iterator[Cockpit]:
+    with cockpit_of(lambda server: DrivePanel(server, drive, BundledPolicies(two_versions))) as served:
+        yield served
+
+
+@pytest.fixture(scope="module")
+def window(cockpit: Cockpit, windows: Windows) -> Iterator[Browser]:
+    """One window for all tests of the drive."""
+    opened = windows(1100, 620)
+    opened.open(cockpit.address)
+    yield opened
+    opened.close()
+
+
+def test_the_handle_is_dragged_and_the_robot_reaches_the_new_target(
+    cockpit: Cockpit, drive: Drive, window: Browser
+) -> None:
+    drive.do(drive.pause)
+    window.wait_for("paused")
+    before = drive.view.after.target
+    assert before is not None
+    up = np.array([0.0, 0.0, 1.0])
+    window.drag(cockpit.pixel(before + ARROW_M * up), cockpit.pixel(before + (ARROW_M + 0.12) * up))
+    wait_for(lambda: (drive.view.after.target - before)[2] > 0.05, "the target is where it was dragged to")
+    assert np.allclose(drive.view.after.target[:2], before[:2], atol=1e-3)
+    window.click("Play")
+    window.wait_for("Arrived.")
+    view = drive.view
+    assert view.after.target is not None and np.linalg.norm(view.after.robot - view.after.target) <= 0.1
+    window.click("New target")
+    wait_for(lambda: drive.view.phase == "driving", "it goes on")
+
+
+def test_the_plots_move_and_the_table_tells_what_the_policy_sees(drive: Drive, window: Browser) -> None:
+    drive.do(drive.play)
+    assert window.plots() >= 4  # distance, action, value, latency
+    first = window.picture_of_plot(0)
+    wait_for(lambda: window.picture_of_plot(0) != first, "another picture of the plot")
+    window.click("Observation", role="tab")
+    window.wait_for("shoulder_velocity")
+    text = window.text()
+    assert "rad/s" in text and "-1.1 .. 1.1" in text and "±" in text
+    window.click("Plots", role="tab")
+
+
+def test_the_ghost_appears_and_the_difference_is_plotted(drive: Drive, window: Browser) -> None:
+    drive.do(drive.play)
+    assert "Ghost's action minus" not in window.text()
+    window.choose("Second version", "2")
+    wait_for(lambda: drive.view.ghost is not None, "the ghost")
+    window.wait_for("Ghost's action minus")
+    wait_for(lambda: np.abs(drive.history[-1].difference).max() > 1e-3, "another action")
+    wait_for(lambda: drive.view.ghost[1].robot is not None, "its pose")
+    window.click("Pause")
+    window.wait_for("paused")
+    with_ghost = window.scene()
+    window.choose("Second version", "none")
+    wait_for(lambda: drive.view.ghost is None, "no ghost")
+    wait_for(lambda: np.abs(window.scene().astype(int) - with_ghost).max() > 30, "the ghost is gone from the picture")
+    window.click("Play")
+
+
+def test_a_second_browser_may_watch_on_a_phone_and_go(cockpit: Cockpit, window: Browser, windows: Windows) -> None:
+    phone = windows(390, 844)
+    phone.open(cockpit.address)
+    assert phone.page.evaluate("document.documentElement.scrollWidth") <= 390
+    assert len(cockpit.server.get_clients()) == 2
+    phone.close()
+    wait_for(lambda: len(cockpit.server.get_clients()) == 1, "the phone is gone")
+    first = window.text()
+    wait_for(lambda: window.text() != first, "the first browser's numbers go on")
+
+
+def test_a_picture_for_the_readme(cockpit: Cockpit, drive: Drive, windows: Windows, tmp_path: Path) -> None:
+    window = windows(1280, 720)
+    window.open(cockpit.address)
+    window.page.get_by_role("alert").locator("button").first.click()  # that it draws in software
+    drive.drag_target(np.array([-0.35, 0.45, 0.35]))
+    drive.do(drive.play)
+    window.choose("Second version", "2")
+    wait_for(lambda: drive.view.ghost is not None, "the ghost")
+    drive.do(lambda: drive.begin("own", keep_target=True))
+    start = drive.history[-1].number
+    wait_for(lambda: drive.history[-1].number > start + 18, "both are on their way")
+    drive.do(drive.pause)
+    window.wait_for("paused")
+    window.page.wait_for_timeout(3000)  # until the last frame is drawn
+    file = Path(PICTURES or tmp_path) / "cockpit.png"
+    picture = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
+    picture.quantize(256).save(file, optimize=True)
+    window.close()
+    drive.do(lambda: drive.choose_ghost(None))
+    drive.do(drive.play)
+    assert len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 500  # no empty page
+
+
+def test_out_of_distribution_is_coloured_and_said(drive: Drive, window: Browser) -> None:
+    drive.drag_target(np.array([3.0, 0.0, 0.5]))  # training had none beyond 0.75 m
+    window.wait_for("standard deviations above what it was in training")
+    window.click("Observation", role="tab")
+    wait_for(lambda: window.page.locator("tr[style*='#ff9d8f']").count() > 0, "a red row")
+    window.click("Plots", role="tab")
+    drive.do(lambda: drive.begin("own"))
+
+
+def test_nothing_was_asked_of_another_machine(window: Browser) -> None:
+    hosts = {urlsplit(address.removeprefix("blob:")).hostname for address in window.requests}
+    assert hosts == {"127.0.0.1"} and len(window.requests) >= 2
+
+
+def test_a_frame_takes_far_less_than_a_twentieth_of_a_second(cockpit: Cockpit) -> None:
+    """Of processor time: what a busy machine makes of it on the wall is not the cockpit's doing."""
+    spent = []
+    for _ in range(100):
+        began = time.thread_time()
+        cockpit.panel.draw()
+        spent.append(time.thread_time() - began)
+    assert np.median(spent) < 0.025
+
+
+def test_a_server_that_goes_away_is_said_and_comes_back(app: Any, windows: Windows, free_port: int) -> None:
+    source = ServedPolicies(f"http://127.0.0.1:{free_port}")
+    with ExitStack() as cleanup:
+        cleanup.callback(source.close)
+        with served_on(app, free_port):
+            drive = Drive(source, Choice("ur5", "production"), seed=5)
+            cleanup.callback(drive.close)
+            drive.start()
+            cockpit = cleanup.enter_context(cockpit_of(lambda server: DrivePanel(server, drive, source)))
+            window = windows(700, 500)
+            cleanup.callback(window.close)
+            window.open(cockpit.address)
+        window.wait_for("waiting for the policy, the robot stands")
+        with served_on(app, free_port):
+            wait_for(lambda: "waiting for the policy" not in window.text(), "it is back")
+            cycles = drive.history[-1].number
+            wait_for(lambda: drive.history[-1].number > cycles + 3, "the robot moves again")
+
+
+def test_target_and_cubes_of_a_mir100_are_dragged_and_dropped(two_versions: Path, windows: Windows) -> None:
+    source = BundledPolicies(two_versions)
+    with ExitStack() as cleanup:
+        drive = Drive(source, Choice("mir100_obstacle_avoidance", "1"), seed=3)
+        cleanup.callback(drive.close)
+        drive.start()
+        cockpit = cleanup.enter_context(cockpit_of(lambda server: DrivePanel(server, drive, source)))
+        window = windows(1200, 700)
+        cleanup.callback(window.close)
+        window.open(cockpit.address)
+        window.click("Pause")
+        window.wait_for("paused")
+        left = np.array([0.0, 1.0, 0.0])
+
+        def place(of: str) -> Any:
+            return drive.view.after.target if of == "target" else drive.view.after.obstacles[1]
+
+        for of, lift in (("target", TARGET_LIFT), ("cube", OBSTACLE_LIFT)):
+            before = place(of)
+            handle = before + (0.0, 0.0, lift)
+            window.drag(cockpit.pixel(handle + 0.6 * left), cockpit.pixel(handle + 1.0 * left))
+            wait_for(
+                lambda of=of, before=before: place(of)[1] > before[1] + 0.2, f"the {of} is where it was dragged to"
+            )
+            assert np.allclose(place(of)[[0, 2]], before[[0, 2]], atol=1e-3)
+        window.click("Drop a cube ahead")
+        robot = drive.view.after.robot
+        wait_for(lambda: np.linalg.norm(drive.view.after.obstacles - robot, axis=1).min() < 1.31, "a cube is near")
+
+
+def test_a_recording_scrubs_and_jumps_to_the_worst_moment(two_versions: Path, windows: Windows, tmp_path: Path) -> None:
+    file = tmp_path / "run.mcap"
+    with Policy.load(two_versions / "ur5" / "1") as policy:
+        rollout(policy, ENV, episodes=2, seed=3, record=file)
+    tape = Tape(file, bundle=two_versions / "ur5" / "2")
+    assert len(tape.episodes) == 2 and tape.moments
+    with cockpit_of(lambda server: PlaybackPanel(server, tape, env_id=None)) as cockpit:
+        window = windows(1100, 620)
+        window.open(cockpit.address)
+        window.click("Pause")
+        window.fill("Decision", "7")
+        window.wait_for("Decision 7")
+        first = window.scene()
+        window.fill("Decision", "20")
+        window.wait_for("Decision 20")
+        wait_for(lambda: np.abs(window.scene().astype(int) - first).max() > 30, "the arm is elsewhere")
+        number, _ = tape.find(tape.moments[0])
+        window.choose("Worst moments", None)
+        window.wait_for(f"Episode {number}: ")
+        window.wait_for(f"Decision {tape.moments[0].step}")
+        window.close()
