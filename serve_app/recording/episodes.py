@@ -130,7 +130,8 @@ class Episode:
     @cached_property
     def reward(self) -> NDArray[np.float64]:
         """What each decision brought; not a number where it is not known."""
-        return np.array([math.nan if one is None else one.get("reward", math.nan) for one in self._outcomes])
+        rewards = [math.nan if one is None else one.get("reward", math.nan) for one in self._outcomes]
+        return np.array(rewards, np.float64)  # a null is not a number
 
     @cached_property
     def reward_input(self) -> NDArray[np.float64]:

@@ -66,6 +66,11 @@ class LogFile:
         return self._stream.tell()
 
     @property
+    def is_deleted(self) -> bool:
+        """Whether nobody can open it any more: what is written is lost."""
+        return os.fstat(self._stream.fileno()).st_nlink == 0
+
+    @property
     def age_s(self) -> float:
         return (time.monotonic_ns() - self._monotonic_ns) / 1e9
 

@@ -47,9 +47,10 @@ class PolicyFormat:
         return f"{self.contract.name}/{self.contract.version}"
 
     @property
-    def key(self) -> tuple[str, str, str, str]:
+    def key(self) -> tuple[str, str, str, str, str]:
         """What makes two recorded policies the same one."""
-        return self.contract.name, self.contract.version, self.graph_hash, self.contract_hash
+        options = json.dumps(self.options, sort_keys=True)
+        return self.contract.name, self.contract.version, self.graph_hash, self.contract_hash, options
 
     @property
     def record_bytes(self) -> int:
