@@ -139,6 +139,13 @@ class Episode:
         return self._numbers("reward_input")
 
     @cached_property
+    def last_action_input(self) -> dict[int, Columns]:
+        """By row the action `[1, *shape]` that a limit on the step counted from, where no earlier row holds it."""
+        key = "last_action_input"
+        given = [(row, one[key]) for row, one in enumerate(self._decisions) if key in one]
+        return {row: self.policy.actions.columns([action]) for row, action in given}
+
+    @cached_property
     def latency_ms(self) -> NDArray[np.float64]:
         return self._numbers("latency_ms")
 

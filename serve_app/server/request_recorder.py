@@ -72,6 +72,8 @@ class RequestRecorder:
             known, obs, decision.action, episode, step, taken_s * 1e3, request.explore, seq=request.seq,
             request_id=_request_id(request), warnings=decision.notices, rows=rows,
         )  # fmt: skip
+        if policy.has_step_limit and not step:
+            record.last_action_input = said.last_action
         if policy.sees_reward:
             record.reward_input = reward
         if request.explore and policy.draw is not None:

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.spaces import DiscreteSpec
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.asgi_app import create_app
@@ -244,6 +245,44 @@ def test_a_session_that_goes_on_begins_no_episode(
     }
     report = replay(Recording(server.folder), recurrent / "lstm_box" / "1")
     assert (report.identical, report.changed) == (5, 0)
+
+
+def test_limits_that_count_from_what_the_client_tells_replay(start: Callable[..., Server], ur5: Path) -> None:
+    server = start({"ur5": PolicyOptions(max_action_step=0.05, out_of_bounds="clip")})
+    rng = np.random.default_rng(0)
+    ways: list[tuple[dict[str, Any], dict[str, str]]] = [({"session_id": "a"}, {}), ({}, {"x-session-id": "b"})]
+    for said, headers in ways:
+        for step in range(5):
+            body = {"obs": (3 * rng.standard_normal(27)).tolist(), **said}
+            if "session_id" in said and step == 0:
+                body["reset"] = True
+            if step in (0, 3) or "session_id" not in said:
+                body["last_action"] = [0.1 * step + 0.1] * 6
+            assert server.act("ur5", body, **headers)[0] == 200
+    assert len(server.recorded()) == 2
+    report = replay(Recording(server.folder), ur5)
+    assert (report.compared, report.identical, report.changed) == (10, 10, 0)
+
+
+def test_what_a_policy_sees_of_its_actions_is_what_it_gave(start: Callable[..., Server], recurrent: Path) -> None:
+    server, rng = start(), np.random.default_rng(0)
+    with PolicyClient(server.url, "lstm_previous") as client:
+        space = client.contract.action_space
+        size = client.contract.observation_space.size
+    assert isinstance(space, DiscreteSpec)
+    given = None
+    for step in range(6):
+        body = {"obs": rng.standard_normal(size).tolist(), "session_id": "a", "reset": step == 0, "reward": 0.5}
+        body["explore"] = True  # so that the distributions are compared, and not their modes alone
+        if step in (2, 4):
+            body["last_action"] = space.start if given != space.start else space.start + 1
+        status, reply = server.act("lstm_previous", body)
+        assert status == 200
+        given = reply["action"]
+    (episode,) = server.recorded()
+    assert episode.fell_back.sum() == 2
+    report = replay(Recording(server.folder), recurrent / "lstm_previous" / "1")
+    assert (report.compared, report.identical, report.changed) == (6, 6, 0)
 
 
 def test_a_session_keeps_no_request_alive(start: Callable[..., Server]) -> None:
