@@ -161,8 +161,10 @@ class Episodes:
             self.sessions.put(name, session_id, session, step.rows if session.policy.is_stateful else 0)
         session.keep(step)
         decision.episode = EpisodeNote(session_id=session_id, step=session.steps)
-        session.seq, session.answer = seq, decision
-        session.inputs_hash = b"" if seq is None else session.policy.fingerprint(step.inputs)
+        session.seq, session.answer, session.inputs_hash = seq, None, b""
+        if seq is not None:  # without the inputs: they may be views of a whole request's body
+            session.answer = replace(decision, inputs={}, is_repeated=True)
+            session.inputs_hash = session.policy.fingerprint(step.inputs)
         return decision
 
     def _check_version(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,10 +10,20 @@ from typing import Any
 
 from rlservo.serve_app.episodes.sessions import Session, SessionId
 
+LONGEST_LABEL = 128  # as a session's id; a header may have 16 KB
+
 
 def new_episode_id(label: str | None) -> str:
     """Return an id for an episode, or a stream, of whoever gave a label."""
-    return secrets.token_hex(8) if label is None else f"{label}.{secrets.token_hex(4)}"
+    return secrets.token_hex(8) if label is None else f"{shorten_label(label)}.{secrets.token_hex(4)}"
+
+
+def shorten_label(label: str) -> str:
+    """Return a label as an episode's id has it: of a long one the beginning and a hash."""
+    if len(label) <= LONGEST_LABEL:
+        return label
+    digest = hashlib.blake2b(label.encode("utf-8", "surrogatepass"), digest_size=8).hexdigest()
+    return f"{label[: LONGEST_LABEL - len(digest) - 1]}.{digest}"
 
 
 @dataclass(frozen=True, slots=True)

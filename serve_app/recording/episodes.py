@@ -130,12 +130,20 @@ class Episode:
     @cached_property
     def reward(self) -> NDArray[np.float64]:
         """What each decision brought; not a number where it is not known."""
-        return np.array([math.nan if one is None else one.get("reward", math.nan) for one in self._outcomes])
+        rewards = [math.nan if one is None else one.get("reward", math.nan) for one in self._outcomes]
+        return np.array(rewards, np.float64)  # a null is not a number
 
     @cached_property
     def reward_input(self) -> NDArray[np.float64]:
         """The reward that the policy was given to see; not a number where it was given none."""
         return self._numbers("reward_input")
+
+    @cached_property
+    def last_action_input(self) -> dict[int, Columns]:
+        """By row the action `[1, *shape]` that a limit on the step counted from, where no earlier row holds it."""
+        key = "last_action_input"
+        given = [(row, one[key]) for row, one in enumerate(self._decisions) if key in one]
+        return {row: self.policy.actions.columns([action]) for row, action in given}
 
     @cached_property
     def latency_ms(self) -> NDArray[np.float64]:

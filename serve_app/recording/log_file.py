@@ -66,6 +66,11 @@ class LogFile:
         return self._stream.tell()
 
     @property
+    def is_deleted(self) -> bool:
+        """Whether nobody can open it any more: what is written is lost."""
+        return os.fstat(self._stream.fileno()).st_nlink == 0
+
+    @property
     def age_s(self) -> float:
         return (time.monotonic_ns() - self._monotonic_ns) / 1e9
 
@@ -75,6 +80,7 @@ class LogFile:
         observed = policy.observations.rows(record.obs)
         acted = None if record.action is None else policy.actions.rows(record.action)
         commanded = None if record.commanded is None else policy.actions.rows(record.commanded)
+        last = None if record.last_action_input is None else policy.actions.rows(record.last_action_input)
         shared = self._shared(record)
         own, inputs = record.own_action, record.dist_inputs
         logp = None if own is None or inputs is None else policy.log_probability(inputs, own)
@@ -85,6 +91,8 @@ class LogFile:
                 parts.append(b'"action":' + policy.actions.encode(acted[row]))
             if commanded is not None:
                 parts.append(b'"commanded":' + policy.actions.encode(commanded[row]))
+            if last is not None:
+                parts.append(b'"last_action_input":' + policy.actions.encode(last[row]))
             if own is not None and inputs is not None:
                 chosen = {name: leaf[row] for name, leaf in own.items()}
                 parts.append(b'"own_action":' + policy.actions.encode(chosen))

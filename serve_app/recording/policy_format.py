@@ -47,9 +47,10 @@ class PolicyFormat:
         return f"{self.contract.name}/{self.contract.version}"
 
     @property
-    def key(self) -> tuple[str, str, str, str]:
+    def key(self) -> tuple[str, str, str, str, str]:
         """What makes two recorded policies the same one."""
-        return self.contract.name, self.contract.version, self.graph_hash, self.contract_hash
+        options = json.dumps(self.options, sort_keys=True)
+        return self.contract.name, self.contract.version, self.graph_hash, self.contract_hash, options
 
     @property
     def record_bytes(self) -> int:
@@ -235,6 +236,7 @@ def decision_schema(policy: PolicyFormat) -> dict[str, Any]:
             "logp": {"type": "number", "description": "Log-probability of own_action"},
             "explore": {"type": "boolean"},
             "reward_input": {"type": "number", "description": "The reward that the policy was given to see"},
+            "last_action_input": {**action, "description": "What a limit on the step counted from, at a beginning"},
             "latency_ms": {"type": "number", "description": "[ms]", "unit": "ms"},
             "seq": _integer("The request's number"),
             "request_id": _text("The request's id in the server's log"),

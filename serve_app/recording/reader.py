@@ -96,7 +96,7 @@ class Recording:
     def known(self, policy: PolicyFormat) -> PolicyFormat:
         """Return the one object that stands for this policy."""
         for known in self.policies:
-            if known.key == policy.key and known.options == policy.options:
+            if known.key == policy.key:
                 return known
         self.policies.append(policy)
         return policy

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import RlservoError, UsageError, first_line
+from rlservo.export.contract.errors import UsageError, first_line
 from rlservo.serve_app.interface import Closeable
 from rlservo.serve_app.recording.log_file import LogFile
 from rlservo.serve_app.recording.policy_format import PolicyFormat
@@ -79,7 +79,7 @@ class Recorder(Closeable):
         self._room = BUFFER_RECORDS
         self._held = 0  # in the buffer; of a batch each row
         self._lock = threading.Lock()
-        self._policies: dict[tuple[str, str, str, str], PolicyFormat] = {}
+        self._policies: dict[tuple[str, ...], PolicyFormat] = {}
         self.dropped = 0
         """Records that did not fit into the buffer, or came after recording had ended."""
         self.written = 0
@@ -120,7 +120,7 @@ class Recorder(Closeable):
         while self._wait and self._held >= self._room and self._thread.is_alive():
             time.sleep(0.001)
         with self._lock:
-            if self._held >= self._room or self.failure is not None:
+            if self._held >= self._room or self.failure is not None or self._closing.is_set():
                 self.dropped += record.rows
                 return False
             self._held += record.rows
@@ -130,7 +130,8 @@ class Recorder(Closeable):
     def close(self) -> None:
         """Write what is in the buffer and end the file."""
         atexit.unregister(self.close)
-        self._closing.set()
+        with self._lock:  # what comes from now on is dropped, so that there is an end
+            self._closing.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(WAIT_S)
 
@@ -165,7 +166,9 @@ class Recorder(Closeable):
                 else:
                     file.add_outcome(record)
                 self.written += record.rows
-            except (RlservoError, ValueError, TypeError, KeyError, IndexError) as error:  # not of the policy's spaces
+            except OSError:
+                raise
+            except Exception as error:  # not of the policy's spaces
                 self.dropped += record.rows
                 if not self._unreadable:
                     self._unreadable = True
@@ -177,9 +180,15 @@ class Recorder(Closeable):
 
     def _rotate(self) -> None:
         file = self._file
-        if file is None or not self._is_folder:
+        if file is None:
             return
-        if file.size >= self._max_file_bytes or file.age_s >= self._max_file_s:
+        if file.is_deleted:
+            if not self._is_folder:
+                raise FileNotFoundError(f"{file.path} was deleted")
+            self._file = None
+            file.close()
+            logger.warning("the recording %s was deleted while it was being written", file.path)
+        elif self._is_folder and (file.size >= self._max_file_bytes or file.age_s >= self._max_file_s):
             self._file = None
             file.close()
 

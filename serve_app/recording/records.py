@@ -38,6 +38,8 @@ class DecisionRecord:
     """Where it explored: `action_dist_inputs`, `[batch, n]`."""
     reward_input: Any = None
     """The reward that the policy was given to see."""
+    last_action_input: Any = None
+    """The action that a limit on the step counted from, where no earlier decision of the episode holds it."""
     seq: int | None = None
     request_id: str | None = None
     warnings: Sequence[str] = ()

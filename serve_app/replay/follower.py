@@ -108,10 +108,12 @@ class Follower:
         for row in range(rows):
             done = {name: leaf[row : row + 1] for name, leaf in executed.items()}
             if known[row]:
+                gave = {name: leaf[row : row + 1] for name, leaf in episode.action.items()}
                 obs = build_action(space, {name: leaf[row] for name, leaf in seen.items()}, "obs")
                 reward = episode.reward_input[row] if rewarded else None
+                last = episode.last_action_input.get(row, last)
                 try:
-                    answer = policy.follow(obs, done, before=before, last=last, reward=reward)
+                    answer = policy.follow(obs, gave, before=before, last=last, reward=reward)
                 except ActionError:
                     known[row], unsafe[row] = False, True
                     if policy.is_stateful:  # what it would remember then is not known either

@@ -290,16 +290,16 @@ class Policy(Closeable):
     def follow(
         self,
         obs: Observation,
-        done: Mapping[str, NDArray[Any]],
+        gave: Mapping[str, NDArray[Any]],
         *,
         before: State | None = None,
         last: Mapping[str, NDArray[Any]] | None = None,
         reward: ArrayLike | None = None,
     ) -> Answer:
-        """Return what the policy would have done, and remember nothing, where what was done is `done`.
+        """Return what the policy would have done, and remember nothing, where the recorded one gave `gave`.
 
-        `done` and `last`, the step before's, are leaves `[batch, *shape]`: what the policy sees of its actions, and
-        what limits count from, is what the robot did. Raises what `step` raises.
+        That and `last` are leaves `[batch, *shape]`: what the policy sees of its actions is what was given, and what
+        limits count from is what the robot did before. Raises what `step` raises.
         """
         feed, _, _ = self._observations.parse(obs)
         rows = len(next(iter(feed.values())))
@@ -313,7 +313,7 @@ class Policy(Closeable):
         if self._step_limit and last is not None:
             action, _ = self._step_limit.apply(action, last)
         inputs = computed["action_dist_inputs"] if explores else None
-        return Answer(action, inputs, self._state_tensors.next_state(computed, done))
+        return Answer(action, inputs, self._state_tensors.next_state(computed, gave))
 
     def value(self, obs: Observation) -> NDArray[Any] | None:
         """Return the critic's value of each observation `[batch]`; None where the graph has none, or remembers."""

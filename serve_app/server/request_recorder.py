@@ -8,16 +8,17 @@ from __future__ import annotations
 import time
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError, RlservoError, UnknownPolicyError, UsageError
-from rlservo.serve_app.episodes.request import Episode, Request
+from rlservo.serve_app.episodes.request import Episode, Request, shorten_label
 from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
 from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.request_path import count_rows
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 
@@ -30,14 +31,8 @@ except ModuleNotFoundError as error:
     raise UsageError(f"recording needs the Python package {error.name!r}: pip install 'rlservo[record]'") from error
 
 MOST_EPISODES = 65_536  # whose steps are counted; of more, the one that was silent longest begins anew
+LONGEST_REQUEST_ID = 128  # of a longer one, the beginning: a header may have 16 KB
 NO_EPISODE = Episode()
-
-
-class _Place(NamedTuple):
-    """Where an episode is: its last recorded step, and its last step by the session's own count."""
-
-    step: int
-    session_step: int | None
 
 
 class RequestRecorder:
@@ -50,19 +45,19 @@ class RequestRecorder:
             Path(settings.record), max_file_bytes=settings.record_file_bytes, max_folder_bytes=settings.record_bytes
         )
         self._formats: WeakKeyDictionary[Policy, PolicyFormat] = WeakKeyDictionary()
-        self._steps: OrderedDict[tuple[str, str], _Place] = OrderedDict()
+        self._steps: OrderedDict[tuple[str, str], int] = OrderedDict()
+        """The last recorded step of each episode, by policy name and episode; the longest silent come first."""
 
     def record_answer(self, request: Request, decision: Decision, taken_s: float) -> None:
         """Record a decision, and what its request says of the one before."""
         policy = decision.policy
-        if not policy.options.record:
+        if not policy.options.record or decision.is_repeated:
             return
         said = request.episode or NO_EPISODE
-        place = self._place(request, decision, said)
-        if place is None:
-            return
-        episode, step = place
-        known, rows, obs = self._format(policy), decision.batch or 1, LeafArrays(decision.inputs)
+        episode, step = self._place(request, decision, said)
+        known, rows = self._format(policy), decision.batch or 1
+        # Copies: what came in binary is a view of the whole request's body, which may be a thousand times as large.
+        obs = LeafArrays({name: decision.inputs[name].copy() for name in known.observations.leaves})
         ends = said.final_status is not None
         reward = None if said.reward is None else _numbers(said.reward, rows)
         if episode and step and (ends or reward is not None or said.last_action is not None):
@@ -75,8 +70,10 @@ class RequestRecorder:
             return  # its action is for nobody
         record = DecisionRecord(
             known, obs, decision.action, episode, step, taken_s * 1e3, request.explore, seq=request.seq,
-            request_id=request.request_id, warnings=decision.notices, rows=rows,
+            request_id=_request_id(request), warnings=decision.notices, rows=rows,
         )  # fmt: skip
+        if policy.has_step_limit and not step:
+            record.last_action_input = said.last_action
         if policy.sees_reward:
             record.reward_input = reward
         if request.explore and policy.draw is not None:
@@ -85,27 +82,34 @@ class RequestRecorder:
 
     def record_failure(self, request: Request, store: PolicyStore | None, error: RlservoError) -> None:
         """Record a single observation that got no action, where it is one of the policy's at all."""
+        said = request.episode or NO_EPISODE
         if store is None or request.obs is None or isinstance(error, ObservationError | RequestError):
             return
+        if said.final_status is not None:
+            return  # no decision was asked for, and the episode goes on until its end is told
         try:
-            policy = store.get(request.policy, request.version) if request.stream is None else request.stream.policy
+            policy = (
+                request.stream.policy
+                if request.stream is not None
+                else store.choose(request.policy, request.version, _session_of(request) or request.label)
+            )
         except UnknownPolicyError:
             return
         if not policy.options.record:
             return
         known = self._format(policy)
-        try:
-            parts = known.observations.rows(request.obs)  # nothing has looked at it yet
-        except (RequestError, ValueError, TypeError, KeyError):
+        if count_rows(policy.contract.observation_space, request.obs) > 1:
             return
-        if len(parts) > 1:
+        try:
+            (leaves,) = known.observations.rows(request.obs)
+        except Exception:  # it may be anything: nothing has looked at it yet
             return
         taken_ms = (time.perf_counter() - request.received) * 1e3
         episode = "" if _carries_state(request) else _episode_of(request)
-        step = self._count(policy.contract.name, episode, request.episode or NO_EPISODE) if episode else 0
+        step = self._count(policy.contract.name, episode, said.reset) if episode else 0
         record = DecisionRecord(
-            known, LeafArrays(parts[0]), None, episode, step, taken_ms, request.explore, seq=request.seq,
-            request_id=request.request_id, error=error.code,
+            known, LeafArrays({name: leaf.copy() for name, leaf in leaves.items()}), None, episode, step, taken_ms,
+            request.explore, seq=request.seq, request_id=_request_id(request), error=error.code,
         )  # fmt: skip
         self.recorder.record(record)
 
@@ -113,32 +117,27 @@ class RequestRecorder:
         """Write what there is and end the file."""
         self.recorder.close()
 
-    def _place(self, request: Request, decision: Decision, said: Episode) -> tuple[str, int] | None:
-        """Return (episode, step); None for the last decision once more, whose request came again."""
+    def _place(self, request: Request, decision: Decision, said: Episode) -> tuple[str, int]:
+        """Return (episode, step)."""
         note = decision.episode
         if note is not None and note.recorded is not None:
             return note.recorded
         episode = _episode_of(request)
         if not episode:
             return "", 0
-        session_step = None if note is None else note.step
-        last = self._steps.get((decision.name, episode))
-        if last is not None and not said.reset and session_step is not None and session_step == last.session_step:
-            return None
-        step = self._count(decision.name, episode, said, session_step)
+        # A memory that goes on is no episode's beginning, whatever was said of its end or was forgotten here.
+        least = note.step - 1 if note is not None and note.step is not None and decision.policy.is_stateful else 0
+        step = self._count(decision.name, episode, said.reset, least)
+        if said.end or said.final_status is not None:
+            del self._steps[decision.name, episode]
         return episode, step
 
-    def _count(self, name: str, episode: str, said: Episode, session_step: int | None = None) -> int:
+    def _count(self, name: str, episode: str, begins: bool, least: int = 0) -> int:
         """Return the number of an episode's next step, from 0."""
-        last = None if said.reset else self._steps.get((name, episode))
-        step = 0 if last is None else last.step + 1
-        if session_step is None and last is not None:
-            session_step = last.session_step
-        self._steps[name, episode] = _Place(step, session_step)
+        step = max(least, 0 if begins else self._steps.get((name, episode), -1) + 1)
+        self._steps[name, episode] = step
         self._steps.move_to_end((name, episode))
-        if said.end or said.final_status is not None:
-            del self._steps[name, episode]
-        elif len(self._steps) > MOST_EPISODES:
+        if len(self._steps) > MOST_EPISODES:
             self._steps.popitem(last=False)
         return step
 
@@ -153,17 +152,25 @@ class RequestRecorder:
 
 def _episode_of(request: Request) -> str:
     """Return the episode that a request is of: its session, its stream, or all that comes under its label."""
-    in_session = request.episode is not None and request.episode.session_id is not None
-    return (request.label if request.stream_id is None or in_session else request.stream_id) or ""
+    return _session_of(request) or request.stream_id or shorten_label(request.label or "")
+
+
+def _session_of(request: Request) -> str | None:
+    episode = request.episode
+    return None if episode is None or episode.session_id is None else str(episode.session_id)
+
+
+def _request_id(request: Request) -> str | None:
+    return None if request.request_id is None else request.request_id[:LONGEST_REQUEST_ID]
 
 
 def _numbers(reward: Any, rows: int) -> NDArray[np.float64] | None:
     """Return a request's reward, or one a row; None for what is none."""
     try:
         numbers = np.ravel(np.asarray(reward, np.float64))
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return None
-    return numbers if len(numbers) in (1, rows) else None
+    return numbers if len(numbers) in (1, rows) and np.isfinite(numbers).all() else None
 
 
 def _carries_state(request: Request) -> bool:

@@ -62,6 +62,7 @@ class Decision:
     notices: tuple[str, ...] = ()  # what was out of bounds or limited, and used all the same
     episode: EpisodeNote | None = None
     sharers: int = 1  # requests whose observations were computed in the same run of the network
+    is_repeated: bool = False  # the answer to a session's last request once more
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shutil
 import signal
 import stat
 import subprocess
@@ -245,6 +246,52 @@ def test_full_buffer_drops_counts_and_marks_the_place(
     recording = Recording(tmp_path / "run.mcap")
     assert sum(1 for _ in recording.entries()) == 100
     assert recording.files[0].dropped == 50
+
+
+def test_what_comes_after_the_end_is_counted_and_not_kept(ur5: Path, tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        policy = recorder.policy(Policy.load(ur5).contract)
+    assert not recorder.record(DecisionRecord(policy, np.zeros(27), np.zeros(6)))
+    assert recorder.dropped == 1
+
+
+def test_a_number_that_no_type_holds_drops_its_record_alone(ur5: Path, tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        policy = recorder.policy(Policy.load(ur5).contract)
+        recorder.record(DecisionRecord(policy, [10**400] * 27, np.zeros(6)))
+        recorder.record(DecisionRecord(policy, np.zeros(27), np.zeros(6)))
+    assert (recorder.failure, recorder.dropped, recorder.written) == (None, 1, 1)
+
+
+def test_a_policy_under_other_options_is_another_one(ur5: Path, tmp_path: Path) -> None:
+    contract = Policy.load(ur5).contract
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        for step in (0.1, 0.2, 0.1):
+            policy = recorder.policy(contract, options={"max_action_step": step})
+            recorder.record(DecisionRecord(policy, np.zeros(27), np.zeros(6)))
+    found = [entry.policy.options["max_action_step"] for entry in Recording(tmp_path / "run.mcap").entries()]
+    assert found == [0.1, 0.2, 0.1]
+
+
+@pytest.mark.parametrize("what", ["file", "folder"])
+def test_deleted_recording_is_noticed(ur5: Path, tmp_path: Path, what: str) -> None:
+    folder, deadline = tmp_path / "run", time.monotonic() + 30
+    with Recorder(folder) as recorder:
+        policy = recorder.policy(Policy.load(ur5).contract)
+        record = DecisionRecord(policy, np.zeros(27), np.zeros(6))
+        recorder.record(record)
+        while not (begun := list(folder.iterdir())):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        if what == "folder":
+            shutil.rmtree(folder)
+        else:
+            begun[0].unlink()
+        while recorder.failure is None and not (folder.exists() and list(folder.iterdir())):
+            assert time.monotonic() < deadline
+            recorder.record(record)
+            time.sleep(0.01)
+    assert (recorder.failure is None) == (what == "file")
 
 
 def test_dropped_decisions_are_a_gap(ur5: Path, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.spaces import DiscreteSpec
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.asgi_app import create_app
@@ -25,6 +26,8 @@ from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.replay.replay import replay
 from rlservo.serve_app.runtime.options import PolicyOptions
+from rlservo.serve_app.server import request_recorder
+from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_recorder import RequestRecorder
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import load_store
@@ -37,6 +40,7 @@ class Server:
     port: int
     folder: Path
     recorder: RequestRecorder
+    core: Core
 
     @property
     def url(self) -> str:
@@ -70,7 +74,9 @@ def start(recurrent: Path, ur5: Path, served: Serve, tmp_path: Path) -> Iterator
         def serve(options: dict[str, PolicyOptions] | None = None, **settings: Any) -> Server:
             store = load_store(recurrent, ur5, options=options)
             app = create_app(lambda: store, ServerSettings(record=str(tmp_path / "recorded"), **settings))
-            server = Server(stack.enter_context(served(app)), tmp_path / "recorded", app.state.core.recorder)
+            server = Server(
+                stack.enter_context(served(app)), tmp_path / "recorded", app.state.core.recorder, app.state.core
+            )
             stack.callback(server.recorder.close)
             return server
 
@@ -210,6 +216,110 @@ def test_what_got_no_action_stands_in_its_episode(start: Callable[..., Server]) 
     assert episode.errors[1] == "deadline-passed"
 
 
+def test_an_observation_that_nothing_has_looked_at_may_be_anything(start: Callable[..., Server]) -> None:
+    server = start()
+    for obs in ([10**400] * 27, "x", {"a": {"b": 1}}, [[[0]]], [[0.0] * 27] * 1000):
+        assert server.act("ur5", {"obs": obs, "deadline_ms": 0})[0] == 408, str(obs)[:40]
+    assert server.act("ur5", {"obs": [0] * 27})[0] == 200
+    (entry,) = server.recorded()
+    assert entry.acted.all()
+
+
+def test_a_session_that_goes_on_begins_no_episode(
+    start: Callable[..., Server], recurrent: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(request_recorder, "MOST_EPISODES", 1)
+    server = start()
+    a, b = ({"obs": [0.5, 0.25, 0.125], "session_id": name} for name in "ab")
+    begin: dict[str, Any] = {"reset": True}
+    late: dict[str, Any] = {"deadline_ms": 0}
+    end: dict[str, Any] = {"final_status": "success"}
+    bodies = [a | begin, a, a | late, a | end | late, a | end, a, b | begin, b, a, b | {"end": True}]
+    statuses = [server.act("lstm_box", body)[0] for body in bodies]
+    assert statuses == [200, 200, 408, 408] + [200] * 6
+    found = {(one.id, tuple(one.steps.tolist()), one.begins, one.final_status) for one in server.recorded()}
+    assert found == {
+        ("a", (0, 1, 2), True, "success"),
+        ("a", (3, 4), False, None),  # with the memory of before
+        ("b", (0, 1, 2), True, None),
+    }
+    report = replay(Recording(server.folder), recurrent / "lstm_box" / "1")
+    assert (report.identical, report.changed) == (5, 0)
+
+
+def test_limits_that_count_from_what_the_client_tells_replay(start: Callable[..., Server], ur5: Path) -> None:
+    server = start({"ur5": PolicyOptions(max_action_step=0.05, out_of_bounds="clip")})
+    rng = np.random.default_rng(0)
+    ways: list[tuple[dict[str, Any], dict[str, str]]] = [({"session_id": "a"}, {}), ({}, {"x-session-id": "b"})]
+    for said, headers in ways:
+        for step in range(5):
+            body = {"obs": (3 * rng.standard_normal(27)).tolist(), **said}
+            if "session_id" in said and step == 0:
+                body["reset"] = True
+            if step in (0, 3) or "session_id" not in said:
+                body["last_action"] = [0.1 * step + 0.1] * 6
+            assert server.act("ur5", body, **headers)[0] == 200
+    assert len(server.recorded()) == 2
+    report = replay(Recording(server.folder), ur5)
+    assert (report.compared, report.identical, report.changed) == (10, 10, 0)
+
+
+def test_what_a_policy_sees_of_its_actions_is_what_it_gave(start: Callable[..., Server], recurrent: Path) -> None:
+    server, rng = start(), np.random.default_rng(0)
+    with PolicyClient(server.url, "lstm_previous") as client:
+        space = client.contract.action_space
+        size = client.contract.observation_space.size
+    assert isinstance(space, DiscreteSpec)
+    given = None
+    for step in range(6):
+        body = {"obs": rng.standard_normal(size).tolist(), "session_id": "a", "reset": step == 0, "reward": 0.5}
+        body["explore"] = True  # so that the distributions are compared, and not their modes alone
+        if step in (2, 4):
+            body["last_action"] = space.start if given != space.start else space.start + 1
+        status, reply = server.act("lstm_previous", body)
+        assert status == 200
+        given = reply["action"]
+    (episode,) = server.recorded()
+    assert episode.fell_back.sum() == 2
+    report = replay(Recording(server.folder), recurrent / "lstm_previous" / "1")
+    assert (report.compared, report.identical, report.changed) == (6, 6, 0)
+
+
+def test_a_session_keeps_no_request_alive(start: Callable[..., Server]) -> None:
+    server = start()
+    body = {"obs": [0.5, 0.25, 0.125], "session_id": "a", "reset": True}
+    for seq in ({}, {"seq": 1}):
+        assert server.act("lstm_box", body | seq)[0] == 200
+        session = server.core.episodes.sessions.peek("lstm_box", "a")
+        assert session is not None and (session.answer is None or session.answer.inputs == {})
+    assert session.answer is not None
+
+
+def test_records_keep_no_large_request_alive(start: Callable[..., Server], monkeypatch: pytest.MonkeyPatch) -> None:
+    server, kept = start(), []
+    monkeypatch.setattr(server.recorder.recorder, "record", kept.append)
+    header = json.dumps(
+        {
+            "inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "parameters": {"binary_data_size": 108}}],
+            "parameters": {"sequence_id": "b" * 120},
+        }
+    )
+    header += " " * (100_000 - len(header))
+    long = "l" * 5000
+    headers = {"inference-header-content-length": "100000", "x-request-id": long}
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)) as connection:
+        connection.request("POST", "/v2/models/ur5/infer", header.encode() + bytes(108), headers)
+        assert connection.getresponse().status == 200
+    server.act("ur5", {"obs": [0] * 27}, **{"x-session-id": long, "x-request-id": long})
+    state = server.act("lstm_box", {"obs": [0, 0, 0], "state": {}}, **{"x-session-id": long})[1]["state"]
+    server.act("lstm_box", {"obs": [0, 0, 0], "state": state}, **{"x-session-id": long})
+    assert len(kept) == 4
+    for record in kept:
+        assert all(array.base is None for array in record.obs.values())
+        assert len(record.request_id or "") <= 128 and len(record.episode) <= 140
+    assert kept[2].episode == kept[3].episode and (kept[2].step, kept[3].step) == (0, 1)
+
+
 def test_policies_whose_options_say_so_are_left_out(start: Callable[..., Server]) -> None:
     server = start({"ur5": PolicyOptions(record=False)})
     assert server.act("ur5", {"obs": [0] * 27})[0] == 200
@@ -240,7 +350,7 @@ def test_nothing_of_headers_is_in_the_file_and_only_the_owner_reads_it(start: Ca
 
 def test_a_reward_that_is_no_number_is_not_recorded(start: Callable[..., Server]) -> None:
     server, headers = start(), {"x-session-id": "cell-7"}
-    for reward in (None, "much", {"a": 1}, [1, [2]], 1.0):
+    for reward in (None, "much", {"a": 1}, "nan", 1.0):
         assert server.act("ur5", {"obs": [0] * 27, "reward": reward}, **headers)[0] == 200
     (episode,) = server.recorded()
     assert len(episode) == 5 and np.isfinite(episode.reward).tolist() == [False, False, False, True, False]
