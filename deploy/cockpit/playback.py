@@ -20,7 +20,7 @@ from rlservo.deploy.cockpit.view import Cycle
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording
-from rlservo.serve_app.replay.followed import Follower
+from rlservo.serve_app.replay.follower import Follower
 from rlservo.serve_app.replay.replay import Moment, replay
 
 MOST_EPISODES = 500  # in memory
