@@ -104,7 +104,9 @@ def run_demo(
     console.print(_table(runs))
     console.print(f"picture: {picture}   bundles: {repository}   {time.monotonic() - start:.0f} s in all", markup=False)
     console.print(
-        f"drive them yourself, in the browser: rlservo cockpit --bundle {shlex.quote(str(repository))}", markup=False
+        f"drive them yourself, in the browser: rlservo cockpit --bundle {shlex.quote(str(repository))}",
+        markup=False,
+        soft_wrap=True,
     )
 
 

@@ -28,7 +28,8 @@ print("closed")
 @pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="needs a virtual display (Debian: xvfb)")
 def test_windows_open_and_close_one_after_another() -> None:
     environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}
-    env_ids = [f"{NAMESPACE}/{name}" for name in ENTRY_POINTS]
+    # Randomized-v0 is one of the others, disturbed.
+    env_ids = [f"{NAMESPACE}/{name}" for name in ENTRY_POINTS if name != "Randomized-v0"]
     done = subprocess.run(
         ["xvfb-run", "-a", "-s", "-screen 0 1024x768x24", sys.executable, "-c", WINDOW, *env_ids],
         capture_output=True,
