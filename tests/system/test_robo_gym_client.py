@@ -25,7 +25,7 @@ from rlservo.envs.robot_server.manager import RobotServers, ServerManager
 from rlservo.envs.robot_server.server import RobotServer
 from rlservo.envs.robot_server.settings import URSettings
 from rlservo.serve_app.ray_serve.processes import free_ports
-from servers import ShippedServer
+from servers import HEEDING_CTRL_C, ShippedServer
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "robo_gym_client.py"
@@ -200,14 +200,13 @@ def test_ctrl_c_ends_with_130_and_no_simulator(
     manager = ServerManager(port=0, servers=servers)
     line = ["--url", url, "--manager-port", str(manager.port), "--episodes", "1000", "--json"]
     process = subprocess.Popen(
-        [str(robo_gym_python), str(EXAMPLE), *line],
+        [*HEEDING_CTRL_C, str(robo_gym_python), str(EXAMPLE), *line],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(light_client)},
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
     )  # fmt: skip
     try:
         deadline = time.monotonic() + 120
         while not (servers.starts if isinstance(servers, SlowToStart) else servers.running):
-            assert process.poll() is None
+            assert process.poll() is None, process.communicate()
             assert time.monotonic() < deadline
             time.sleep(0.05)
         if during == "start":
@@ -231,7 +230,7 @@ def test_ctrl_c_ends_with_130_and_no_simulator(
             assert report["interrupted"] and report["episodes"] == sum(report["endings"].values()) >= 1
     finally:
         process.kill()
-        process.wait()
+        process.communicate()
         manager.close()
 
 
