@@ -39,7 +39,7 @@ TOGETHER = {
     "tests/examples/test_training_scripts.py": "one Ray",
 }
 
-# What takes longest begins first, so that nobody waits for it in the end; then the files with slow tests, then the rest.
+# What takes longest begins first: nobody waits for it in the end. The files with slow tests follow, then the rest.
 LONGEST = (
     "one Ray", "cluster", "live server", "shipped server", "tests/deploy/cockpit/test_page.py",
     "tests/system/test_demo.py", "tests/examples/test_on_a_cluster.py", "tests/system/test_serving_starts.py",
