@@ -232,15 +232,17 @@ def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) 
         "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
     }  # fmt: skip
     plan = json.dumps({"dashboard": dashboard, "folder": str(folder)})
-    process = subprocess.Popen(
-        [sys.executable, "-c", CLUSTER, plan],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment,
-        start_new_session=True,
-    )  # fmt: skip
+    errors = tmp_path_factory.mktemp("cluster") / "errors.txt"
+    with errors.open("w") as stream:
+        process = subprocess.Popen(
+            [sys.executable, "-c", CLUSTER, plan],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True, env=environment,
+            start_new_session=True,
+        )  # fmt: skip
     assert process.stdin is not None and process.stdout is not None
     try:
         address = process.stdout.readline().strip()
-        assert address
+        assert address, errors.read_text()[-3000:]
         made = Cluster(address, port, dashboard, folder, environment, cluster_repository, configuration)
         made.missing = tmp_path_factory.mktemp("configuration") / "gone"
         made.before = made.check("--config", _configuration_without_policies(made.missing))

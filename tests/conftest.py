@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from typing import Any
 
 import pytest
@@ -29,12 +30,21 @@ TOGETHER = {
     "tests/examples/test_edge_environments.py": "one Ray",
     "tests/examples/test_learn_from_recordings.py": "one Ray",
     "tests/examples/test_shipped_policies.py": "one Ray",
-    "tests/examples/test_simple_trainer.py": "one Ray",
-    "tests/examples/test_slurm.py": "one Ray",
+    "tests/examples/test_simple_trainer.py::test_ctrl_c": "one Ray",
+    "tests/examples/test_simple_trainer.py::test_resumed": "one Ray",
+    "tests/examples/test_simple_trainer.py": "sweep",
+    "tests/examples/test_slurm.py::test_several_nodes": "several nodes",
+    "tests/examples/test_slurm.py": "sweep",
     "tests/examples/test_tour.py": "one Ray",
     "tests/examples/test_training_scripts.py": "one Ray",
 }
 
+# What takes longest begins first: nobody waits for it in the end. The files with slow tests follow, then the rest.
+LONGEST = (
+    "one Ray", "cluster", "live server", "shipped server", "tests/deploy/cockpit/test_page.py",
+    "tests/system/test_demo.py", "tests/examples/test_on_a_cluster.py", "tests/system/test_serving_starts.py",
+    "ports of server managers", "sweep", "several nodes",
+)  # fmt: skip
 
 # Servers and Rays that tests share. One that nobody uses still takes a tenth of a core or more.
 RUNNING = {"live_server", "shipped_server", "cluster", "one_ray"}
@@ -62,10 +72,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByGroup:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the groups that share something, then the files with slow tests first: nobody waits for those in the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    shared = set(TOGETHER.values())
-    items.sort(key=lambda item: (group_of(item.nodeid) not in shared, item.path not in slow))
+    places = {group: place for place, group in enumerate(LONGEST)}
+    items.sort(key=lambda item: (places.get(group_of(item.nodeid), len(places)), item.path not in slow))
 
 
 class SharedFixtures:
@@ -97,4 +106,7 @@ class SharedFixtures:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # A collection walks all that torch and RLlib have made, and by Python's own threshold one comes every 700 objects:
+    # a quarter of the time of their import.
+    gc.set_threshold(100_000, 20, 20)
     config.pluginmanager.register(SharedFixtures())
