@@ -201,9 +201,9 @@ def test_network_policy_lets_in_clients_operator_and_prometheus_to_ports_that_ar
 
 def test_compose_is_well_formed_and_no_linter_finds_a_serious_fault() -> None:
     compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
-    PyCompose.from_dict(compose).validate()
+    PyCompose.from_yaml(yaml.safe_dump(compose)).validate()  # without the merge keys, which its parser leaves to others
     with pytest.raises(ValueError, match="memlimit"):
-        PyCompose.from_dict({"services": {"a": {"image": "a:1", "memlimit": "1g"}}})
+        PyCompose.from_yaml("services: {a: {image: 'a:1', memlimit: 1g}}")
     done = subprocess.run(
         [program("compose-lint"), "--format", "json", str(DEPLOY / "compose.yaml")], capture_output=True, text=True
     )
