@@ -44,6 +44,7 @@ def main() -> None:
     parser.add_argument("--tls", action="store_true")
     parser.add_argument("--seconds", type=float, default=15.0, help="of idling, and again of load")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # `timeout` leaves nothing behind, either
     folder = Path(tempfile.mkdtemp(prefix="r"))
     mark = secrets.token_hex(16)
     try:
@@ -88,7 +89,7 @@ def measure(policies: Path, folder: Path, mark: str, *, tls: bool, seconds: floa
         print(f"TLS between nodes: {'yes' if tls else 'no'}; under load {answers / seconds:.0f} requests/s, JSON")
         report(idle, busy, seconds)
         if tls:
-            refuse_without_certificate(environment, gcs)
+            refuse_without_certificate(environment, secured, gcs)
 
 
 def node_environment(folder: Path, mark: str) -> dict[str, str]:
@@ -242,20 +243,22 @@ def total(found: Readings, where: str, kind: str, column: int) -> float:
     return sum(float(each[column]) for each in found.values() if each[:2] == (where, kind))
 
 
-def refuse_without_certificate(environment: Mapping[str, str], gcs: int) -> None:
-    """Ask the cluster with its token and without TLS; an answer fails the run."""
+def refuse_without_certificate(plain: Mapping[str, str], secured: Mapping[str, str], gcs: int) -> None:
+    """Ask the cluster with its token, with and without the certificate; only the first may get an answer."""
     program = "import ray, sys; ray.init(sys.argv[1], logging_level='ERROR', log_to_driver=False); print('ANSWERED')"
-    try:
-        asked = subprocess.run(
-            [sys.executable, "-c", program, f"127.0.0.1:{gcs}"],
-            env=dict(environment), capture_output=True, text=True, timeout=60,
-        )  # fmt: skip
-        answered = "ANSWERED" in asked.stdout
-    except subprocess.TimeoutExpired:
-        answered = False
-    if answered:
-        raise SystemExit("Ray answered a client that had no certificate")
-    print("a client with the token and without a certificate got no answer")
+
+    def is_answered(environment: Mapping[str, str]) -> bool:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            asked = subprocess.run(
+                [sys.executable, "-c", program, f"127.0.0.1:{gcs}"],
+                env=dict(environment), capture_output=True, text=True, timeout=60,
+            )  # fmt: skip
+            return "ANSWERED" in asked.stdout
+        return False
+
+    if is_answered(plain) or not is_answered(secured):
+        raise SystemExit("Ray answered a client that had no certificate, or none that had one")
+    print("a client with the token and the certificate got an answer, one with the token alone none")
 
 
 if __name__ == "__main__":

@@ -125,4 +125,4 @@ def test_aliases_outlive_the_container(redis: tuple[int, str], policies: Path, t
 
 def default(admin: AdminClient) -> str:
     (replica,) = admin.replicas()
-    return str(next(each for each in replica["policies"] if each["name"] == "ur5")["default"])
+    return str(next(each for each in replica["policies"] if each["name"] == "ur5")["version"])
