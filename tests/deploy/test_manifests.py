@@ -212,8 +212,10 @@ def test_compose_is_well_formed_and_no_linter_finds_a_serious_fault() -> None:
 
 def test_compose_publishes_nginx_alone_and_every_service_is_confined_and_watched() -> None:
     compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
-    assert set(compose["services"]) == {"server", "nginx", "redis", "store", "prometheus", "grafana"}
+    assert set(compose["services"]) == {"server", "nginx", "redis", "store", "store-volume", "prometheus", "grafana"}
     assert compose["networks"]["inside"] == {"internal": True}
+    owner = compose["services"].pop("store-volume")  # root, for one call of chown
+    assert (owner["cap_drop"], owner["cap_add"], owner["network_mode"]) == (["ALL"], ["CHOWN"], "none")
     for name, service in compose["services"].items():
         assert ("ports" in service) == (name == "nginx"), name
         assert (service["networks"] == ["inside"]) == (name != "nginx")

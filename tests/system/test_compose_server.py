@@ -1,4 +1,4 @@
-"""The program of compose's server container: Ray and Serve from its script, and what outlives them in Redis."""
+"""The image's environment running compose's server: Ray and Serve without torch, and what outlives them in Redis."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import secrets
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -46,7 +45,16 @@ def redis(tmp_path: Path) -> Iterator[tuple[int, str]]:
         process.wait(30)
 
 
-def test_aliases_outlive_the_container(redis: tuple[int, str], policies: Path, tmp_path: Path) -> None:
+def test_the_image_has_no_torch(image_environment: Path) -> None:
+    program = "import importlib.util as u; print([n for n in ('torch', 'gymnasium', 'mujoco') if u.find_spec(n)])"
+    python = str(image_environment / "bin" / "python")
+    done = subprocess.run([python, "-I", "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
+def test_aliases_outlive_the_container(
+    redis: tuple[int, str], image_environment: Path, policies: Path, tmp_path: Path
+) -> None:
     key, line = new_key("operator", admin=True)
     folder, mark = Path(tempfile.mkdtemp(prefix="r")), secrets.token_hex(16)  # sockets need a short path
     port, grpc_port, gcs, dashboard, agent, metrics, stats, proxy_metrics, fallback, fallback_grpc, first, second = (
@@ -62,11 +70,11 @@ def test_aliases_outlive_the_container(redis: tuple[int, str], policies: Path, t
     files = {"serve.yaml": yaml.safe_dump(configuration), "api_keys": line, "token": secrets.token_hex(32)}
     for name, content in {**files, "password": redis[1]}.items():
         (folder / name).write_text(content)
-    own = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "RLSERVO_"))}
+    own = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "RLSERVO_", "PYTHON"))}
     environment = own | {
         MARK: mark,
         "HOME": str(folder),
-        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "PATH": f"{image_environment / 'bin'}{os.pathsep}{os.environ['PATH']}",
         "RAY_AUTH_TOKEN_FILE": str(folder / "token"),
         "RLSERVO_REDIS": f"127.0.0.1:{redis[0]}",
         "RLSERVO_REDIS_PASSWORD_FILE": str(folder / "password"),
