@@ -73,7 +73,7 @@ def measure(policies: Path, folder: Path, mark: str, *, tls: bool, seconds: floa
         deploy(policies, folder, secured, port, dashboard)
         name = sorted(each.name for each in policies.iterdir() if each.is_dir())[0]
         with PolicyClient(f"http://127.0.0.1:{port}", name, timeout_s=START_S, retries=10_000) as client:
-            observation = np.zeros(client.contract.observation_space.shape, np.float32)  # type: ignore[union-attr]
+            observation = np.zeros(client.contract.observation_space.shape, np.float32)
             client.act(observation)
             idle = sample(mark, seconds, lambda: time.sleep(0.5))
             answers = 0
@@ -175,7 +175,8 @@ def deploy(policies: Path, folder: Path, environment: Mapping[str, str], port: i
 
 def sample(mark: str, seconds: float, act: Callable[[], None]) -> Readings:
     """Read every process until the time is up: the largest PSS, and the CPU seconds of the whole time."""
-    before, largest = readings(mark), {}
+    before = readings(mark)
+    largest: Readings = {}
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         act()

@@ -15,8 +15,10 @@ ray start --head --block --node-ip-address 127.0.0.1 --dashboard-host 127.0.0.1 
   --redis-password "$(cat "${RLSERVO_REDIS_PASSWORD_FILE:?the file of its password}")" "$@" &
 ray="$!"
 trap 'kill -TERM "$ray" 2>/dev/null || true; wait "$ray" || true' TERM INT EXIT
-until serve deploy "$config" --address "http://127.0.0.1:$dashboard"; do
+healthy="import urllib.request as u; u.urlopen('http://127.0.0.1:$dashboard/api/gcs_healthz', timeout=5)"
+until python -c "$healthy" 2>/dev/null && serve deploy "$config" --address "http://127.0.0.1:$dashboard"; do
   kill -0 "$ray" # Ray ended: so do we
-  sleep 1
+  echo "server.sh: Ray is not ready yet" >&2
+  sleep 2
 done
 wait "$ray"
