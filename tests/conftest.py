@@ -13,6 +13,8 @@ pytest_plugins = ["checkpoints", "bundles", "clusters", "cockpits", "environment
 # Tests that share what is costly to make, by the beginning of their id. All others share their file's own.
 TOGETHER = {
     "tests/envs/robot_server/": "ports of server managers",
+    "tests/system/test_behind_nginx.py": "live server",
+    "tests/system/test_prometheus.py": "live server",
     "tests/system/test_serving.py": "live server",
     "tests/system/test_serving_fuzz.py": "live server",
     "tests/system/test_serving_grpc.py": "live server",

@@ -8,10 +8,13 @@ import subprocess
 import sys
 import tempfile
 import venv
+import zipfile
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from cache import PYTHON, cached, versions
 
@@ -40,6 +43,51 @@ def wheel() -> Path:
 
     made_of = [ROOT / name for name in PACKAGED]
     return next(cached("wheel", [*made_of, versions("build")], build).glob("*.whl"))
+
+
+@pytest.fixture(scope="session")
+def image_environment(wheel: Path) -> Path:
+    """The virtual environment of deploy/Dockerfile: the wheel and what its extra `serve` requires, nothing else.
+
+    Linked to the packages that are installed here, file by file, so that it costs no download.
+    """
+
+    def make(folder: Path) -> None:
+        venv.create(folder)
+        site = folder / "lib" / PYTHON / "site-packages"
+        with zipfile.ZipFile(next(wheel.parent.glob("*.whl"))) as archive:
+            archive.extractall(site)
+        for distribution in _required("rlservo", {"serve"}):
+            own = distribution.name == "rlservo"  # its files are the wheel's
+            for file in () if own else distribution.files or ():
+                if ".." not in file.parts and "__pycache__" not in file.parts and not (site / file).exists():
+                    (site / file).parent.mkdir(parents=True, exist_ok=True)
+                    (site / file).symlink_to(distribution.locate_file(file).absolute())
+            for point in distribution.entry_points.select(group="console_scripts"):
+                script = folder / "bin" / point.name
+                program = f"import sys\nfrom {point.module} import {point.attr}\nsys.exit({point.attr}())\n"
+                script.write_text(f"#!{folder / 'bin' / 'python'}\n{program}")
+                script.chmod(0o755)
+
+    return cached("image-environment", [wheel.parent.name, ROOT / "constraints.txt", Path(__file__), PYTHON], make)
+
+
+def _required(name: str, extras: set[str]) -> list[metadata.Distribution]:
+    """Return the installed distribution and, without end, those it requires with these extras."""
+    found: dict[str, metadata.Distribution] = {}
+    seen: set[tuple[str, str]] = set()
+    waiting = [(name, extra) for extra in ("", *extras)]
+    while waiting:
+        name, extra = waiting.pop()
+        if (name.lower(), extra) in seen:
+            continue
+        seen.add((name.lower(), extra))
+        found[name.lower()] = metadata.distribution(name)
+        for line in found[name.lower()].requires or ():
+            wanted = Requirement(line)
+            if wanted.marker is None or wanted.marker.evaluate({"extra": extra}):
+                waiting += [(wanted.name, more) for more in ("", *wanted.extras)]
+    return list(found.values())
 
 
 def virtual_environment(*packages: str) -> Path:
