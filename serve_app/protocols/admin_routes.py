@@ -49,6 +49,7 @@ class UnloadCommand(_Command):
 class AliasCommand(_Command):
     alias: Alias = Field(description="`production` is the default version; it can be moved, not removed.")
     version: Version | None = Field(description="A loaded version; null removes the alias.")
+    expected: Version | None = Field(None, description="Where the alias leads now; when it does not, nothing changes.")
 
 
 class RollbackCommand(_Command):
@@ -121,6 +122,20 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
         replies = [listing.describe(core)] if control.gather is None else await control.gather()
         return Response(orjson.dumps(replies), media_type="application/json")
 
+    @add_route(
+        app,
+        Access.admin,
+        "GET",
+        "/v1/admin/policies/{name}/counts",
+        "admin",
+        "What every replica serves of a policy, and has counted of it since its start",
+        *STATUSES,
+        response_model=list[listing.PolicyCounts],
+    )
+    async def counts(name: str) -> Response:
+        replies = [listing.count(core, name)] if control.gather is None else await control.gather(name)
+        return Response(orjson.dumps([reply for reply in replies if reply]), media_type="application/json")
+
     @command("load", "Load a version, prove it, and keep it ready: not in use until an alias leads to it")
     async def load(request: Request, name: str, given: LoadCommand) -> Response:
         what = f"load {name} {given.version or 'newest'}"
@@ -135,8 +150,13 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
 
     @command("alias", "Let an alias lead to a loaded version")
     async def alias(request: Request, name: str, given: AliasCommand) -> Response:
-        what = f"alias {name} {given.alias}={given.version or ''}"
-        return await changed(request, name, what, lambda p: plan_changes.set_alias(p, name, given.alias, given.version))
+        what, expected = f"alias {name} {given.alias}={given.version or ''}", given.expected
+        return await changed(
+            request,
+            name,
+            what,
+            lambda p: plan_changes.set_alias(p, name, given.alias, given.version, expected=expected),
+        )
 
     @command("rollback", "Let an alias lead where it led before")
     async def rollback(request: Request, name: str, given: RollbackCommand) -> Response:
