@@ -106,6 +106,7 @@ class Promotion:
         every_s: float,
         say: Callable[[str], None],
         sleep: Callable[[float], None] = time.sleep,
+        clock: Callable[[], float] = time.monotonic,
         patience_s: float = PATIENCE_S,
     ) -> None:
         """`connect` makes a client with the admin key as it is now; `say` is for whoever watches."""
@@ -117,10 +118,11 @@ class Promotion:
         self._every_s = every_s
         self._say = say
         self._sleep = sleep
+        self._clock = clock
         self._patience_s = patience_s
         self._counts = Counts()
         self._said_at = -math.inf
-        self._ends_at = math.inf  # by time.monotonic
+        self._ends_at = math.inf  # by the clock
 
     def run(self) -> Outcome:
         """Watch and decide. Raises RlservoError where nothing has begun: bad input, or a server out of reach."""
@@ -201,7 +203,7 @@ class Promotion:
         if started is None:
             self._say("goes on: it had ended before its canary was known to run")
         else:
-            self._ends_at = time.monotonic() + state.began + terms.seconds - time.time()
+            self._ends_at = self._clock() + state.began + terms.seconds - time.time()
             self._say(f"goes on: {_duration(self._remaining)} are left")
         return state, None
 
@@ -230,7 +232,7 @@ class Promotion:
             total=self._counts.total,
             seen=self._counts.seen,
         )
-        state.began, self._ends_at = seconds_of(entry), time.monotonic() + terms.seconds
+        state.began, self._ends_at = seconds_of(entry), self._clock() + terms.seconds
         self._say(
             f"watches version {terms.version} of '{terms.policy}' beside {state.production} for "
             f"{_duration(terms.seconds)}, on {_plural(len(replies), 'replica')}; the log is {self._log.file}"
@@ -240,14 +242,14 @@ class Promotion:
     # Watch.
 
     def _watch(self, state: _State) -> Outcome:
-        answered_at = followed_at = time.monotonic()
+        answered_at = followed_at = self._clock()
         while True:
             try:
                 replies, served = self._look()
             except AWAY as error:
                 self._log.write("unreachable", error=error.message)
                 self._tell(f"no counts: {error.message}", at_once=True)
-                if time.monotonic() - answered_at > self._patience_s:
+                if self._clock() - answered_at > self._patience_s:
                     return Outcome(
                         STOPPED, f"the server told no counts for {self._patience_s:g} s, so nobody can judge: {error}"
                     )
@@ -256,7 +258,7 @@ class Promotion:
             except RlservoError as error:
                 return Outcome(STOPPED, f"the server's counts cannot be had any more: {error.message}")
             else:
-                answered_at = time.monotonic()
+                answered_at = self._clock()
                 if served is None:
                     return self._gone()
                 changed = self._changed(state, served)
@@ -349,12 +351,12 @@ class Promotion:
         terms = self._terms
         if terms.dry_run:
             return replace(outcome, why=f"{outcome.why} (dry run: nothing was changed)")
-        deadline = time.monotonic() + self._patience_s
+        deadline = self._clock() + self._patience_s
         while True:
             try:
                 return self._attempt(state, outcome)
             except AWAY as error:
-                if time.monotonic() > deadline:
+                if self._clock() > deadline:
                     return self._unsure(outcome, error.message)
                 self._tell(f"cannot be carried out yet: {error.message}", at_once=True)
             except RlservoError as error:
@@ -424,11 +426,11 @@ class Promotion:
 
     @property
     def _remaining(self) -> float:
-        return self._ends_at - time.monotonic()
+        return self._ends_at - self._clock()
 
     def _tell(self, line: str, *, at_once: bool = False) -> None:
-        if at_once or time.monotonic() - self._said_at >= QUIET_S:
-            self._said_at = time.monotonic()
+        if at_once or self._clock() - self._said_at >= QUIET_S:
+            self._said_at = self._clock()
             self._say(line)
 
 

@@ -268,10 +268,12 @@ def wilson(successes: float, trials: float, z: float = Z) -> tuple[float, float]
     return max(centre - width, 0.0), min(centre + width, 1.0)
 
 
-def newcombe(first: float, first_of: float, second: float, second_of: float) -> tuple[float, float, float]:
+def newcombe(
+    first: float, first_of: float, second: float, second_of: float, z: float = Z
+) -> tuple[float, float, float]:
     """Return (first proportion less the second, the interval's lower bound, its upper one)."""
     p, q = first / first_of, second / second_of
-    (p_low, p_high), (q_low, q_high) = wilson(first, first_of), wilson(second, second_of)
+    (p_low, p_high), (q_low, q_high) = wilson(first, first_of, z), wilson(second, second_of, z)
     difference = p - q
     low = difference - math.hypot(p - p_low, q_high - q)
     return difference, low, difference + math.hypot(p_high - p, q - q_low)
