@@ -87,9 +87,9 @@ def promote(
             raise
         except RlservoError as error:  # nothing has begun, and 1 would say that it was rolled back
             raise UsageError(error.message) from None
-        except SystemExit:
+        except (SystemExit, KeyboardInterrupt) as ended:
             terminal.note(f"ended by a signal: what runs is left as it is; the same line goes on ({file})")
-            raise
+            raise typer.Exit(ended.code if isinstance(ended, SystemExit) else 130) from None  # type: ignore[arg-type]
         finally:
             promotion.close()
     if as_json:

@@ -40,7 +40,10 @@ from rlservo.serve_app.client.promotion_log import (
 
 PRODUCTION = "production"
 PATIENCE_S = 60.0  # without an answer, or with a replica that cannot follow
+SETTLE_S = 10.0  # in which replicas follow a plan that nobody told them of
 QUIET_S = 10.0  # between lines for whoever watches
+
+MOST_CHECKS = 1000  # in a log, of one promotion
 
 PROMOTED, ROLLED_BACK, UNDECIDED, STOPPED, INTERRUPTED = (
     "promoted",
@@ -121,7 +124,7 @@ class Promotion:
         self._clock = clock
         self._patience_s = patience_s
         self._counts = Counts()
-        self._said_at = -math.inf
+        self._said_at = self._logged_at = -math.inf
         self._ends_at = math.inf  # by the clock
 
     def run(self) -> Outcome:
@@ -137,7 +140,7 @@ class Promotion:
         try:
             outcome = self._carry_out(state, outcome)
         except KeyboardInterrupt:
-            outcome = self._unsure(outcome, "interrupted once more")
+            outcome = self._unsure(outcome, "interrupted meanwhile")
         if outcome.is_finished:
             self._log.write(END, outcome=outcome.outcome, why=outcome.why)
         return outcome
@@ -187,6 +190,17 @@ class Promotion:
                 f"{self._log.file} has a promotion that is not finished, with other terms ({start.get('terms')}): "
                 "start that one again, or name another --log"
             )
+        try:
+            return self._read(entries)
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise UsageError(
+                f"{self._log.file} has a promotion that is not finished and cannot be read "
+                f"({type(error).__name__}: {error}): name another --log"
+            ) from None
+
+    def _read(self, entries: list[Entry]) -> tuple[_State, Outcome | None]:
+        """Return what a log's promotion has come to, and the outcome if that was decided."""
+        terms, start = self._terms, entries[0]
         canary = start["canary"]
         state = _State(
             start["production"], bool(start["own_shadow"]), None if canary is None else (canary[0], canary[1])
@@ -198,6 +212,7 @@ class Promotion:
             self._counts = Counts(known["total"], known["seen"])
             state.generation = known["generation"]
         if decision is not None:
+            EXIT_CODES[decision["outcome"]]
             self._say(f"goes on: it was decided ({decision['outcome']}) and not yet carried out")
             return state, Outcome(decision["outcome"], decision["why"])
         if started is None:
@@ -214,7 +229,8 @@ class Promotion:
             replies, served = self._look()
             if served is None:
                 return self._gone()
-            if served.canary not in (None, state.canary) or served.production != state.production:
+            foreign = state.own_shadow and served.shadow not in (None, terms.version)
+            if foreign or served.canary not in (None, state.canary) or served.production != state.production:
                 return Outcome(STOPPED, f"somebody else has changed what is served ({served.last_change})")
             self._counts.begin(replies, self._versions(state))
             state.shadow, state.generation = served.shadow, served.generation
@@ -242,7 +258,7 @@ class Promotion:
     # Watch.
 
     def _watch(self, state: _State) -> Outcome:
-        answered_at = followed_at = self._clock()
+        answered_at = followed_at = settled_at = self._clock()
         while True:
             try:
                 replies, served = self._look()
@@ -261,17 +277,22 @@ class Promotion:
                 answered_at = self._clock()
                 if served is None:
                     return self._gone()
-                changed = self._changed(state, served)
-                if changed is not None:
-                    return Outcome(STOPPED, changed)
-                if not served.behind:
-                    followed_at = answered_at
-                elif answered_at - followed_at > self._patience_s:
-                    return Outcome(ROLLED_BACK, f"not every replica can serve it: {'; '.join(served.behind)}")
-                state.generation = served.generation
-                outcome = self._check(state, replies, served)
-                if outcome is not None:
-                    return outcome
+                is_older = served.generation < state.generation
+                if not is_older:
+                    settled_at = answered_at
+                # Who had followed may have been killed, and the others look at the ledger every two seconds.
+                if not is_older or answered_at - settled_at > SETTLE_S:
+                    changed = self._changed(state, served)
+                    if changed is not None:
+                        return Outcome(STOPPED, changed)
+                    if not served.behind:
+                        followed_at = answered_at
+                    elif answered_at - followed_at > self._patience_s:
+                        return Outcome(ROLLED_BACK, f"not every replica can serve it: {'; '.join(served.behind)}")
+                    state.generation = served.generation
+                    outcome = self._check(state, replies, served)
+                    if outcome is not None:
+                        return outcome
             self._sleep(min(self._every_s, max(self._remaining, min(1.0, self._every_s))))
 
     def _check(self, state: _State, replies: Replies, served: Served) -> Outcome | None:
@@ -282,22 +303,24 @@ class Promotion:
         least = {"min_requests": terms.min_requests, "min_episodes": terms.min_episodes}
         figures = [judge(condition, evidence, **least) for condition in self._conditions]
         remaining = self._remaining
-        self._log.write(
-            CHECK,
-            remaining_s=round(remaining, 3),
-            replicas=[reply["replica"] for reply in replies],
-            began_anew=restarted,
-            behind=served.behind,
-            generation=served.generation,
-            requests=evidence.candidate.answered,
-            requests_in_production=evidence.production.answered,
-            figures=[document(figure) for figure in figures],
-            total=self._counts.total,
-            seen=self._counts.seen,
-        )
+        certain = [figure.sentence() for figure in figures if figure.is_certain]
+        if certain or restarted or remaining <= 0 or self._clock() - self._logged_at >= terms.seconds / MOST_CHECKS:
+            self._logged_at = self._clock()
+            self._log.write(
+                CHECK,
+                remaining_s=round(remaining, 3),
+                replicas=[reply["replica"] for reply in replies],
+                began_anew=restarted,
+                behind=served.behind,
+                generation=served.generation,
+                requests=evidence.candidate.answered,
+                requests_in_production=evidence.production.answered,
+                figures=[document(figure) for figure in figures],
+                total=self._counts.total,
+                seen=self._counts.seen,
+            )
         answered = f"{evidence.candidate.answered:,} requests"
         self._tell(f"{_duration(remaining)} left, {answered}; " + "; ".join(figure.sentence() for figure in figures))
-        certain = [figure.sentence() for figure in figures if figure.is_certain]
         if certain:
             return Outcome(ROLLED_BACK, "; ".join(certain))
         if remaining > 0:
@@ -308,8 +331,11 @@ class Promotion:
         """Decide when the time is over."""
         least = self._terms.min_requests
         if asked < least:
-            why = f"too little traffic to judge: version {self._terms.version} was asked {asked:,} times, not {least:,}"
-            return Outcome(UNDECIDED, why)
+            return Outcome(
+                UNDECIDED,
+                f"too little traffic to judge: version {self._terms.version} was asked {asked:,} times, not {least:,} "
+                "(a canary gets requests that name no version)",
+            )
         few = [
             f"{figure.sentence()}, counted of {figure.count:,} and not {figure.needed:,}"
             for figure in figures
@@ -325,11 +351,6 @@ class Promotion:
     def _changed(self, state: _State, served: Served) -> str | None:
         """Return what somebody else has changed of what is watched, in a sentence."""
         terms = self._terms
-        if served.generation < state.generation:
-            return (
-                f"the server was started anew: it is at change {served.generation} after {state.generation}, and "
-                f"{served.production} is in production"
-            )
         what = None
         if served.production != state.production:
             what = f"'{PRODUCTION}' leads to {served.production} and no longer to {state.production}"
@@ -339,7 +360,10 @@ class Promotion:
             what = f"the canary is {_canary(served.canary)} and no longer {_canary(state.canary)}"
         elif state.own_shadow and served.shadow != state.shadow:
             what = f"the shadow is {served.shadow or 'none'} and no longer {state.shadow}"
-        return what and f"somebody else has changed what is served: {what} ({served.last_change})"
+        if what is None:
+            return None
+        whose = "a new start of the server" if served.generation < state.generation else "somebody else"
+        return f"{whose} has changed what is served: {what} ({served.last_change})"
 
     def _gone(self) -> Outcome:
         return Outcome(STOPPED, f"policy '{self._terms.policy}' is no longer served")

@@ -347,14 +347,19 @@ def arranged(cluster: Cluster) -> set[tuple[str, Any]]:
     return {(policy["version"], policy["canary"] and policy["canary"]["version"]) for policy in policies}
 
 
+def produce(cluster: Cluster, version: str) -> None:
+    with cluster.admin() as admin:
+        for each in ("1", "2", "3", "5"):
+            admin.load("ur5", each)
+        admin.canary("ur5", None)
+        admin.alias("ur5", "production", version)
+
+
 def test_a_promotion_that_is_killed_half_way_goes_on_with_what_both_replicas_counted(
     cluster: Cluster, tmp_path: Path
 ) -> None:
     log = tmp_path / "log.jsonl"
-    with cluster.admin() as admin:
-        for version in ("1", "2", "5"):
-            admin.load("ur5", version)
-        admin.alias("ur5", "production", "1")
+    produce(cluster, "1")
     with loaded(cluster) as load:
         with promoting(cluster, log, "2", "--for", "15s") as process:
             wait_for_checks(process, log, requests=20)
@@ -373,6 +378,7 @@ def test_a_promotion_that_is_killed_half_way_goes_on_with_what_both_replicas_cou
 
 
 def test_a_bad_canary_is_rolled_back_at_once(cluster: Cluster, tmp_path: Path) -> None:
+    produce(cluster, "2")
     with loaded(cluster), promoting(cluster, tmp_path / "log.jsonl", "5", "--for", "10m") as process:
         code, said = outcome_of(process)
     assert code == 1 and "unsafe-action" in said, said
@@ -381,6 +387,7 @@ def test_a_bad_canary_is_rolled_back_at_once(cluster: Cluster, tmp_path: Path) -
 
 def test_a_promotion_stops_when_somebody_else_moves_the_alias(cluster: Cluster, tmp_path: Path) -> None:
     log = tmp_path / "log.jsonl"
+    produce(cluster, "2")
     with loaded(cluster), promoting(cluster, log, "1", "--for", "10m") as process:
         wait_for_checks(process, log)
         with cluster.admin() as admin:

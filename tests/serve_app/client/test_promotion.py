@@ -29,6 +29,7 @@ from rlservo.serve_app.client.promotion_conditions import parse_conditions
 from rlservo.serve_app.client.promotion_counts import Counts
 from rlservo.serve_app.client.promotion_log import PromotionLog
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.settings import ServerSettings
@@ -341,6 +342,33 @@ def test_an_alias_that_is_moved_in_the_last_moment_is_not_moved_back(run: Any, s
     assert (server.plan.default, server.plan.canary) == ("4", None)
 
 
+def test_a_server_that_is_started_anew_stops_it(run: Any, server: Server) -> None:
+    """Its changes count from 1 again; replicas that have not followed yet are older, too, but not for long."""
+    before = server.control.plan
+    assert before is not None
+
+    def start_anew() -> None:
+        server.control.plan = before.model_copy(update={"generation": 1})
+
+    try:
+        outcome = run(seconds=100 * EVERY_S)(lambda: server.ask(60), start_anew)
+    finally:
+        with server.admin() as admin:  # the ledger has not forgotten
+            admin.canary("ur5", None)
+    assert outcome.outcome == STOPPED and "a new start of the server has changed what is served" in outcome.why
+    assert "the canary is none and no longer 2=0.5" in outcome.why
+
+
+def test_a_bug_in_a_canary_is_its_own(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    with server.admin() as admin:
+        admin.canary("ur5", "2", 1.0)
+    before = server.core.metrics.counts("ur5").get("2")
+    failed = 0 if before is None else before.failed.get("internal", 0)
+    monkeypatch.setattr(Policy, "step", lambda *_, **__: 1 / 0)
+    server.ask(3)
+    assert server.core.metrics.counts("ur5")["2"].failed["internal"] == failed + 3
+
+
 def test_a_policy_that_is_unloaded_stops_it(run: Any, server: Server) -> None:
     def step() -> None:
         with server.admin() as admin:
@@ -407,6 +435,11 @@ def test_other_terms_do_not_go_on_with_it_and_a_second_process_waits_for_the_fir
         promotion(kill)
     with pytest.raises(UsageError, match="is not finished, with other terms"):
         run(share=0.4)()
+    whole = promotion.log.read_text()
+    promotion.log.write_text(whole.replace('"own_shadow"', '"own"'))
+    with pytest.raises(UsageError, match="cannot be read"):
+        promotion()
+    promotion.log.write_text(whole)
     with PromotionLog.open(promotion.log), pytest.raises(UsageError, match="another 'rlservo policy promote' writes"):
         promotion()
     assert server.plan.canary is not None
