@@ -32,8 +32,9 @@ class PromotionLog:
     @contextlib.contextmanager
     def open(cls, file: Path) -> Iterator[PromotionLog]:
         """Open a log, made if it is not there. Raises UsageError where it is no log or another process writes it."""
+        flags, is_new = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, not file.exists()
         try:
-            descriptor = os.open(file, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o644)
+            descriptor = os.open(file, flags, 0o644)
         except OSError as error:
             raise UsageError(f"the log {file} cannot be written: {error.strerror}") from None
         try:
@@ -42,7 +43,11 @@ class PromotionLog:
             except OSError:
                 raise UsageError(f"another 'rlservo policy promote' writes {file}: wait for it, or end it") from None
             entries, is_torn = _read(file, descriptor)
-            yield cls(file, descriptor, entries, is_torn=is_torn)
+            try:
+                yield cls(file, descriptor, entries, is_torn=is_torn)
+            finally:
+                if is_new and not os.fstat(descriptor).st_size:  # nothing was begun
+                    file.unlink(missing_ok=True)
         finally:
             os.close(descriptor)
 

@@ -509,10 +509,10 @@ def test_a_short_silence_costs_nothing(run: Any, server: Server, monkeypatch: py
 def test_what_cannot_be_promoted_is_refused_before_anything_is_changed(
     run: Any, server: Server, version: str, says: str
 ) -> None:
-    before = server.control.plan
+    before, promotion = server.control.plan, run(version)
     with pytest.raises(UsageError, match=says):
-        run(version)()
-    assert server.control.plan is before
+        promotion()
+    assert server.control.plan is before and not promotion.log.exists()
 
 
 def test_a_canary_of_somebody_else_is_in_the_way(run: Any, server: Server) -> None:
