@@ -19,6 +19,7 @@ from rlservo.deploy import (
     export_commands,
     log_commands,
     policy_commands,
+    promote_command,
     robot_commands,
     serve_commands,
     terminal,
@@ -77,6 +78,7 @@ for command in (
 ):
     app.command()(command)
 app.add_typer(robot_commands.robot_server, name="robot-server")
+policy_commands.policy.command()(promote_command.promote)
 app.add_typer(policy_commands.policy, name="policy")
 app.add_typer(cluster_commands.cluster, name="cluster")
 app.add_typer(log_commands.log, name="log")

@@ -95,6 +95,12 @@ def serve(
 def key(
     label: Annotated[str, typer.Argument(help="Whom the key is for: a robot, a person. Shown in messages.")],
     admin: Annotated[bool, typer.Option("--admin", help="For administration; robots need no such key.")] = False,
+    rate: Annotated[
+        float | None, typer.Option(help="Requests a second that each replica answers of it; any number by default.")
+    ] = None,
+    burst: Annotated[
+        int | None, typer.Option(help="Requests at once, after a pause; as many as in a second by default.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Make an API key. What is printed is the key for the client and the line with its hash for the server's key file.
@@ -103,7 +109,7 @@ def key(
     """
     from rlservo.serve_app.server.api_keys import new_key
 
-    secret, line = new_key(label, admin=admin)
+    secret, line = new_key(label, admin=admin, rate=rate, burst=burst)
     if as_json:
         print_json({"key": secret, "line": line})
         return

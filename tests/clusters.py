@@ -185,8 +185,9 @@ class Cluster:
 
 @pytest.fixture(scope="session")
 def cluster_repository(tmp_path_factory: pytest.TempPathFactory, box_policy: Callable[..., Path]) -> Path:
-    """ur5 in versions 1 to 3, and 4 with a byte of its weights changed."""
+    """ur5 in versions 1 to 3, 4 with a byte of its weights changed, and 5 whose actions leave the space."""
     root = tmp_path_factory.mktemp("repository")
+    box_policy(root, version="5", seed=5, action_scale=400.0)
     for seed, version in enumerate(("1", "2", "3", "4")):
         box_policy(root, version=version, seed=seed)
     weights = root / "ur5" / "4" / "policy.onnx"

@@ -26,6 +26,7 @@ them to exit codes.
     │   └── SessionLostError      session-lost             the server has no such session (any more)
     ├── UnavailableError          unavailable              not ready, or the server cannot be reached
     │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
+    │   ├── RateLimitError        rate-limited             the API key asked more often than it may
     │   ├── LateError             late                     the observation waited too long: send a newer one
     │   └── PartlyAppliedError    partly-applied           a change that some replicas could not follow
     ├── InternalError             internal                 the server's own fault: its log says more
@@ -187,6 +188,12 @@ class OverloadedError(UnavailableError):
     """The server has as much work as it takes on; nothing was computed."""
 
     code = "over-capacity"
+
+
+class RateLimitError(UnavailableError):
+    """The API key has asked more often than its line allows; nothing was computed."""
+
+    code = "rate-limited"
 
 
 class LateError(UnavailableError):

@@ -14,6 +14,7 @@ from rlservo.serve_app.wire.admin_key_file import key_file, read_key
 from rlservo.serve_app.wire.loopback import is_loopback
 
 KEY_VARIABLE = "RLSERVO_ADMIN_KEY"
+COUNTS_TIMEOUT_S = 10.0  # it only reads what replicas have in memory
 TIMEOUT_S = 90.0  # every replica loads and proves a version before the server answers
 
 
@@ -30,6 +31,13 @@ class AdminClient(Closeable):
         listings: list[dict[str, Any]] = self._transport.get("v1", "admin", "policies")
         return listings
 
+    def counts(self, name: str) -> list[dict[str, Any]]:
+        """Return what every replica serves of a policy, and has counted of it since its start."""
+        replies: list[dict[str, Any]] = self._transport.get(
+            "v1", "admin", "policies", name, "counts", timeout_s=COUNTS_TIMEOUT_S
+        )
+        return replies
+
     def load(self, name: str, version: str | None = None) -> dict[str, Any]:
         """Load and prove a version; None is the repository's newest."""
         return self._command(name, "load", {"version": version})
@@ -38,9 +46,9 @@ class AdminClient(Closeable):
         """Drop a version, or with None the policy."""
         return self._command(name, "unload", {"version": version})
 
-    def alias(self, name: str, alias: str, version: str | None) -> dict[str, Any]:
-        """Let an alias lead to a loaded version, or with None remove it."""
-        return self._command(name, "alias", {"alias": alias, "version": version})
+    def alias(self, name: str, alias: str, version: str | None, *, expected: str | None = None) -> dict[str, Any]:
+        """Let an alias lead to a loaded version, or with None remove it; unless it no longer leads to `expected`."""
+        return self._command(name, "alias", {"alias": alias, "version": version, "expected": expected})
 
     def rollback(self, name: str, alias: str) -> dict[str, Any]:
         """Let an alias lead where it led before; once, even if the proxy should send the command twice."""

@@ -65,7 +65,7 @@ class Request:
     """Whose request it is, in the client's words: where a canary runs, all of a label get the same version."""
     request_id: str | None = None
     headers: Mapping[bytes, bytes] = field(default_factory=dict)
-    """Of an HTTP message."""
+    """Of an HTTP message, or the metadata of a gRPC call."""
     waited: float | None = None
     """[s] How long it had waited before it was received; None where nobody knows."""
     stream: Session | None = None

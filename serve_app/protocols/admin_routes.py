@@ -15,18 +15,16 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from rlservo.export.contract.errors import RequestError, RlservoError
+from rlservo.export.contract.errors import RequestError
 from rlservo.serve_app.protocols.fastapi_routes import Endpoint, add_route
-from rlservo.serve_app.protocols.http_endpoint import KEY, peer_of
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.media_types import accept_json
 from rlservo.serve_app.protocols.oip_infer import accept_media_type
 from rlservo.serve_app.protocols.oip_models import TAG
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import Access
+from rlservo.serve_app.server.audit import AUDIT, OK, AuditEntry
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_checks import HEADERS, REQUEST_ID, header_text
-from rlservo.serve_app.server.request_log import write_change
 from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
 from rlservo.serve_app.versions.replica_versions import Change, ReplicaVersions
@@ -49,6 +47,7 @@ class UnloadCommand(_Command):
 class AliasCommand(_Command):
     alias: Alias = Field(description="`production` is the default version; it can be moved, not removed.")
     version: Version | None = Field(description="A loaded version; null removes the alias.")
+    expected: Version | None = Field(None, description="Where the alias leads now; when it does not, nothing changes.")
 
 
 class RollbackCommand(_Command):
@@ -87,25 +86,20 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
         path, accepted = f"/v1/admin/policies/{{name}}/{path}", [Depends(accept_json)]
         return post(path, "admin", summary, *STATUSES, response_model=Changed, dependencies=accepted)
 
-    async def apply(request: Request, what: str, command: Awaitable[Plan]) -> Plan:
-        key = request.scope.get(KEY)
-        log = partial(
-            write_change,
-            what,
-            key="" if key is None else key.label,
-            peer=peer_of(request.scope),
-            request_id=header_text(request.scope[HEADERS], REQUEST_ID),
-        )
-        try:
-            after = await command
-        except RlservoError as error:
-            log(error.code)
-            raise
-        log("ok", generation=after.generation)
+    async def apply(
+        request: Request, command: str, name: str, change: str, version: str | None, making: Awaitable[Plan]
+    ) -> Plan:
+        entry: AuditEntry = request.scope[AUDIT]
+        entry.command, entry.policy, entry.change, entry.version = command, name, change, version
+        after = await making
+        entry.code, entry.generation = OK, after.generation
         return after
 
-    async def changed(request: Request, name: str, what: str, change: Change) -> Response:
-        return _answer(name, await apply(request, what, control.change(change, what=what)))
+    async def changed(
+        request: Request, command: str, name: str, what: str, version: str | None, change: Change
+    ) -> Response:
+        what = f"{command} {name} {what}".strip()
+        return _answer(name, await apply(request, command, name, what, version, control.change(change, what=what)))
 
     @add_route(
         app,
@@ -121,28 +115,42 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
         replies = [listing.describe(core)] if control.gather is None else await control.gather()
         return Response(orjson.dumps(replies), media_type="application/json")
 
+    @add_route(
+        app,
+        Access.admin,
+        "GET",
+        "/v1/admin/policies/{name}/counts",
+        "admin",
+        "What every replica serves of a policy, and has counted of it since its start",
+        *STATUSES,
+        response_model=list[listing.PolicyCounts],
+    )
+    async def counts(name: str) -> Response:
+        replies = [listing.count(core, name)] if control.gather is None else await control.gather(name)
+        return Response(orjson.dumps([reply for reply in replies if reply]), media_type="application/json")
+
     @command("load", "Load a version, prove it, and keep it ready: not in use until an alias leads to it")
     async def load(request: Request, name: str, given: LoadCommand) -> Response:
         what = f"load {name} {given.version or 'newest'}"
-        return _answer(name, await apply(request, what, control.load(name, given.version, what=what)))
+        making = control.load(name, given.version, what=what)
+        return _answer(name, await apply(request, "load", name, what, given.version, making))
 
     @command("unload", "Drop a version, or the policy")
     async def unload(request: Request, name: str, given: UnloadCommand) -> Response:
         version = given.version
-        return await changed(
-            request, name, f"unload {name} {version or ''}", lambda p: plan_changes.unload(p, name, version)
-        )
+        change = partial(plan_changes.unload, name=name, version=version)
+        return await changed(request, "unload", name, version or "", version, change)
 
     @command("alias", "Let an alias lead to a loaded version")
     async def alias(request: Request, name: str, given: AliasCommand) -> Response:
-        what = f"alias {name} {given.alias}={given.version or ''}"
-        return await changed(request, name, what, lambda p: plan_changes.set_alias(p, name, given.alias, given.version))
+        alias, version, expected = given.alias, given.version, given.expected
+        change = partial(plan_changes.set_alias, name=name, alias=alias, version=version, expected=expected)
+        return await changed(request, "alias", name, f"{alias}={version or ''}", version, change)
 
     @command("rollback", "Let an alias lead where it led before")
     async def rollback(request: Request, name: str, given: RollbackCommand) -> Response:
-        what = f"rollback {name} {given.alias}"
-        alias, expected = given.alias, given.expected
-        return await changed(request, name, what, lambda p: plan_changes.roll_back(p, name, alias, expected=expected))
+        change = partial(plan_changes.roll_back, name=name, alias=given.alias, expected=given.expected)
+        return await changed(request, "rollback", name, given.alias, None, change)
 
     @command("canary", "Send a share of the sessions to another version")
     async def canary(request: Request, name: str, given: CanaryCommand) -> Response:
@@ -150,13 +158,14 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
             raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
         ended = given.version is None or not given.share
         chosen = None if ended else Canary(version=str(given.version), share=given.share or 0)
-        what = f"canary {name} {given.version or 'off'} {given.share or ''}"
-        return await changed(request, name, what, lambda p: plan_changes.set_canary(p, name, chosen))
+        what = f"{given.version or 'off'} {given.share or ''}"
+        change = partial(plan_changes.set_canary, name=name, canary=chosen)
+        return await changed(request, "canary", name, what, given.version, change)
 
     @command("shadow", "Let another version compute along")
     async def shadow(request: Request, name: str, given: ShadowCommand) -> Response:
-        what = f"shadow {name} {given.version or 'off'}"
-        return await changed(request, name, what, lambda p: plan_changes.set_shadow(p, name, given.version))
+        change = partial(plan_changes.set_shadow, name=name, shadow=given.version)
+        return await changed(request, "shadow", name, given.version or "off", given.version, change)
 
     # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: nobody reads it.
     def repository(path: str, summary: str) -> Callable[[Endpoint], Endpoint]:
@@ -168,13 +177,14 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
     @repository("load", "Load a model's newest version; in use at once only if the model was not served")
     async def load_model(request: Request, name: str) -> Response:
         what = f"load {name} newest"
-        await apply(request, what, control.load(name, None, what=what))
+        await apply(request, "load", name, what, None, control.load(name, None, what=what))
         return Response(b"{}", media_type="application/json")
 
     @repository("unload", "Unload a model, all its versions")
     async def unload_model(request: Request, name: str) -> Response:
         what = f"unload {name}"
-        await apply(request, what, control.change(lambda p: plan_changes.unload(p, name, None), what=what))
+        making = control.change(partial(plan_changes.unload, name=name, version=None), what=what)
+        await apply(request, "unload", name, what, None, making)
         return Response(b"{}", media_type="application/json")
 
 

@@ -10,7 +10,7 @@ from fastapi.responses import Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.exceptions import HTTPException
 
-from rlservo.export.contract.errors import RequestError, RlservoError
+from rlservo.export.contract.errors import InternalError, RequestError, RlservoError
 from rlservo.serve_app.protocols import http_errors, json_routes, oip_config, oip_models, websocket_stream
 from rlservo.serve_app.protocols.admin_routes import add_admin
 from rlservo.serve_app.protocols.docs_page import add_docs
@@ -19,6 +19,7 @@ from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.status_page import add_status_page
 from rlservo.serve_app.server.api_keys import Access, grant
+from rlservo.serve_app.server.audit import AUDIT
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.gauges import exposition
 from rlservo.serve_app.server.request_checks import Hosts, RequestChecks
@@ -85,26 +86,30 @@ def _add_health(app: FastAPI, core: Core) -> None:
 # Errors of the routes that FastAPI runs; `http_errors.py` has the table.
 
 
-async def _on_rlservo_error(_request: Request, error: Exception) -> Response:
+async def _on_rlservo_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RlservoError)
+    request.scope[AUDIT].code = error.code
     status, content, headers = http_errors.error_answer(error)
     return Response(content, status, {name.decode(): value.decode() for name, value in headers})
 
 
 async def _on_http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
+    request.scope[AUDIT].code = http_errors.CODES.get(error.status_code, http_errors.OTHER)
     return http_errors.http_error(
         error.status_code, request.scope, detail=str(error.detail), headers=error.headers or {}
     )
 
 
-async def _on_validation_error(_request: Request, error: Exception) -> Response:
+async def _on_validation_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
+    request.scope[AUDIT].code = RequestError.code
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
     document = {"error": f"{where}: {first['msg']}", "code": RequestError.code}
     return Response(encode_json(document), 400, None, "application/json")
 
 
-async def _on_bug(_request: Request, _error: Exception) -> Response:
+async def _on_bug(request: Request, _error: Exception) -> Response:
+    request.scope[AUDIT].code = InternalError.code
     return Response(http_errors.encode_bug(), 500, None, "application/json")  # Starlette raises it again, for the log

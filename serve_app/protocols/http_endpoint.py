@@ -26,6 +26,7 @@ from rlservo.serve_app.protocols.direct_routes import PostRoute, StreamRoute
 from rlservo.serve_app.protocols.http_errors import Headers, error_answer, http_error, send_error, too_large
 from rlservo.serve_app.protocols.websocket_stream import refuse_upgrade
 from rlservo.serve_app.server.api_keys import Access, access_of
+from rlservo.serve_app.server.audit import AUDIT, AuditEntry
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_checks import (
     HEADERS,
@@ -47,7 +48,6 @@ PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and 
 TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been read
 STAMP_HEADER = STAMP.encode()
 ROOT = "/"  # a page for browsers (`status_page.py`), nothing for programs
-KEY = "rlservo.key"  # in a connection's scope: the key that opened it
 REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, beside the protocol's own
 
 Body = bytes | bytearray
@@ -116,10 +116,23 @@ class PolicyApp(FastAPI):
         if match is not None:
             await self._answer_direct(match, headers, scope, receive, send)
             return
+        method, request_id = scope.get("method", ""), header_text(headers, REQUEST_ID)
+        entry = scope[AUDIT] = AuditEntry(method, path, peer_of(scope), request_id)
+        try:
+            await self._answer_routed(entry, path, headers, scope, receive, send)
+        finally:
+            entry.write()
+
+    async def _answer_routed(
+        self, entry: AuditEntry, path: str, headers: dict[bytes, bytes], scope: Scope, receive: Receive, send: Send
+    ) -> None:
         try:
             check_path(scope, path)
             route, access = self._find(scope)
-            scope[HEADERS], scope[KEY] = headers, self._checks.check(scope, headers, access)
+            entry.is_administration = access is Access.admin
+            key = self._checks.check(scope, headers, access)
+            entry.key = "" if key is None else key.label
+            scope[HEADERS] = headers
             if scope["type"] == "websocket":
                 sentence = f"no stream is at {path[:200]}: connect to /v1/policies/NAME/stream"
                 await _send_refusal(scope, receive, send, UnknownPolicyError(sentence))
@@ -130,6 +143,7 @@ class PolicyApp(FastAPI):
                 return
             body = await receive_body(self._core, headers, receive)
         except RlservoError as error:
+            entry.code, entry.key = error.code, entry.key or str(error.details.get("key", ""))
             await self._refuse(scope, headers, receive, send, error)
         except ClientGoneError:
             return

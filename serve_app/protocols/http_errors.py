@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,6 +18,7 @@ from rlservo.export.contract.errors import (
     InternalError,
     MediaTypeError,
     ObservationError,
+    RateLimitError,
     RequestError,
     RlservoError,
     SessionError,
@@ -41,6 +43,7 @@ STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; w
     (ConflictError, 409),
     (SessionLostError, 410),
     (SessionError, 409),
+    (RateLimitError, 429),
     (UnavailableError, 503),
     (UnauthenticatedError, 401),
     (ForbiddenError, 403),
@@ -52,7 +55,8 @@ CODES = {
     413: "too-large",
     415: "wrong-media-type",
 }  # where FastAPI decides
-ANY_ROUTE = (400, 401, 403, 408, 413)  # its path, key, host, page and body
+OTHER = "http-error"
+ANY_ROUTE = (400, 401, 403, 408, 413, 429)  # its path, key, host, page, body and rate
 RETRY_AFTER_S = 1
 JSON = b"application/json"
 Headers = tuple[tuple[bytes, bytes], ...]
@@ -77,11 +81,18 @@ def error_answer(error: RlservoError) -> tuple[int, bytes, Headers]:
     headers = JSON_HEADERS
     if status == 503:
         headers += ((b"retry-after", str(RETRY_AFTER_S).encode()),)
+    elif status == 429:
+        headers += ((b"retry-after", str(retry_after_s(error)).encode()),)
     elif status == 401:
         headers += ((b"www-authenticate", b"Bearer"),)
     elif status >= 500 and not isinstance(error, InternalError):  # which is logged with its traceback
         logger.error("%s", error.message)
     return status, encode_error(error), headers
+
+
+def retry_after_s(error: RlservoError) -> int:
+    """Return the whole seconds after which to ask again."""
+    return max(RETRY_AFTER_S, math.ceil(error.details.get("retry_after_s", 0)))
 
 
 def encode_error(error: RlservoError) -> bytes:
@@ -106,7 +117,7 @@ def http_error(status: int, scope: Scope, *, detail: str = "", headers: Mapping[
         404: f"nothing is at {path}: policies are under /v1/policies, documentation at /docs",
         405: f"{scope['method']} is not what {path} takes: {headers.get('Allow', 'another method')} is",
     }
-    document = {"error": sentences.get(status, detail), "code": CODES.get(status, "http-error")}
+    document = {"error": sentences.get(status, detail), "code": CODES.get(status, OTHER)}
     return Response(json_messages.encode_json(document), status, headers, "application/json")
 
 

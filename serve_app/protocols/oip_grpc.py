@@ -28,18 +28,20 @@ from rlservo.export.contract.errors import (
     ForbiddenError,
     InternalError,
     ObservationError,
+    RateLimitError,
     RequestError,
     RlservoError,
     TooLargeError,
+    UnavailableError,
 )
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
-from rlservo.serve_app.protocols.http_errors import RETRY_AFTER_S, status_of
+from rlservo.serve_app.protocols.http_errors import retry_after_s, status_of
 from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
 from rlservo.serve_app.protocols.oip_tensors import DTYPES, check_form, check_size, datatype_of, from_bytes
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_checks import authorize, presented_key
+from rlservo.serve_app.server.request_checks import StreamKey, authorize, presented_key
 from rlservo.serve_app.server.request_path import BUG
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.request_stamp import STAMP
@@ -62,6 +64,7 @@ CODES = {
     413: grpc.StatusCode.RESOURCE_EXHAUSTED,  # what gRPC itself says of a message beyond its limit
     415: grpc.StatusCode.INVALID_ARGUMENT,
     422: grpc.StatusCode.INVALID_ARGUMENT,
+    429: grpc.StatusCode.RESOURCE_EXHAUSTED,
     503: grpc.StatusCode.UNAVAILABLE,
 }
 OPEN = frozenset({"ServerLive", "ServerReady"})  # what orchestrators probe; every other method wants the keys' `act`
@@ -120,7 +123,6 @@ class Grpc:
         """
         core = self._core
         idle_s = core.settings.stream_idle_s
-        key_changes = core.keys.changes
         try:
             opening = self._begin("ModelStreamInfer", context)
             opening.label = opening.label or secrets.token_hex(8)  # one version for all where a canary runs
@@ -128,6 +130,7 @@ class Grpc:
         except Exception as error:
             _fail(context, error)
             return
+        key = StreamKey(core.keys, presented_key(opening.headers))
         try:
             while True:
                 try:
@@ -137,24 +140,24 @@ class Grpc:
                 except asyncio.TimeoutError:
                     _fail(context, DeadlineError(f"the stream was silent for {idle_s:g} s: open another one"))
                     return
-                if key_changes != core.keys.changes:  # the key may be no longer accepted
-                    key_changes = core.keys.changes
-                    try:
-                        self._begin("ModelStreamInfer", context)
-                    except RlservoError as error:
-                        _fail(context, error)
-                        return
                 request = Request(
                     PROTOCOL, "", None, time.perf_counter(), label=opening.label, request_id=opening.request_id
                 )
                 try:
+                    key.check()
+                except RlservoError as error:
+                    peer = _peer(context.peer(), context.invocation_metadata())
+                    core.record_failure(request, error.code, error.message, peer=peer)
+                    if not isinstance(error, RateLimitError):  # the key is no longer accepted
+                        _fail(context, error)
+                        return
+                    yield _error_reply(error, content)
+                    continue
+                try:
                     reply = await core.answer(self._codec, request, (content, None))
                     yield messages.ModelStreamInferResponse(infer_response=reply)
                 except RlservoError as error:
-                    sentence = _explain(error)[1]
-                    yield messages.ModelStreamInferResponse(
-                        error_message=sentence, infer_response=messages.ModelInferResponse(id=_id_of(content))
-                    )
+                    yield _error_reply(error, content)
         finally:
             core.close_stream(opening)
 
@@ -176,6 +179,7 @@ class Grpc:
             time.perf_counter(),
             label=texts.get(LABEL),
             request_id=texts.get(REQUEST_ID),
+            headers=headers,
             waited=self._core.admission.waited(headers.get(STAMP.encode())),
         )
         try:
@@ -378,6 +382,13 @@ def _id_of(content: bytes) -> str:
         return ""
 
 
+def _error_reply(error: RlservoError, content: bytes) -> Any:
+    """Return a stream's reply to a request that failed."""
+    return messages.ModelStreamInferResponse(
+        error_message=_explain(error)[1], infer_response=messages.ModelInferResponse(id=_id_of(content))
+    )
+
+
 def _fail(context: Any, error: Exception) -> None:
     """Set the status of a call. Serve would log what is raised, with a traceback: too much for a client's fault."""
     status, sentence, code = _explain(error)
@@ -385,8 +396,8 @@ def _fail(context: Any, error: Exception) -> None:
     context.set_details(sentence)
     given = [(name, value) for name, value in context.invocation_metadata() or () if name == REQUEST_ID]
     trailing = [("rlservo-code", code), *given]
-    if status is grpc.StatusCode.UNAVAILABLE:
-        trailing.append(("retry-after", str(RETRY_AFTER_S)))
+    if isinstance(error, UnavailableError):
+        trailing.append(("retry-after", str(retry_after_s(error))))
     context.set_trailing_metadata(trailing)  # in addition to Serve's
 
 

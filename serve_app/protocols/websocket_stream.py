@@ -22,16 +22,21 @@ from collections.abc import Callable, Mapping
 
 from starlette.types import Message, Receive, Scope, Send
 
-from rlservo.export.contract.errors import OverloadedError, RlservoError, UnknownPolicyError
+from rlservo.export.contract.errors import (
+    ForbiddenError,
+    OverloadedError,
+    RlservoError,
+    UnauthenticatedError,
+    UnknownPolicyError,
+)
 from rlservo.serve_app.episodes.request import Request, new_episode_id
 from rlservo.serve_app.episodes.sessions import Session
 from rlservo.serve_app.protocols.direct_routes import StreamRoute
 from rlservo.serve_app.protocols.http_errors import Headers, encode_bug, error_answer, send_error
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
-from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_checks import HEADERS, LABEL, REQUEST_ID, authorize, header_text, presented_key
+from rlservo.serve_app.server.request_checks import HEADERS, LABEL, REQUEST_ID, StreamKey, header_text, presented_key
 from rlservo.serve_app.server.request_metrics import IDLE
 
 logger = logging.getLogger(__name__)
@@ -42,6 +47,7 @@ FAILED = 1011  # the close code openpi's server uses for every error
 KEEP = b"errors=keep"
 PROTOCOL = "websocket"
 SILENT = "silent for too long"
+REVOKED = (UnauthenticatedError, ForbiddenError)  # what the key of a stream may come to
 DENIAL = "websocket.http.response"  # the ASGI extension that answers an upgrade with an HTTP error
 
 
@@ -118,7 +124,7 @@ class StreamEndpoint:
         """Answer request by request. Raises RlservoError, which has been recorded, where it ends the stream."""
         core, codec = self._core, self._codec
         keeps = KEEP in scope.get("query_string", b"").split(b"&")
-        key, key_changes = presented_key(scope[HEADERS]), -1  # checked again with the first request
+        key = StreamKey(core.keys, presented_key(scope[HEADERS]))
         timings: dict[str, float] | None = None
         waited: float | None = None
         while True:
@@ -138,18 +144,16 @@ class StreamEndpoint:
             idle.touch()
             if message["type"] == "websocket.disconnect":
                 return
-            if key_changes != core.keys.changes:  # the key may be no longer accepted: this ends every stream
-                key_changes = core.keys.changes
+            waited = None
+            try:
                 try:
-                    authorize(core.keys, key, Access.act)
+                    key.check()
                 except RlservoError as error:
                     core.record_failure(request, error.code, error.message)
                     raise
-            waited = None
-            try:
                 reply = await core.answer(codec, request, message)
             except RlservoError as error:
-                if not keeps:
+                if not keeps or isinstance(error, REVOKED):  # which ends every stream
                     raise
                 await send({"type": "websocket.send", "text": _with_seq(error_answer(error)[1], request.seq)})
                 continue

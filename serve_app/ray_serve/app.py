@@ -199,6 +199,10 @@ class PolicyServer(InferenceService):
         """Return this replica's listing; replicas call this of each other."""
         return {} if self._core is None else listing.describe(self._core)
 
+    async def count(self, name: str) -> dict[str, Any]:
+        """Return what this replica counted of a policy; replicas call this of each other."""
+        return {} if self._core is None else listing.count(self._core, name)
+
     def __del__(self) -> None:
         """End the recording: Serve calls this when the replica has answered its last request."""
         core = getattr(self, "_core", None)
@@ -226,8 +230,9 @@ class PolicyServer(InferenceService):
         replies = await self._call_all("follow_plan", generation)
         return [reply for reply in replies if isinstance(reply, ReplicaProgress)]
 
-    async def _ask_all(self) -> list[Any]:
-        return sorted(await self._call_all("describe"), key=lambda reply: str(reply.get("replica")))
+    async def _ask_all(self, *name: str) -> list[Any]:
+        replies = await self._call_all("count" if name else "describe", *name)
+        return sorted(replies, key=lambda reply: str(reply.get("replica")))
 
     async def _call_all(self, method: str, *arguments: Any) -> list[Any]:
         """Call a method of every running replica. Raises PartlyAppliedError when one of them does not answer."""

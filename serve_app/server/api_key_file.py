@@ -15,6 +15,7 @@ from pathlib import Path
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.server.api_keys import Keys, read_key_file
+from rlservo.serve_app.server.rate_limits import RateLimits
 from rlservo.serve_app.server.settings import ServerSettings
 
 logger = logging.getLogger(__name__)
@@ -33,6 +34,7 @@ class CurrentKeys:
         content = None if file is None else read_key_file(Path(file))
         self.accepted = Keys.from_settings(settings, file_content=content)
         """The keys that are accepted now."""
+        self.limits = RateLimits()
         self._seen: bytes | str | None = content
         self._used: bytes | str | None = content
         self._refused = ""

@@ -3,7 +3,7 @@
 A key is 256 random bits, so its plain SHA-256 is all that needs keeping: there is no dictionary to try. A line of the
 key file, or an entry of RLSERVO_API_KEYS (separated by commas), is
 
-    <label> <act|admin> sha256:<64 hexadecimal digits>
+    <label> <act|admin> sha256:<64 hexadecimal digits> [rate=<requests a second> [burst=<requests at once>]]
 
 `rlservo key LABEL` makes a key and its line.
 """
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import math
 import os
 import re
 import secrets
@@ -29,7 +30,10 @@ from rlservo.export.contract.regular_files import NotReadableError, blocks, open
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.loopback import is_loopback
 
-LINE = re.compile(r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|admin)\s+sha256:(?P<digest>[0-9a-f]{64})")
+LINE = re.compile(
+    r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|admin)\s+sha256:(?P<digest>[0-9a-f]{64})"
+    r"(?:\s+rate=(?P<rate>[0-9]{1,6}(?:\.[0-9]{1,3})?)(?:\s+burst=(?P<burst>[1-9][0-9]{0,5}))?)?"
+)
 KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets can tell what they found
 KEY_BYTES = 32
 LONGEST_FILE = 1 << 20  # [bytes] of the key file: some ten thousand keys
@@ -79,12 +83,30 @@ def access_of(route: Any) -> Access:
 
 
 @dataclass(frozen=True)
+class RateLimit:
+    """How often a key may ask, on each replica."""
+
+    rate: float  # requests a second
+    burst: int  # requests at once, after a pause
+
+    @classmethod
+    def parse(cls, rate: str | None, burst: str | None) -> RateLimit | None:
+        """Return a line's limit; the burst is a second's requests where it is not said. Raises ValueError for 0."""
+        if rate is None:
+            return None
+        if not float(rate):
+            raise ValueError
+        return cls(float(rate), int(burst) if burst else max(1, math.ceil(float(rate))))
+
+
+@dataclass(frozen=True)
 class Key:
     """A key as it is kept: not the key itself."""
 
     label: str
     role: Role
     digest: bytes
+    limit: RateLimit | None = None
 
 
 @dataclass(frozen=True)
@@ -110,9 +132,13 @@ class Keys:
             if match is None:  # the line is not shown: it may be a key by mistake
                 raise UsageError(
                     f"{where}: expected '<label> <act|admin> sha256:<64 hexadecimal digits>', as "
-                    "'rlservo key LABEL' makes it"
+                    "'rlservo key LABEL' makes it, and after it 'rate=<requests a second> burst=<requests>' or nothing"
                 )
-            keys.append(Key(match["label"], Role(match["role"]), bytes.fromhex(match["digest"])))
+            try:
+                limit = RateLimit.parse(match["rate"], match["burst"])
+            except ValueError:
+                raise UsageError(f"{where}: a rate of 0 would let the key ask nothing: leave its line out") from None
+            keys.append(Key(match["label"], Role(match["role"]), bytes.fromhex(match["digest"]), limit))
         if (settings.api_keys_file is not None or settings.api_keys.strip()) and not keys:
             raise UsageError(
                 "the key settings name no key, and would leave the server open: add one, or leave them out"
@@ -130,12 +156,18 @@ class Keys:
         return found
 
 
-def new_key(label: str, *, admin: bool = False) -> tuple[str, str]:
+def new_key(label: str, *, admin: bool = False, rate: float | None = None, burst: int | None = None) -> tuple[str, str]:
     """Return (the key, for the client alone; its line, for the server). Raises UsageError."""
+    if burst is not None and rate is None:
+        raise UsageError("a burst is of a rate: say how many requests a second as well")
     key = KEY_PREFIX + secrets.token_urlsafe(KEY_BYTES)
     line = f"{label} {'admin' if admin else 'act'} sha256:{hashlib.sha256(key.encode()).hexdigest()}"
     if LINE.fullmatch(line) is None:
         raise UsageError(f"label {label[:80]!r}: expected 1 to 64 letters, digits, '.', '_' and '-'")
+    line += "" if rate is None else f" rate={rate:.3f}".rstrip("0").rstrip(".")
+    line += "" if burst is None else f" burst={burst}"
+    if LINE.fullmatch(line) is None or (rate is not None and rate < 0.001):
+        raise UsageError("expected a rate of 0.001 to 999999 requests a second, and a burst of 1 to 999999")
     return key, line
 
 

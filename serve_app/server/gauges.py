@@ -61,9 +61,15 @@ def queue(core: Core, replica: str) -> Iterator[Metric]:
 
 
 def keys(core: Core, replica: str) -> Iterator[Metric]:
-    """Yield whether the API keys in use are those of their file."""
+    """Yield whether the API keys in use are those of their file, and whose requests were refused by their rate."""
     current = "1 while the API keys in use are those of their file; 0: the file cannot be used, and older keys stay"
     yield _gauge("rlservo_api_keys_current", current, replica, core.keys.current)
+    limited = CounterMetricFamily(
+        "rlservo_rate_limited", "Requests refused because their key asked too often", labels=["replica", "key"]
+    )
+    for label, count in core.keys.limits.refused.items():
+        limited.add_metric([replica, label], count)
+    yield limited
 
 
 def recording(core: Core, replica: str) -> Iterator[Metric]:

@@ -94,7 +94,7 @@ class Hosts:
 def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key | None:
     """Return the key that opens what a route, or a method, grants, None where it needs none.
 
-    Raises UnauthenticatedError or ForbiddenError.
+    It counts as a request of that key. Raises UnauthenticatedError, ForbiddenError or RateLimitError.
     """
     if access is Access.open:
         return None
@@ -112,8 +112,32 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     if key is None:
         raise UnauthenticatedError("this API key is not known to the server")
     if admin and key.role is not Role.admin:
-        raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key")
+        raise ForbiddenError(
+            f"the key '{key.label}' may ask for actions, and this needs an admin key", {"key": key.label}
+        )
+    if key.limit is not None:
+        keys.limits.spend(key, key.limit)
     return key
+
+
+class StreamKey:
+    """The key of an open stream: checked again after every change of the keys, and counted with every request."""
+
+    def __init__(self, keys: CurrentKeys, presented: bytes | None) -> None:
+        """Nothing is checked before the first request."""
+        self._keys = keys
+        self._presented = presented
+        self._changes = -1
+        self._key: Key | None = None
+
+    def check(self) -> None:
+        """Check the key for one more request. Raises as `authorize` does: RateLimitError is about this one alone."""
+        if self._changes != self._keys.changes:
+            changes = self._keys.changes
+            self._key = authorize(self._keys, self._presented, Access.act)
+            self._changes = changes
+        elif self._key is not None and self._key.limit is not None:
+            self._keys.limits.spend(self._key, self._key.limit)
 
 
 class RequestChecks:

@@ -12,6 +12,7 @@ import sys
 import time
 from typing import Any
 
+from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision
@@ -21,7 +22,7 @@ FIELDS = "fields"  # where a record carries its fields
 LONGEST_ID = 128
 
 _requests = logging.getLogger(f"{LOGGER}.requests")
-_administration = logging.getLogger(f"{LOGGER}.administration")
+administration = logging.getLogger(f"{LOGGER}.administration")
 
 
 class JsonFormatter(logging.Formatter):
@@ -49,7 +50,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def configure(settings: ServerSettings, *, replica: str = "") -> None:
-    """Send this process's log, in JSON, to the settings' file or to standard error."""
+    """Send this process's log, in JSON, to the settings' file or to standard error. Raises UsageError."""
     handler: logging.Handler
     handler = logging.StreamHandler(sys.stderr) if settings.log_file is None else logging.FileHandler(settings.log_file)
     handler.setFormatter(JsonFormatter(replica))
@@ -60,6 +61,22 @@ def configure(settings: ServerSettings, *, replica: str = "") -> None:
     logger.addHandler(handler)
     logger.setLevel(settings.log_level.upper())
     logger.propagate = False
+    _log_administration(settings, replica)
+
+
+def _log_administration(settings: ServerSettings, replica: str) -> None:
+    """Write who administers whatever the log's level, and to the audit's file where there is one."""
+    administration.setLevel(logging.INFO)
+    for previous in list(administration.handlers):
+        administration.removeHandler(previous)
+        previous.close()
+    if settings.audit_file is not None:
+        try:
+            handler = logging.FileHandler(settings.audit_file)
+        except OSError as error:
+            raise UsageError(f"the audit file {settings.audit_file} cannot be written: {error.strerror}") from None
+        handler.setFormatter(JsonFormatter(replica))
+        administration.addHandler(handler)
 
 
 class RequestLog:
@@ -100,22 +117,6 @@ def _fields(request: Request, policy: str, version: str | None, code: str, secon
     if request.stream_id is not None and request.seq is not None:
         fields["seq"] = request.seq
     return fields
-
-
-def write_change(
-    change: str, code: str, *, key: str, peer: str | None, request_id: str | None, generation: int | None = None
-) -> None:
-    """Write a change of what is served, or one that was refused: whose key asked for it, from which address."""
-    fields: dict[str, Any] = {
-        "request_id": _shorten(request_id),
-        "change": change.strip(),
-        "code": code,
-        "key": key,
-        "peer": peer,
-    }
-    if generation is not None:
-        fields["generation"] = generation
-    _administration.info("changed" if code == "ok" else "refused", extra={FIELDS: fields})
 
 
 def _shorten(request_id: str | None) -> str | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from bisect import bisect_left
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
@@ -18,7 +18,8 @@ from prometheus_client.metrics_core import Metric
 from rlservo.serve_app.versions.policy_store import Decision
 
 IDLE = "idle"  # what a stream is closed with that was silent for too long
-SECONDS = (1e-5, 2.5e-5, 5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0)
+SECONDS = (1e-5, 2.5e-5, 5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0)
+SUCCESS = "success"  # the final status of an episode that reached its goal, as the environments say it
 BATCHES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0, 2048.0, 4096.0)
 
 
@@ -70,6 +71,16 @@ class Totals:
     last_answer_ms: int  # since 1970; 0 where there was none
 
 
+@dataclass
+class VersionCounts:
+    """What was counted of one policy's version since the start."""
+
+    latency: list[int] = field(default_factory=lambda: [0] * (len(SECONDS) + 1))
+    """Answered requests by how long they took: up to each of `SECONDS`, and longer."""
+    failed: dict[str, int] = field(default_factory=dict)  # by the error's code
+    ends: list[int] = field(default_factory=lambda: [0, 0])  # episodes that ended in success, and otherwise
+
+
 class Metrics:
     """The counts of one replica."""
 
@@ -77,6 +88,7 @@ class Metrics:
         self._answered: dict[tuple[str, str, str], _Series] = {}
         self._failed: dict[tuple[str, str, str, str], int] = {}
         self._streams: dict[str, int] = {}
+        self._ends: dict[tuple[str, str, bool], int] = {}
 
     def record_answer(self, protocol: str, decision: Decision, seconds: float) -> None:
         """Count a request that got its action `seconds` after it arrived."""
@@ -94,6 +106,11 @@ class Metrics:
         """Count a request that got none; `policy` is empty unless it is loaded, so that nobody can make up labels."""
         key = (policy, version, protocol, code)
         self._failed[key] = self._failed.get(key, 0) + 1
+
+    def count_end(self, decision: Decision, status: str) -> None:
+        """Count an episode whose end a client told. Its word is free, so only `success` is told from the others."""
+        key = (decision.name, decision.version, status == SUCCESS)
+        self._ends[key] = self._ends.get(key, 0) + 1
 
     def count_stream(self, policy: str, change: int) -> None:
         """Count a WebSocket that opened (1) or closed (-1)."""
@@ -116,6 +133,23 @@ class Metrics:
             inference_s=sum(series.inference.total for series in found),
             last_answer_ms=round(1e3 * max((series.last_answer_s for series in found), default=0.0)),
         )
+
+    def counts(self, policy: str) -> dict[str, VersionCounts]:
+        """Return what was counted of each version of a policy since the start, over all protocols."""
+        found: dict[str, VersionCounts] = {}
+        for (name, version, _), series in self._answered.items():
+            if name == policy:
+                counts = found.setdefault(version, VersionCounts())
+                counts.latency = [a + b for a, b in zip(counts.latency, series.latency.counts, strict=True)]
+        for (name, version, _, code), count in self._failed.items():
+            if name == policy and version:
+                failed = found.setdefault(version, VersionCounts()).failed
+                failed[code] = failed.get(code, 0) + count
+        for (name, version, succeeded), count in self._ends.items():
+            if name == policy:
+                ends = found.setdefault(version, VersionCounts()).ends
+                ends[int(not succeeded)] += count
+        return found
 
     def families(self, replica: str) -> Iterator[Metric]:
         """Yield the families as they are now; `replica` tells the replicas' series apart."""
@@ -147,3 +181,11 @@ class Metrics:
         for policy, count in self._streams.items():
             streams.add_metric([replica, policy], count)
         yield streams
+        ends = CounterMetricFamily(
+            "rlservo_episode_ends",
+            "Episodes whose end clients told (`final_status`); outcome: success, other",
+            labels=["replica", "policy", "version", "outcome"],
+        )
+        for (policy, version, succeeded), count in self._ends.items():
+            ends.add_metric([replica, policy, version, SUCCESS if succeeded else "other"], count)
+        yield ends

@@ -38,7 +38,7 @@ from rlservo.serve_app.server.loop_clock import LoopClock
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
 from rlservo.serve_app.server.request_metrics import Metrics
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blamed_version
 from rlservo.serve_app.versions.shadow import Shadows
 from rlservo.serve_app.wire.request_stamp import clock_id
 
@@ -218,15 +218,17 @@ class RequestPath:
         except ClientGoneError:
             raise
         except RlservoError as error:
-            self.record_failure(request, error.code, error.message)
+            self.record_failure(request, error.code, error.message, asked=blamed_version(error))
             if self.recorder is not None:
                 self.recorder.record_failure(request, self._store_provider(), error)
             raise
         except Exception as error:
-            self.record_bug(request)
+            self.record_bug(request, asked=blamed_version(error))
             raise InternalError(BUG) from error
         taken = time.perf_counter() - request.received
         self.metrics.record_answer(request.protocol, decision, taken)
+        if request.episode is not None and request.episode.final_status is not None:
+            self._count_end(request, decision, request.episode.final_status)
         if self.recorder is not None:
             self.recorder.record_answer(request, decision, taken)
         if self.log.every:
@@ -259,24 +261,31 @@ class RequestPath:
             self.shadows.offer(shadow, obs, decision)
         return decision
 
-    def record_failure(self, request: Request, code: str, sentence: str, *, peer: str | None = None) -> None:
+    def record_failure(
+        self, request: Request, code: str, sentence: str, *, peer: str | None = None, asked: str | None = None
+    ) -> None:
         """Count and log a request that got no action; names that are not loaded are not told apart.
 
-        `peer` is the address it came from, for the log of what was refused before it was routed.
+        `peer` is the address it came from, for the log of what was refused before it was routed; `asked` is the version
+        that was asked and failed, where it came so far.
         """
         name, version = request.policy, request.version
         store = self._store_provider()
         if store is None or name not in store.names:
             name = version = ""
+        elif asked is not None:
+            version = asked
         else:  # an alias is counted as the version it leads to, no version as the default
             version = store.default(name) if version is None else store.version_of(name, version)
         self.metrics.count_failure(request.protocol, name, version, code)
         self.log.write_failure(request, code, sentence, peer=peer)
 
-    def record_bug(self, request: Request) -> None:
+    def record_bug(self, request: Request, *, asked: str | None = None) -> None:
         """Count a request that failed by the exception that is being handled, and log that with its traceback."""
         logger.exception("a request failed", extra={FIELDS: {"request_id": request.request_id}})
-        self.metrics.count_failure(request.protocol, "", "", InternalError.code)  # what failed may be the policies
+        # Unless a version was asked: what failed may be the policies.
+        name, version = ("", "") if asked is None else (request.policy, asked)
+        self.metrics.count_failure(request.protocol, name, version, InternalError.code)
 
     def open_stream(self, request: Request) -> None:
         """Count a stream that opens, from whose opening `request` is. Raises OverloadedError."""
@@ -291,6 +300,13 @@ class RequestPath:
         """Count it no longer."""
         self.admission.close_stream()
         self.metrics.count_stream(request.policy, -1)
+
+    def _count_end(self, request: Request, decision: Decision, status: str) -> None:
+        """Count an episode that ended, unless chance gave its requests to one version or another."""
+        carries_state = decision.episode is not None and decision.episode.state is not None
+        drawn = request.version is None and not carries_state and self.store().is_drawn(decision.name, request.label)
+        if not drawn and not decision.is_repeated:
+            self.metrics.count_end(decision, status)
 
     def _admit(self, request: Request) -> None:
         """Raise OverloadedError or LateError; a wait before `received` begins to count."""

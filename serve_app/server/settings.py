@@ -85,6 +85,10 @@ class ServerSettings(BaseModel):
     log_file: str | None = None
     """Append the log to this file; without one it goes to standard error, which Ray keeps in its session folder."""
 
+    audit_file: str | None = None
+    """Append a line for every command of administration, carried out or refused, to this file, in addition to the log.
+    Every replica of a machine appends to the same one."""
+
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """The least that is logged; at `info`, every request that got no action."""
 
@@ -151,7 +155,7 @@ class ServerSettings(BaseModel):
             max_contract_bytes=self.max_contract_bytes,
         )
 
-    @field_validator("api_keys_file", "log_file", "record")
+    @field_validator("api_keys_file", "audit_file", "log_file", "record")
     @classmethod
     def _absolute(cls, value: str | None) -> str | None:
         """A replica's working directory is not the caller's."""

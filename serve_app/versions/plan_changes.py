@@ -85,10 +85,18 @@ def unload(plan: Plan, name: str, version: str | None) -> dict[str, PolicyPlan]:
     return _with(plan, name, policy, versions={v: digest for v, digest in policy.versions.items() if v != version})
 
 
-def set_alias(plan: Plan, name: str, alias: str, version: str | None) -> dict[str, PolicyPlan]:
-    """Let an alias lead to a loaded version, or with None remove it; `production` can only be moved."""
+def set_alias(
+    plan: Plan, name: str, alias: str, version: str | None, *, expected: str | None = None
+) -> dict[str, PolicyPlan]:
+    """Let an alias lead to a loaded version, or with None remove it; `production` can only be moved.
+
+    `expected` is where it leads as far as the caller knows: who has not seen another's move does not undo it. The same
+    command twice is no contradiction.
+    """
     policy = plan.policy(name)
     aliases = dict(policy.aliases)
+    if expected is not None and aliases.get(alias) not in (expected, version):
+        raise _not_as_expected(policy, name, alias, expected)
     if version is None:
         if alias not in aliases:
             raise ConflictError(f"policy '{name}' has no alias '{alias}': it has {_listed(aliases)}")
@@ -114,10 +122,7 @@ def roll_back(plan: Plan, name: str, alias: str, *, expected: str | None = None)
     """
     policy = plan.policy(name)
     if expected is not None and policy.aliases.get(alias) != expected:
-        leads = f"leads to {policy.aliases[alias]}" if alias in policy.aliases else "is gone"
-        raise ConflictError(
-            f"the alias '{alias}' of policy '{name}' {leads} and was expected at {expected}: moved already"
-        )
+        raise _not_as_expected(policy, name, alias, expected)
     earlier = policy.history.get(alias, ())
     if not earlier:
         raise ConflictError(f"the alias '{alias}' of policy '{name}' has led nowhere else: there is no way back")
@@ -126,6 +131,13 @@ def roll_back(plan: Plan, name: str, alias: str, *, expected: str | None = None)
     changed = _with(plan, name, policy, versions=versions, aliases={**policy.aliases, alias: version})
     history = {**changed[name].history, alias: earlier[:-1]}
     return {**changed, name: changed[name].model_copy(update={"history": history})}
+
+
+def _not_as_expected(policy: PolicyPlan, name: str, alias: str, expected: str) -> ConflictError:
+    leads = f"leads to {policy.aliases[alias]}" if alias in policy.aliases else "is gone"
+    return ConflictError(
+        f"the alias '{alias}' of policy '{name}' {leads} and was expected at {expected}: moved already"
+    )
 
 
 def set_canary(plan: Plan, name: str, canary: Canary | None) -> dict[str, PolicyPlan]:

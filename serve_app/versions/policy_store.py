@@ -190,6 +190,11 @@ class PolicyStore:
                 return served.canary
         return self.get(name, version)
 
+    def is_drawn(self, name: str, label: str | None) -> bool:
+        """Whether chance says, request by request, which version a request without a version gets."""
+        served = self._served.get(name)
+        return label is None and served is not None and served.canary is not None
+
     def shadow(self, name: str) -> Shadow | None:
         """Return the version that computes along, if there is one."""
         return self._find(name).shadow
@@ -231,14 +236,18 @@ class PolicyStore:
         batcher = self._batchers.get(policy)
         if batcher is None:
             return take_step(policy, obs)[0]
-        started = time.perf_counter()
-        feed, batch, notices = policy.parse(obs)
-        parse_ms = (time.perf_counter() - started) * 1e3
-        rows = len(next(iter(feed.values())))
-        single = rows == 1  # also a batch of one: the Open Inference Protocol has no other
-        computed = await batcher.compute(feed, check) if single else batcher.compute_now(feed)
-        started = time.perf_counter()
-        action = policy.build_action(computed.outputs, batch=batch)
+        try:
+            started = time.perf_counter()
+            feed, batch, notices = policy.parse(obs)
+            parse_ms = (time.perf_counter() - started) * 1e3
+            rows = len(next(iter(feed.values())))
+            single = rows == 1  # also a batch of one: the Open Inference Protocol has no other
+            computed = await batcher.compute(feed, check) if single else batcher.compute_now(feed)
+            started = time.perf_counter()
+            action = policy.build_action(computed.outputs, batch=batch)
+        except Exception as error:
+            blame(error, policy)
+            raise
         infer_ms = parse_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
         version, size, sharers = policy.contract.version, rows if batch else None, computed.requests
         return Decision(action, policy, feed, name, version, infer_ms, size, notices, sharers=sharers)
@@ -291,10 +300,24 @@ def _wants_batches(policy: Policy) -> bool:
 def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision, Step]:
     """Decide by one step of a policy, `given` what `Policy.step` takes beside the observation; return the step, too."""
     started = time.perf_counter()
-    step = policy.step(obs, **given)
+    try:
+        step = policy.step(obs, **given)
+    except Exception as error:
+        blame(error, policy)
+        raise
     infer_ms = (time.perf_counter() - started) * 1e3
     name, version = policy.contract.name, policy.contract.version
     return Decision(step.action, policy, step.inputs, name, version, infer_ms, step.batch, step.notices), step
+
+
+def blame(error: Exception, policy: Policy) -> None:
+    """Write the version that was asked on its error: where a canary runs, nobody else knows which one it was."""
+    error.policy_version = policy.contract.version  # type: ignore[attr-defined]
+
+
+def blamed_version(error: Exception) -> str | None:
+    """Return the version that was asked and failed with this error; None where none was asked."""
+    return getattr(error, "policy_version", None)
 
 
 def _draw(name: str, label: str | None, canary: Policy) -> float:

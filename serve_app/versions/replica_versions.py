@@ -70,7 +70,8 @@ class VersionState:
 
 
 Broadcast = Callable[[int], Awaitable[Sequence[ReplicaProgress]]]
-Gather = Callable[[], Awaitable[Sequence[Any]]]
+Gather = Callable[..., Awaitable[Sequence[Any]]]
+"""What every replica says: of all policies without an argument, else what it counted of the one named."""
 IsCurrent = Callable[[Any], Awaitable[bool]]
 
 
@@ -88,8 +89,8 @@ class ReplicaVersions:
         is_current: IsCurrent | None = None,
     ) -> None:
         """`broadcast` tells every replica of a number and returns what they answer, `gather` returns every replica's
-        listing, and `is_current` says whether a configuration is the one that the deployment has now, since a replica
-        may be started with the one before. Without them this replica is the only one.
+        listing or counts, and `is_current` says whether a configuration is the one that the deployment has now, since a
+        replica may be started with the one before. Without them this replica is the only one.
         """
         self.store: PolicyStore | None = None
         self.plan: Plan | None = None

@@ -33,6 +33,7 @@ class _Series:
     def __init__(self) -> None:
         self.counts = np.zeros(len(BOUNDS) + 1, np.int64)
         self.total = 0.0
+        self.squares = 0.0
         self.largest = 0.0
         self.failed = 0
         self.left_out = 0
@@ -75,6 +76,22 @@ class Shadows:
             "left_out": series.left_out,
         }
 
+    def counts(self, policy: str) -> list[dict[str, Any]]:
+        """Return all that was counted of each pair of versions of a policy since the start."""
+        return [
+            {
+                "version": version,
+                "shadow": shadow,
+                "differences": series.counts.tolist(),
+                "total": series.total,
+                "squares": series.squares,
+                "failed": series.failed,
+                "left_out": series.left_out,
+            }
+            for (name, version, shadow), series in list(self._series.items())
+            if name == policy
+        ]
+
     def families(self, replica: str) -> Iterator[Metric]:
         """Yield the metrics as they are now."""
         names = ["replica", "policy", "version", "shadow"]
@@ -110,6 +127,7 @@ class Shadows:
                 continue
             np.add.at(series.counts, np.searchsorted(BOUNDS, differences), 1)
             series.total += float(differences.sum())
+            series.squares += float(np.square(differences).sum())
             series.largest = max(series.largest, float(differences.max(initial=0.0)))
 
     def _series_of(self, shadow: Shadow, decision: Decision) -> _Series:

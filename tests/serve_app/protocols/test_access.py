@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import logging
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -17,11 +18,12 @@ from typing import Any
 
 import pytest
 
+from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.status_page import FOLDER
 from rlservo.serve_app.server.api_keys import ACCESS, Access, access_of, grant, new_key
-from rlservo.serve_app.server.request_log import FIELDS
+from rlservo.serve_app.server.request_log import FIELDS, configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 
@@ -39,7 +41,7 @@ OBS = b'{"obs": [0]}'
 COMMANDS = ("load", "unload", "alias", "rollback", "canary", "shadow")
 ADMIN_PATHS = (
     "/v1/admin/policies",
-    *(f"/v1/admin/policies/{{name}}/{command}" for command in COMMANDS),
+    *(f"/v1/admin/policies/{{name}}/{command}" for command in (*COMMANDS, "counts")),
     "/v2/repository/models/{name}/load",
     "/v2/repository/models/{name}/unload",
 )
@@ -349,13 +351,19 @@ def test_who_administers_and_whose_key_is_refused_is_in_the_log(
             for key in (WRONG, ROBOT):
                 assert wire.ask(b"POST", path, *bearer(key), b"x-request-id: refused", body=body)[0] in (401, 403)
     changes = entries(caplog, "rlservo.administration")
-    told = [(entry["request_id"], entry["change"], entry["code"]) for entry in changes]
+    told = [(entry["request_id"], entry["change"], entry["code"], entry["key"]) for entry in changes]
     assert told == [
-        ("change-1", "alias ur5 candidate=2", "ok"),
-        ("change-2", "alias ur5 candidate=77", "unknown-version"),
-        ("change-3", "unload gridworld", "ok"),
+        ("change-1", "alias ur5 candidate=2", "ok", "boss"),
+        ("change-2", "alias ur5 candidate=77", "unknown-version", "boss"),
+        ("change-3", "unload gridworld", "ok", "boss"),
+        ("refused", "", "unauthenticated", ""),
+        ("refused", "", "forbidden", "cell-7"),
     ]
-    assert {(entry["key"], entry["peer"]) for entry in changes} == {("boss", "127.0.0.1")}
+    assert {entry["peer"] for entry in changes} == {"127.0.0.1"}
+    assert [(entry["command"], entry["policy"], entry["version"]) for entry in changes[:3]] == [
+        ("alias", "ur5", "2"), ("alias", "ur5", "77"), ("unload", "gridworld", None),
+    ]  # fmt: skip
+    assert {entry["path"] for entry in changes[3:]} == {path.decode()}
     assert changes[0]["generation"] == 2
     refused = [entry for entry in entries(caplog, "rlservo.requests") if entry["request_id"] == "refused"]
     assert [(entry["code"], entry["peer"]) for entry in refused] == [
@@ -363,6 +371,73 @@ def test_who_administers_and_whose_key_is_refused_is_in_the_log(
         ("forbidden", "127.0.0.1"),
     ]
     assert WRONG not in caplog.text and ADMIN not in caplog.text
+
+
+def test_every_command_is_in_the_audit_whatever_became_of_it_and_no_key_is(
+    policies: Path, controlled: Controlled, served: Serve, tmp_path: Path
+) -> None:
+    file = tmp_path / "audit.jsonl"
+    settings = ServerSettings(
+        api_keys=f"{ROBOT_LINE},{ADMIN_LINE}", audit_file=str(file), log_level="error",
+        log_file=str(tmp_path / "server.jsonl"), body_timeout_s=0.3,
+    )  # fmt: skip
+    attempts = [
+        (b"alias", b'{"alias": "candidate", "version": "2"}', "ok"),
+        (b"alias", b'{"alias": "candidate"}', "bad-request"),
+        (b"alias", b"not json", "bad-request"),
+        (b"alias", b'{"alias": "candidate", "version": "2", "key": "%s"}' % ADMIN.encode(), "bad-request"),
+        (b"load", b'{"version": "77"}', "unknown-version"),
+        (b"canary", b'{"version": "2"}', "bad-request"),
+        (b"canary", b'{"version": "2", "share": 0.1}', "ok"),
+        (b"shadow", b'{"version": "2"}', "ok"),
+        (b"rollback", b"{}", "conflict"),
+        (b"unload", b'{"version": "2"}', "conflict"),
+        (b"unload", b" " * (5 << 20), "too-large"),
+    ]
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(listening_log(settings))
+        control = stack.enter_context(controlled(policies))
+        port = stack.enter_context(served(create_app(lambda: control.store, settings, control=control)))
+        with Wire(port) as wire:
+            for command, body, _ in attempts:
+                wire.ask(b"POST", b"/v1/admin/policies/ur5/" + command, *bearer(ADMIN), body=body)
+            wire.ask(b"POST", b"/v1/admin/policies/" + ADMIN.encode() + b"/load", *bearer(ADMIN), body=b"{}")
+            wire.ask(b"PUT", b"/v1/admin/policies/ur5/load", *bearer(ADMIN))
+            wire.ask(b"GET", b"/v1/admin/policies", *bearer(ROBOT))
+            wire.ask(b"GET", b"/v1/admin/policies", *bearer(ADMIN))  # changes nothing
+            wire.ask(b"POST", b"/v1/admin/policies/ur5/load", b"x-request-id: " + ADMIN.encode())
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert [line["code"] for line in lines] == [
+        *(code for *_, code in attempts), "unknown-policy", "method-not-allowed", "forbidden", "unauthenticated",
+    ]  # fmt: skip
+    assert [line["message"] for line in lines].count("changed") == 3
+    assert {line["key"] for line in lines} == {"boss", "cell-7", ""}
+    assert all(line["logger"] == "rlservo.administration" and line["peer"] == "127.0.0.1" for line in lines)
+    assert ADMIN not in file.read_text() and ADMIN.removeprefix("rlservo_") not in file.read_text()
+    assert lines[-1]["request_id"] == "rlservo_..."
+    assert (tmp_path / "server.jsonl").read_text().count("rlservo.administration") == len(lines)
+
+
+def test_an_audit_file_that_cannot_be_written_refuses_the_start(tmp_path: Path) -> None:
+    settings = ServerSettings(audit_file=str(tmp_path / "gone" / "audit.jsonl"))
+    with pytest.raises(UsageError, match=r"the audit file .* cannot be written: No such file"), listening_log(settings):
+        pass
+
+
+@contextlib.contextmanager
+def listening_log(settings: ServerSettings) -> Iterator[None]:
+    """Log as a replica does, and as before afterwards."""
+    loggers = [logging.getLogger(name) for name in ("rlservo", "rlservo.administration")]
+    try:
+        configure(settings)
+        yield
+    finally:
+        for logger in loggers:
+            for handler in list(logger.handlers):
+                logger.removeHandler(handler)
+                handler.close()
+            logger.setLevel(logging.NOTSET)
+        loggers[0].propagate = True
 
 
 def test_no_route_reads_a_body_beyond_the_limit(server: Served) -> None:

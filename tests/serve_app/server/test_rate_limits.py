@@ -1,0 +1,265 @@
+"""Rate limits per API key: over every protocol, by label, and only where a line says so."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import grpc
+import msgpack
+import pytest
+import websockets.sync.client
+from typer.testing import CliRunner
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from rlservo.deploy.cli import app as command_line
+from rlservo.export.contract.errors import RateLimitError, UsageError
+from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.protocols.http_endpoint import PolicyApp
+from rlservo.serve_app.protocols.oip_grpc import Grpc
+from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, Role, new_key
+from rlservo.serve_app.server.rate_limits import RateLimits
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from stores import load_store
+
+Serve = Callable[[Any], AbstractContextManager[int]]
+
+# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
+pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+
+OBS = [0.1] * 27
+BURST = 3
+LIMITED, LIMITED_LINE = new_key("cell-7", rate=0.001, burst=BURST)  # in a test's time no further one
+FREE, FREE_LINE = new_key("cell-8")
+
+
+@pytest.fixture(scope="module")
+def store(ur5: Path) -> PolicyStore:
+    return load_store(ur5)
+
+
+@pytest.fixture
+def app(store: PolicyStore) -> PolicyApp:
+    settings = ServerSettings(api_keys=f"{LIMITED_LINE},{FREE_LINE}", default_policy="ur5")
+    return create_app(lambda: store, settings, replica="r1")
+
+
+@pytest.fixture
+def port(app: PolicyApp, served: Serve) -> Iterator[int]:
+    with served(app) as port:
+        yield port
+
+
+def ask(port: int, method: str, path: str, body: Any = None, key: str = LIMITED) -> tuple[int, dict[str, str], bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    headers = {"content-type": "application/json", "authorization": f"Bearer {key}"}
+    connection.request(method, path, None if body is None else json.dumps(body), headers)
+    reply = connection.getresponse()
+    content = reply.read()
+    connection.close()
+    return reply.status, dict(reply.headers), content
+
+
+ACT = ("POST", "/v1/policies/ur5/act", {"obs": OBS})
+INFER = (
+    "POST",
+    "/v2/models/ur5/infer",
+    {"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": OBS}]},
+)
+LIST = ("GET", "/v1/policies", None)
+
+
+def test_a_key_gets_its_burst_over_all_of_http_and_then_429_with_a_time_to_wait(port: int) -> None:
+    assert [ask(port, *request)[0] for request in (ACT, INFER, LIST)] == [200] * BURST
+    for request in (ACT, INFER, LIST):
+        status, headers, content = ask(port, *request)
+        document = json.loads(content)
+        assert (status, document["code"]) == (429, "rate-limited")
+        assert "the key 'cell-7' may ask 0.001 times a second here, 3 times at once: wait" in document["error"]
+        assert 900 < int(headers["retry-after"]) <= 1000 and 900 < document["details"]["retry_after_s"] <= 1000
+    for _ in range(5 * BURST):  # another key's, and who needs none
+        assert ask(port, *ACT, key=FREE)[0] == 200
+        assert ask(port, "GET", "/v2/health/live")[0] == 200
+    text = ask(port, "GET", "/metrics", key=FREE)[2].decode()
+    assert 'rlservo_rate_limited_total{key="cell-7",replica="r1"} 3.0' in text
+    assert 'key="cell-8"' not in text and 'code="rate-limited"' in text
+
+
+def test_our_client_raises_it_at_once_and_says_how_long(port: int) -> None:
+    with PolicyClient(f"http://127.0.0.1:{port}", "ur5", api_key=LIMITED) as client:
+        client.act(OBS)  # the contract is a request, too
+        client.act(OBS)
+        began = time.monotonic()
+        with pytest.raises(RateLimitError, match="wait") as caught:
+            client.act(OBS)
+    assert caught.value.details["retry_after_s"] > 900 and time.monotonic() - began < 60
+
+
+def test_a_websockets_frames_count_and_one_too_many_ends_it_or_not(port: int, app: PolicyApp) -> None:
+    def connect(query: str = "") -> Any:
+        headers = {"authorization": f"Bearer {LIMITED}"}
+        return websockets.sync.client.connect(f"ws://127.0.0.1:{port}/{query}", additional_headers=headers)
+
+    frame = msgpack.packb({"obs": OBS})
+    with connect("?errors=keep") as stream:  # the upgrade is the first
+        stream.recv()
+        for _ in range(BURST - 1):
+            stream.send(frame)
+            assert isinstance(stream.recv(), bytes)
+        for _ in range(2):
+            stream.send(frame)
+            reply = stream.recv()
+            assert isinstance(reply, str) and json.loads(reply)["code"] == "rate-limited"
+    with pytest.raises(InvalidStatus) as caught:
+        connect()
+    assert caught.value.response.status_code == 429
+    assert 900 < int(caught.value.response.headers["retry-after"]) <= 1000
+    app.state.core.keys.limits._buckets.clear()
+    with connect() as stream:
+        stream.recv()
+        for _ in range(BURST - 1):
+            stream.send(frame)
+            assert isinstance(stream.recv(), bytes)
+        stream.send(frame)
+        assert json.loads(stream.recv())["code"] == "rate-limited"
+        with pytest.raises(ConnectionClosed):
+            stream.recv()
+        assert stream.close_code == 1011
+
+
+def test_our_stream_raises_it_and_stays_open(port: int) -> None:
+    with StreamClient(f"http://127.0.0.1:{port}", "ur5", api_key=LIMITED) as client:
+        for _ in range(BURST - 1):
+            client.act(OBS)
+        for _ in range(2):
+            with pytest.raises(RateLimitError):
+                client.act(OBS)
+        assert client.reconnects == 0
+
+
+class Context:
+    """What a gRPC call tells, and is told."""
+
+    def __init__(self, key: str) -> None:
+        self.metadata = (("authorization", f"Bearer {key}"),)
+        self.code: Any = None
+        self.details = ""
+        self.trailing: dict[str, str] = {}
+
+    def peer(self) -> str:
+        return "ipv4:127.0.0.1:4711"
+
+    def invocation_metadata(self) -> Any:
+        return self.metadata
+
+    def set_code(self, code: Any) -> None:
+        self.code = code
+
+    def set_details(self, details: str) -> None:
+        self.details = details
+
+    def set_trailing_metadata(self, pairs: Any) -> None:
+        self.trailing.update(pairs)
+
+
+def infer() -> bytes:
+    request = messages.ModelInferRequest(model_name="ur5")
+    request.inputs.add(name="obs", datatype="FP32", shape=[1, 27]).contents.fp32_contents.extend(OBS)
+    return bytes(request.SerializeToString())
+
+
+def test_grpc_says_resource_exhausted(app: PolicyApp) -> None:
+    async def calls() -> list[Context]:
+        service, contexts = Grpc(app.state.core), []
+        for _ in range(BURST + 1):
+            contexts.append(Context(LIMITED))
+            await service.answer("ModelInfer", (infer(), None), contexts[-1])
+        return contexts
+
+    *good, refused = asyncio.run(calls())
+    assert [context.code for context in good] == [None] * BURST
+    assert refused.code is grpc.StatusCode.RESOURCE_EXHAUSTED and "'cell-7' may ask" in refused.details
+    assert refused.trailing["rlservo-code"] == "rate-limited" and 900 < int(refused.trailing["retry-after"]) <= 1000
+
+
+def test_a_grpc_streams_messages_count_and_it_goes_on(app: PolicyApp) -> None:
+    async def requests() -> AsyncIterator[bytes]:
+        for _ in range(BURST + 2):
+            yield infer()
+
+    async def replies() -> list[str]:
+        stream = Grpc(app.state.core).stream(requests(), context)
+        return [reply.error_message async for reply in stream]
+
+    context = Context(LIMITED)
+    errors = asyncio.run(replies())
+    # Opening it is a request, too.
+    assert errors[: BURST - 1] == [""] * (BURST - 1) and all("may ask" in error for error in errors[BURST - 1 :])
+    assert len(errors) == BURST + 2 and context.code is None
+
+
+def test_a_bucket_fills_with_time_up_to_its_burst_and_is_its_labels() -> None:
+    now = [0.0]
+    limits = RateLimits(lambda: now[0])
+    limit = RateLimit(rate=10, burst=4)
+    old, new = (Key("cell-7", Role.act, bytes([n]) * 32, limit) for n in range(2))
+
+    def count(key: Key) -> int:
+        passed = 0
+        try:
+            while passed < 100:
+                limits.spend(key, limit)
+                passed += 1
+        except RateLimitError as error:
+            assert 0 < error.details["retry_after_s"] <= 0.1
+        return passed
+
+    assert (count(old), count(new)) == (4, 0)  # two keys of one label, as while one takes the other's place
+    now[0] += 0.25
+    assert count(new) == 2
+    now[0] += 1e6
+    assert count(old) == 4
+    assert limits.refused["cell-7"] == 4
+
+
+@pytest.mark.parametrize(
+    ("more", "limit"),
+    [
+        ("", None),
+        (" rate=20", RateLimit(20, 20)),
+        (" rate=0.5", RateLimit(0.5, 1)),
+        ("\trate=20  burst=40", RateLimit(20, 40)),
+    ],
+)
+def test_a_line_says_the_limit_or_nothing(more: str, limit: RateLimit | None) -> None:
+    (key,) = Keys.from_settings(ServerSettings(api_keys=FREE_LINE + more)).keys
+    assert key.limit == limit
+
+
+@pytest.mark.parametrize(
+    "more", [" rate=0", " rate=0.000", " rate=-1", " rate=x", " burst=3", " rate=1 burst=0", " 20"]
+)
+def test_a_line_that_says_it_wrongly_refuses_the_start_and_is_not_shown(more: str) -> None:
+    with pytest.raises(UsageError, match="entry 1 of RLSERVO_API_KEYS") as caught:
+        Keys.from_settings(ServerSettings(api_keys=FREE_LINE + more))
+    assert FREE_LINE.split(":")[1] not in caught.value.message
+
+
+def test_the_command_writes_such_lines() -> None:
+    done = CliRunner().invoke(command_line, ["key", "cell-9", "--rate", "20", "--burst", "40", "--json"])
+    line = json.loads(done.stdout)["line"]
+    assert line.endswith(" rate=20 burst=40")
+    assert Keys.from_settings(ServerSettings(api_keys=line)).keys[0].limit == RateLimit(20, 40)
+    for rate, burst in ((0, None), (float("nan"), None), (1e9, None), (None, 4), (1, 0)):
+        with pytest.raises(UsageError, match="rate"):
+            new_key("cell-9", rate=rate, burst=burst)
