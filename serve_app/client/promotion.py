@@ -212,7 +212,8 @@ class Promotion:
             self._counts = Counts(known["total"], known["seen"])
             state.generation = known["generation"]
         if decision is not None:
-            EXIT_CODES[decision["outcome"]]
+            if decision["outcome"] not in EXIT_CODES:
+                raise ValueError(f"no outcome is called {decision['outcome']!r:.40}")
             self._say(f"goes on: it was decided ({decision['outcome']}) and not yet carried out")
             return state, Outcome(decision["outcome"], decision["why"])
         if started is None:

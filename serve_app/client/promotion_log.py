@@ -102,8 +102,9 @@ def _read(file: Path, descriptor: int) -> tuple[list[Entry], bool]:
     for number, line in enumerate(lines, start=1):
         try:
             entry = json.loads(line)
-            entry["event"], entry["time"]
-        except (ValueError, KeyError, TypeError):
+            if not isinstance(entry, dict) or not {"event", "time"} <= entry.keys():
+                raise ValueError
+        except ValueError:
             if number > 1 and line:  # half a line of a process that was killed, which the next one has ended
                 continue
             raise UsageError(f"{file}, line {number}, is none of a promotion's log: name another --log") from None

@@ -92,7 +92,7 @@ def error_answer(error: RlservoError) -> tuple[int, bytes, Headers]:
 
 def retry_after_s(error: RlservoError) -> int:
     """Return the whole seconds after which to ask again."""
-    return max(RETRY_AFTER_S, math.ceil(error.details.get("retry_after_s", 0)))
+    return max(RETRY_AFTER_S, math.ceil(float(error.details.get("retry_after_s", 0))))
 
 
 def encode_error(error: RlservoError) -> bytes:

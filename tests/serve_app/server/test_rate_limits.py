@@ -95,6 +95,21 @@ def test_a_key_gets_its_burst_over_all_of_http_and_then_429_with_a_time_to_wait(
     assert 'key="cell-8"' not in text and 'code="rate-limited"' in text
 
 
+def test_attempts_at_what_the_key_may_not_do_count_as_well(
+    policies: Path, controlled: Any, served: Serve, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", logger="rlservo")
+    with controlled(policies) as control:
+        app = create_app(lambda: control.store, ServerSettings(api_keys=LIMITED_LINE), control=control)
+        with served(app) as port:
+            load = ("POST", "/v1/admin/policies/ur5/load", {})
+            assert [ask(port, *load)[0] for _ in range(BURST + 1)] == [403] * BURST + [429]
+    entries = [record.__dict__["fields"] for record in caplog.records if record.name == "rlservo.administration"]
+    assert [(each["code"], each["key"]) for each in entries] == [
+        *[("forbidden", "cell-7")] * BURST, ("rate-limited", "cell-7"),
+    ]  # fmt: skip
+
+
 def test_our_client_raises_it_at_once_and_says_how_long(port: int) -> None:
     with PolicyClient(f"http://127.0.0.1:{port}", "ur5", api_key=LIMITED) as client:
         client.act(OBS)  # the contract is a request, too
