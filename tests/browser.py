@@ -157,12 +157,18 @@ class Browser:
             tab.call("Page.close")
 
 
-@contextlib.contextmanager
-def browsing() -> Iterator[Browser]:
-    """Start a browser that reaches nothing but this machine, and end it; skip the test where there is none."""
+def browser_program() -> str:
+    """Return where Chromium or Chrome is; skip the test where there is none."""
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
         pytest.skip("no Chromium or Chrome is installed: no page was opened")
+    return program
+
+
+@contextlib.contextmanager
+def browsing() -> Iterator[Browser]:
+    """Start a browser that reaches nothing but this machine, and end it; skip the test where there is none."""
+    program = browser_program()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         port_file, log = Path(folder, "DevToolsActivePort"), Path(folder, "log")
         with log.open("wb") as output:

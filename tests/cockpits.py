@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 from PIL import Image
 
+from browser import browser_program
 from bundles import write_bundle
 from rlservo.export.contract import bundle as bundle_files
 from rlservo.serve_app.ray_serve.processes import free_ports
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (
     "--no-sandbox",
     "--disable-background-networking",
@@ -143,9 +143,7 @@ def free_port() -> int:
 @pytest.fixture(scope="module")  # while it is there, no asyncio.run of another test's could work in this thread
 def chromium() -> Iterator[Any]:
     """The browser, or a skip with the reason."""
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        pytest.skip("no Chromium or Chrome is installed: the cockpit's page was not looked at")
+    path = browser_program()
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=path, headless=True, args=FLAGS)  # with an empty profile

@@ -1,4 +1,4 @@
-"""What the policy sees, as a table and in words, and what it does, as moving plots."""
+"""Readings of a policy: a table and words for its observation, moving plots for what it does."""
 
 from __future__ import annotations
 
