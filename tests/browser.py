@@ -74,6 +74,11 @@ class Tab:
         """Open an address."""
         self.call("Page.navigate", url=url)
 
+    def hurry(self, most_ms: int) -> None:
+        """Let no timer of what is visited from now on wait longer than that."""
+        source = f"{{ const later = setTimeout; window.setTimeout = (run, ms) => later(run, Math.min(ms, {most_ms})) }}"
+        self.call("Page.addScriptToEvaluateOnNewDocument", source=source)
+
     def evaluate(self, expression: str) -> Any:
         """Return the value of an expression of JavaScript, awaited where it is a promise."""
         done = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)

@@ -32,7 +32,11 @@ FLAGS = (
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--disable-gpu-rasterization",  # Debian's Chromium would draw the panels in the same software
 )
+# A few frames a second are enough to see what happens, and each is drawn by the processors that the test shares.
+FEW_FRAMES = """const each = requestAnimationFrame;
+window.requestAnimationFrame = draw => setTimeout(() => each(draw), 150);"""
 # The scene is the largest canvas; the others are plots.
 CORNER_OF_SCENE = """() => {
     const boxes = [...document.querySelectorAll("canvas")].map(canvas => canvas.getBoundingClientRect());
@@ -161,6 +165,7 @@ def windows(chromium: Any) -> Windows:
     def make(width: int, height: int) -> Browser:
         context = chromium.new_context(viewport={"width": width, "height": height})
         opened = Browser(context.new_page())
+        opened.page.add_init_script(FEW_FRAMES)
         opened.page.on("request", lambda request: opened.requests.append(request.url))
         opened.page.on("websocket", lambda socket: opened.requests.append(socket.url))
         return opened
@@ -176,9 +181,9 @@ class Cockpit:
     server: Any
     panel: Any
 
-    def pixel(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where a point of the world is in the scene of the first browser."""
-        camera = next(iter(self.server.get_clients().values())).camera
+    def pixel(self, point: NDArray[np.float64], browser: int = 0) -> NDArray[np.float64]:
+        """Return where a point of the world is in the scene of a browser, by when it came."""
+        camera = list(self.server.get_clients().values())[browser].camera
         ahead = camera.look_at - camera.position
         ahead = ahead / np.linalg.norm(ahead)
         right = np.cross(ahead, camera.up_direction)
