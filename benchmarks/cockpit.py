@@ -5,14 +5,15 @@
 `rlservo serve` and `rlservo cockpit --url` run as processes of their own, as users run them, and Chromium without a
 window looks at the page (`pip install playwright`; it draws with the graphics card it finds, or in software, and the
 name of that is printed). For every window and resolution (canvas pixels to a screen's; below 1 is viser's `?fixedDpr=`)
-it prints the frames that the page drew and the moments of the scene that reached it, a second each, and which process
-took how much processor time for a frame.
+it prints the frames that the page drew, those that the cockpit published (as the page says), and how much processor
+time each part took for a frame that was drawn: what of it is plots, numbers and layout goes by time, not by frame.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import re
 import shutil
 import signal
 import subprocess
@@ -35,15 +36,17 @@ from rlservo.serve_app.ray_serve.processes import free_ports
 
 SETTLE_S = 4.0  # shaders are compiled, viser has settled on a resolution
 PATIENCE_S = 120.0
-SLOWEST_MOMENT_BYTES = 4000  # the poses of one moment; plots and tables are longer
 # Draws are counted where WebGL is called: a frame in which nothing was drawn is none.
 COUNTER = """
-let drawn = false; window.frames_drawn = 0;
+let drawn = null; window.frames_drawn = 0;
 for (const name of ["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"]) {
   const draw = WebGL2RenderingContext.prototype[name];
-  WebGL2RenderingContext.prototype[name] = function (...given) { drawn = true; return draw.apply(this, given) };
+  WebGL2RenderingContext.prototype[name] = function (...given) { drawn = this; return draw.apply(this, given) };
 }
-const count = () => { window.frames_drawn += drawn; drawn = false; requestAnimationFrame(count) };
+const count = () => {
+  if (drawn) { window.frames_drawn += 1; window.canvas = `${drawn.drawingBufferWidth}x${drawn.drawingBufferHeight}` }
+  drawn = null; requestAnimationFrame(count);
+};
 requestAnimationFrame(count);
 """
 RENDERER = """() => {
@@ -94,41 +97,36 @@ def cpu_seconds(programs: dict[str, int]) -> Counter[str]:
     return spent
 
 
-def measure(page: Any, moments: list[int], seconds: float, programs: dict[str, int]) -> dict[str, Any]:
-    def state() -> tuple[float, int, int, Counter[str]]:
-        return time.perf_counter(), page.evaluate("window.frames_drawn"), moments[0], cpu_seconds(programs)
+def measure(page: Any, seconds: float, programs: dict[str, int]) -> tuple[str, ...]:
+    def state() -> tuple[float, int, Counter[str]]:
+        return time.perf_counter(), page.evaluate("window.frames_drawn"), cpu_seconds(programs)
 
     page.wait_for_timeout(1e3 * SETTLE_S)
-    began, frames_before, moments_before, cpu_before = state()
+    began, frames_before, cpu_before = state()
     page.wait_for_timeout(1e3 * seconds)
-    ended, frames, arrived, cpu = state()
-    span, drawn = ended - began, max(1, frames - frames_before)
-    sizes = page.evaluate("[...document.querySelectorAll('canvas')].map(one => [one.width, one.height])")
-    width, height = max(sizes, key=lambda size: size[0] * size[1])
-    return {
-        "canvas": f"{width}x{height}",
-        "drawn": (frames - frames_before) / span,
-        "arrived": (arrived - moments_before) / span,
-        "cpu": ", ".join(f"{part} {1e3 * (cpu[part] - cpu_before[part]) / drawn:.0f}" for part in sorted(cpu)),
-    }
+    ended, frames, cpu = state()
+    drawn = frames - frames_before
+    published = re.search(r"(\d+) frames/s", page.inner_text("body"))
+    shares = {part: 1e3 * (cpu[part] - cpu_before[part]) / max(1, drawn) for part in sorted(cpu)}
+    return (
+        page.evaluate("window.canvas"),
+        f"{drawn / (ended - began):.1f}",
+        published[1] if published else "?",
+        f"{sum(shares.values()):.0f}: " + ", ".join(f"{part} {share:.0f}" for part, share in shares.items()),
+    )
 
 
-def look(browser: Any, address: str, window: str, resolution: float, arguments: Any, pids: dict[str, int]) -> Any:
+def look(browser: Any, address: str, window: str, arguments: Any, pids: dict[str, int]) -> tuple[tuple[str, ...], str]:
+    """Open a window and measure; return a line of the table, and what draws."""
     width, height = map(int, window.split("x"))
     context = browser.new_context(viewport={"width": width, "height": height})
-    page, moments = context.new_page(), [0]
+    page = context.new_page()
     page.add_init_script(COUNTER)
-
-    def note(message: bytes | str) -> None:
-        moments[0] += len(message) < SLOWEST_MOMENT_BYTES
-
-    page.on("websocket", lambda socket: socket.on("framereceived", note))
-    page.goto(address if resolution == 1 else f"{address}/?fixedDpr={resolution:g}")
+    page.goto(address)
     page.wait_for_selector("text=frames/s", timeout=1e3 * PATIENCE_S)
-    result = measure(page, moments, arguments.seconds, pids)
-    result["graphics"] = page.evaluate(RENDERER)
+    result, graphics = measure(page, arguments.seconds, pids), str(page.evaluate(RENDERER))
     context.close()
-    return result
+    return (window, *result), graphics
 
 
 def main() -> None:
@@ -147,7 +145,7 @@ def main() -> None:
     server_port, page_port = free_ports(2)
     url = f"http://127.0.0.1:{server_port}"
     table = Table(title="Cockpit")
-    for column in ("window", "canvas", "drawn /s", "sent /s", "ms of CPU for a frame"):
+    for column in ("window", "canvas", "drawn /s", "published /s", "ms of processor time for a frame"):
         table.add_column(column)
     flags = ["--no-sandbox", "--enable-unsafe-swiftshader", *arguments.browser_argument]
     graphics = ""
@@ -162,9 +160,8 @@ def main() -> None:
             (driver,) = (each for each in psutil.Process().children() if each.pid not in (server.pid, cockpit.pid))
             pids = {"server": server.pid, "cockpit": cockpit.pid, "browser": driver.pid}
             for window, resolution in itertools.product(arguments.window, arguments.resolution):
-                found = look(browser, f"http://127.0.0.1:{page_port}", window, resolution, arguments, pids)
-                graphics = found["graphics"]
-                row = (window, found["canvas"], f"{found['drawn']:.1f}", f"{found['arrived']:.1f}", found["cpu"])
+                query = "" if resolution == 1 else f"/?fixedDpr={resolution:g}"
+                row, graphics = look(browser, f"http://127.0.0.1:{page_port}{query}", window, arguments, pids)
                 table.add_row(*row)
             browser.close()
     console = Console(width=140)

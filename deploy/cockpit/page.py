@@ -26,7 +26,7 @@ FRAME_S = 1 / 30
 NEARER = 0.62  # tan(45 / 2) / tan(75 / 2), about: MuJoCo's angle of view to viser's
 NARROW = 0.75  # of a window's width to its height, below which it is a phone's
 FARTHER, SHEET = 1.7, 0.6  # what a phone's camera makes of that: distance, and height of the middle above the window's
-PANEL_S = 0.25  # between two refreshes of numbers and plots
+PANEL_S = 0.5  # between two refreshes of numbers and plots: drawn in software, one costs as much as a frame
 # Pages that may talk to the cockpit: its own, also through a forwarded port. Programs send no Origin.
 ORIGINS = [re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?"), None]
 
