@@ -36,7 +36,8 @@ FLAGS = (
 )
 # A few frames a second are enough to see what happens, and each is drawn by the processors that the test shares.
 FEW_FRAMES = """const each = requestAnimationFrame;
-window.requestAnimationFrame = draw => setTimeout(() => each(draw), 150);"""
+window.requestAnimationFrame = draw => setTimeout(() => each(draw), 300);"""
+RESOLUTION = 0.5  # of the scene, to the screen's: viser would change it by how long frames take
 # The scene is the largest canvas; the others are plots.
 CORNER_OF_SCENE = """() => {
     const boxes = [...document.querySelectorAll("canvas")].map(canvas => canvas.getBoundingClientRect());
@@ -46,12 +47,12 @@ CORNER_OF_SCENE = """() => {
 PATIENCE_S = float(os.environ.get("RLSERVO_PATIENCE_S", 180.0))  # a browser that draws in software on a busy machine
 
 
-def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
+def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S, *, poll_s: float = 0.05) -> Any:
     """Poll until something is true, and return it."""
     deadline = time.monotonic() + timeout_s
     while not (found := condition()):
         assert time.monotonic() < deadline, f"waited {timeout_s:g} s for: {what}"
-        time.sleep(0.05)
+        time.sleep(poll_s)
     return found
 
 
@@ -62,15 +63,15 @@ class Browser:
     page: Any
     requests: list[str] = field(default_factory=list)
 
-    def open(self, address: str) -> None:
-        self.page.goto(address)
+    def open(self, address: str, resolution: float = RESOLUTION) -> None:
+        self.page.goto(f"{address}/?fixedDpr={resolution}")
         self.page.wait_for_selector("text=frames/s", timeout=1e3 * PATIENCE_S)
 
     def text(self) -> str:
         return str(self.page.evaluate("document.body.innerText"))
 
     def wait_for(self, text: str) -> None:
-        wait_for(lambda: text in self.text(), f"{text!r} in the page")
+        wait_for(lambda: text in self.text(), f"{text!r} in the page", poll_s=0.25)
 
     def drag(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> None:
         """Drag with the mouse from one pixel of the scene to another, slowly."""
@@ -191,7 +192,8 @@ class Cockpit:
         way = np.asarray(point) - camera.position
         x, y, z = way @ right, way @ np.cross(right, ahead), way @ ahead
         focal = camera.image_height / 2 / np.tan(camera.fov / 2)
-        return np.array([camera.image_width / 2 + focal * x / z, camera.image_height / 2 - focal * y / z])
+        drawn = np.array([camera.image_width / 2 + focal * x / z, camera.image_height / 2 - focal * y / z])
+        return drawn / RESOLUTION
 
 
 @contextlib.contextmanager

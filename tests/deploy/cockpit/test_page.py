@@ -156,7 +156,7 @@ def test_a_second_browser_may_watch_on_a_phone_and_go(cockpit: Cockpit, window: 
 
 def test_a_picture_for_the_readme(cockpit: Cockpit, drive: Drive, windows: Windows, tmp_path: Path) -> None:
     window = windows(1280, 720)
-    window.open(cockpit.address)
+    window.open(cockpit.address, resolution=1.0)
     window.page.get_by_role("alert").locator("button").first.click()  # that it draws in software
     drive.drag_target(np.array([-0.35, 0.45, 0.35]))
     drive.do(drive.play)
