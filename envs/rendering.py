@@ -88,6 +88,10 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return {}
 
     @abstractmethod
+    def start_at(self, position: ArrayLike) -> dict[str, Any]:
+        """Return options of `reset` that start an episode with `robot_position` at, or near, a position [m] (3,)."""
+
+    @abstractmethod
     def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
         """Put robot and target where row `row` of an episode's observations (n, size) has them: to look at, not to act.
 

@@ -74,6 +74,11 @@ class Tab:
         """Open an address."""
         self.call("Page.navigate", url=url)
 
+    def hurry(self, most_ms: int) -> None:
+        """Let no timer of what is visited from now on wait longer than that."""
+        source = f"{{ const later = setTimeout; window.setTimeout = (run, ms) => later(run, Math.min(ms, {most_ms})) }}"
+        self.call("Page.addScriptToEvaluateOnNewDocument", source=source)
+
     def evaluate(self, expression: str) -> Any:
         """Return the value of an expression of JavaScript, awaited where it is a promise."""
         done = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
@@ -157,12 +162,18 @@ class Browser:
             tab.call("Page.close")
 
 
-@contextlib.contextmanager
-def browsing() -> Iterator[Browser]:
-    """Start a browser that reaches nothing but this machine, and end it; skip the test where there is none."""
+def browser_program() -> str:
+    """Return where Chromium or Chrome is; skip the test where there is none."""
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
         pytest.skip("no Chromium or Chrome is installed: no page was opened")
+    return program
+
+
+@contextlib.contextmanager
+def browsing() -> Iterator[Browser]:
+    """Start a browser that reaches nothing but this machine, and end it; skip the test where there is none."""
+    program = browser_program()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         port_file, log = Path(folder, "DevToolsActivePort"), Path(folder, "log")
         with log.open("wb") as output:

@@ -239,8 +239,16 @@ def write_discrete_policy(root: Path, *, name: str = "gridworld", version: str =
     return write_bundle(folder, contract, np.arange(5, dtype=np.int64))
 
 
-def write_leaky_policy(root: Path, *, name: str = "leaky", version: str = "1", seed: int = 0) -> Path:
-    """A policy with a memory, of three numbers: h becomes h / 2 + obs @ w, and h in [-1, 1] is the action of two."""
+def write_leaky_policy(
+    root: Path, *, name: str = "leaky", version: str = "1", seed: int = 0, like: Contract | None = None
+) -> Path:
+    """A policy with a memory, of three numbers: h becomes h / 2 + obs @ w, and h in [-1, 1] is the action of two.
+
+    With `like` it has the spaces, and so the sizes, of that contract, and was trained where that was.
+    """
+    observed = BoxSpec(shape=(3,), dtype="float32", low=None, high=None) if like is None else like.observation_space
+    acted = BoxSpec(shape=(2,), dtype="float32", low=-1.0, high=1.0) if like is None else like.action_space
+    sees, does = observed.size, acted.size
     rng = np.random.default_rng(seed)
     folder = root / name / version
     folder.mkdir(parents=True)
@@ -250,35 +258,35 @@ def write_leaky_policy(root: Path, *, name: str = "leaky", version: str = "1", s
         helper.make_node("Add", ["left", "seen"], ["state_out.h"]),
         helper.make_node("Clip", ["state_out.h", "low", "high"], ["action"]),
     ]
-    constants = {"w": weights(rng, 3, 2), "half": np.float32([0.5]), "low": np.float32(-1), "high": np.float32(1)}
+    constants = {"w": weights(rng, sees, does), "half": np.float32([0.5]), "low": np.float32(-1), "high": np.float32(1)}
     save_graph(
         folder / bundle_files.ONNX_FILE,
         nodes,
         {key: np.asarray(value) for key, value in constants.items()},
-        [("obs", TensorProto.FLOAT, ["batch", 3]), ("state_in.h", TensorProto.FLOAT, ["batch", 2])],
-        [("action", TensorProto.FLOAT, ["batch", 2]), ("state_out.h", TensorProto.FLOAT, ["batch", 2])],
+        [("obs", TensorProto.FLOAT, ["batch", sees]), ("state_in.h", TensorProto.FLOAT, ["batch", does])],
+        [("action", TensorProto.FLOAT, ["batch", does]), ("state_out.h", TensorProto.FLOAT, ["batch", does])],
     )
     contract = Contract(
         name=name,
         version=version,
-        observation_space=BoxSpec(shape=(3,), dtype="float32", low=None, high=None),
-        action_space=BoxSpec(shape=(2,), dtype="float32", low=-1.0, high=1.0),
+        observation_space=observed,
+        action_space=acted,
         inputs=(
-            TensorSpec(name="obs", dtype="float32", shape=(-1, 3)),
-            TensorSpec(name="state_in.h", dtype="float32", shape=(-1, 2)),
+            TensorSpec(name="obs", dtype="float32", shape=(-1, sees)),
+            TensorSpec(name="state_in.h", dtype="float32", shape=(-1, does)),
         ),
         outputs=(
-            TensorSpec(name="action", dtype="float32", shape=(-1, 2)),
-            TensorSpec(name="state_out.h", dtype="float32", shape=(-1, 2)),
+            TensorSpec(name="action", dtype="float32", shape=(-1, does)),
+            TensorSpec(name="state_out.h", dtype="float32", shape=(-1, does)),
         ),
-        state=(StateSpec(name="h", dtype="float32", shape=(2,)),),
+        state=(StateSpec(name="h", dtype="float32", shape=(does,)),),
         distribution=None,
         baked_in=(BakedStep(step="network"), BakedStep(step="clip")),
         control_rate_hz=10.0,
-        provenance=PROVENANCE,
+        provenance=PROVENANCE if like is None else like.provenance,
         parity=PARITY,
     )
-    obs, state = (rng.standard_normal((8, size)).astype(np.float32) for size in (3, 2))
+    obs, state = (rng.standard_normal((8, size)).astype(np.float32) for size in (sees, does))
     return write_bundle(folder, contract, obs, state_in__h=state)
 
 

@@ -21,18 +21,23 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 from PIL import Image
 
+from browser import browser_program
 from bundles import write_bundle
 from rlservo.export.contract import bundle as bundle_files
 from rlservo.serve_app.ray_serve.processes import free_ports
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (
     "--no-sandbox",
     "--disable-background-networking",
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--disable-gpu-rasterization",  # Debian's Chromium would draw the panels in the same software
 )
+# A few frames a second are enough to see what happens, and each is drawn by the processors that the test shares.
+FEW_FRAMES = """const each = requestAnimationFrame;
+window.requestAnimationFrame = draw => setTimeout(() => each(draw), 300);"""
+RESOLUTION = 0.5  # of the scene, to the screen's: viser would change it by how long frames take
 # The scene is the largest canvas; the others are plots.
 CORNER_OF_SCENE = """() => {
     const boxes = [...document.querySelectorAll("canvas")].map(canvas => canvas.getBoundingClientRect());
@@ -42,12 +47,12 @@ CORNER_OF_SCENE = """() => {
 PATIENCE_S = float(os.environ.get("RLSERVO_PATIENCE_S", 180.0))  # a browser that draws in software on a busy machine
 
 
-def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
+def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S, *, poll_s: float = 0.05) -> Any:
     """Poll until something is true, and return it."""
     deadline = time.monotonic() + timeout_s
     while not (found := condition()):
         assert time.monotonic() < deadline, f"waited {timeout_s:g} s for: {what}"
-        time.sleep(0.05)
+        time.sleep(poll_s)
     return found
 
 
@@ -58,15 +63,15 @@ class Browser:
     page: Any
     requests: list[str] = field(default_factory=list)
 
-    def open(self, address: str) -> None:
-        self.page.goto(address)
+    def open(self, address: str, resolution: float = RESOLUTION) -> None:
+        self.page.goto(f"{address}/?fixedDpr={resolution}")
         self.page.wait_for_selector("text=frames/s", timeout=1e3 * PATIENCE_S)
 
     def text(self) -> str:
         return str(self.page.evaluate("document.body.innerText"))
 
     def wait_for(self, text: str) -> None:
-        wait_for(lambda: text in self.text(), f"{text!r} in the page")
+        wait_for(lambda: text in self.text(), f"{text!r} in the page", poll_s=0.25)
 
     def drag(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> None:
         """Drag with the mouse from one pixel of the scene to another, slowly."""
@@ -143,9 +148,7 @@ def free_port() -> int:
 @pytest.fixture(scope="module")  # while it is there, no asyncio.run of another test's could work in this thread
 def chromium() -> Iterator[Any]:
     """The browser, or a skip with the reason."""
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        pytest.skip("no Chromium or Chrome is installed: the cockpit's page was not looked at")
+    path = browser_program()
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=path, headless=True, args=FLAGS)  # with an empty profile
@@ -163,6 +166,7 @@ def windows(chromium: Any) -> Windows:
     def make(width: int, height: int) -> Browser:
         context = chromium.new_context(viewport={"width": width, "height": height})
         opened = Browser(context.new_page())
+        opened.page.add_init_script(FEW_FRAMES)
         opened.page.on("request", lambda request: opened.requests.append(request.url))
         opened.page.on("websocket", lambda socket: opened.requests.append(socket.url))
         return opened
@@ -178,9 +182,9 @@ class Cockpit:
     server: Any
     panel: Any
 
-    def pixel(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where a point of the world is in the scene of the first browser."""
-        camera = next(iter(self.server.get_clients().values())).camera
+    def pixel(self, point: NDArray[np.float64], browser: int = 0) -> NDArray[np.float64]:
+        """Return where a point of the world is in the scene of a browser, by when it came."""
+        camera = list(self.server.get_clients().values())[browser].camera
         ahead = camera.look_at - camera.position
         ahead = ahead / np.linalg.norm(ahead)
         right = np.cross(ahead, camera.up_direction)
@@ -188,7 +192,8 @@ class Cockpit:
         way = np.asarray(point) - camera.position
         x, y, z = way @ right, way @ np.cross(right, ahead), way @ ahead
         focal = camera.image_height / 2 / np.tan(camera.fov / 2)
-        return np.array([camera.image_width / 2 + focal * x / z, camera.image_height / 2 - focal * y / z])
+        drawn = np.array([camera.image_width / 2 + focal * x / z, camera.image_height / 2 - focal * y / z])
+        return drawn / RESOLUTION
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rlservo.deploy.cockpit.ghost import Ghost
 from rlservo.deploy.cockpit.policies import Choice, Link, PolicySource
-from rlservo.deploy.cockpit.stage import Disturbance, Stage, home_arguments, home_of
+from rlservo.deploy.cockpit.stage import Disturbance, Stage, Vector, home_arguments, home_of
 from rlservo.deploy.cockpit.view import Cycle, Phase, View
 from rlservo.envs.rendering import Start
 from rlservo.export.contract.contract import REWARD, Contract
@@ -73,7 +73,7 @@ class Drive:
         self._ghost: Ghost | None = None
         self._commands: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
-        self._dragged: NDArray[np.float64] | None = None  # where the target was dragged to, and has not been put yet
+        self._dragged: dict[Callable[[Vector], None], Vector] = {}  # what was dragged, and has not been put there yet
         self._thread = threading.Thread(target=self._run, name="cockpit-drive", daemon=True)
         self._phase: Phase = "driving"
         self._start: Start = "own"
@@ -143,14 +143,15 @@ class Drive:
         """Let time pass `speed` times as fast as on the wall."""
         self._speed = speed
 
-    def drag_target(self, position: NDArray[np.float64]) -> None:
+    def drag_target(self, position: Vector) -> None:
         """Put the target somewhere else, from any thread and without `do`; of many positions the last one counts."""
-        with self._lock:
-            is_asked_for, self._dragged = self._dragged is not None, position
-        if not is_asked_for:
-            self.do(self._put_target)
+        self._drag(self._put_target, position)
 
-    def move_obstacle(self, index: int, position: NDArray[np.float64]) -> None:
+    def drag_robot(self, position: Vector) -> None:
+        """Begin an episode with the robot somewhere else; like `drag_target`."""
+        self._drag(self._put_robot, position)
+
+    def move_obstacle(self, index: int, position: Vector) -> None:
         """Put an obstacle somewhere else."""
         for stage in self._stages():
             stage.env.move_obstacle(index, position)
@@ -334,9 +335,11 @@ class Drive:
 
     # -- episodes
 
-    def _begin(self, start: Start, *, keep_target: bool, seed: int | None = None) -> None:
+    def _begin(
+        self, start: Start, *, keep_target: bool, position: Vector | None = None, seed: int | None = None
+    ) -> None:
         self._next = None
-        self._obs = self._stage.begin(start=start, keep_target=keep_target, seed=seed)
+        self._obs = self._stage.begin(start=start, position=position, keep_target=keep_target, seed=seed)
         self._policy.reset()
         self._reward = 0.0
         self._after = self._stage.scene()
@@ -359,10 +362,24 @@ class Drive:
         self._due = time.perf_counter() + DWELL_S
         self._sentence = f"Episode {self._episodes}: {status}."
 
-    def _put_target(self) -> None:
+    def _drag(self, put: Callable[[Vector], None], position: Vector) -> None:
+        def put_last() -> None:
+            with self._lock:
+                last = self._dragged.pop(put)
+            put(last)
+
         with self._lock:
-            position, self._dragged = self._dragged, None
-        assert position is not None
+            is_asked_for = put in self._dragged
+            self._dragged[put] = position
+        if not is_asked_for:
+            self.do(put_last)
+
+    def _put_robot(self, position: Vector) -> None:
+        self._begin("here", position=position, keep_target=True)
+        if self._phase == "arrived":
+            self.play()
+
+    def _put_target(self, position: Vector) -> None:
         for stage in self._stages():
             stage.env.move_target(position)
         self._is_users_target = True

@@ -17,14 +17,16 @@ from typing import Any, Protocol
 import numpy as np
 import viser
 import websockets.asyncio.server
-from numpy.typing import NDArray
 
+from rlservo.deploy.cockpit.stage import Vector
 from rlservo.export.contract.errors import UsageError
 
 HOST = "127.0.0.1"
 FRAME_S = 1 / 30
 NEARER = 0.62  # tan(45 / 2) / tan(75 / 2), about: MuJoCo's angle of view to viser's
-PANEL_S = 0.2  # between two refreshes of numbers and plots
+NARROW = 0.75  # of a window's width to its height, below which it is a phone's
+FARTHER, SHEET = 1.7, 0.6  # what a phone's camera makes of that: distance, and height of the middle above the window's
+PANEL_S = 0.5  # between two refreshes of numbers and plots: drawn in software, one costs as much as a frame
 # Pages that may talk to the cockpit: its own, also through a forwarded port. Programs send no Origin.
 ORIGINS = [re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?"), None]
 
@@ -62,6 +64,9 @@ def served_page(port: int, title: str) -> Iterator[viser.ViserServer]:
         server.scene.configure_environment_map(None)
         server.scene.add_light_hemisphere("/sky", ground_color=(190, 190, 190), intensity=1.5)
         server.gui.main_panel.dock_right()
+        server.on_client_connect(
+            lambda client: _aim(client.camera, server.initial_camera.position, server.initial_camera.look_at)
+        )
         yield server
     finally:
         with _silence():
@@ -89,12 +94,23 @@ def set_value(handle: Any, value: Any) -> None:
         handle.value = value
 
 
-def aim_cameras(server: viser.ViserServer, position: NDArray[np.float64], look_at: NDArray[np.float64]) -> None:
+def aim_cameras(server: viser.ViserServer, position: Vector, look_at: Vector) -> None:
     """Let everybody who looks, and who will, stand there and look at that, as near as a browser's wider lens wants."""
     position = look_at + NEARER * (position - look_at)
     server.initial_camera.position, server.initial_camera.look_at = position, look_at
     for client in server.get_clients().values():
-        client.camera.position, client.camera.look_at = position, look_at
+        _aim(client.camera, position, look_at)
+
+
+def _aim(camera: viser.CameraHandle, position: Vector, look_at: Vector) -> None:
+    """Aim a camera; on a phone so that its target is above the sheet with the panels, which covers three fifths."""
+    if camera.image_width < NARROW * camera.image_height:
+        way = FARTHER * (look_at - position)
+        ahead = way / np.linalg.norm(way)
+        up = np.array([0.0, 0.0, 1.0]) - ahead[2] * ahead
+        down = SHEET * np.tan(camera.fov / 2) * np.linalg.norm(way) * up / np.linalg.norm(up)
+        position, look_at = look_at - way - down, look_at - down
+    camera.position, camera.look_at = position, look_at
 
 
 def _check_port(port: int) -> None:

@@ -53,6 +53,8 @@ class DrivePanel:
             begin.on_click(lambda event: drive.do(starts[str(event.target.value)]))
             speed = gui.add_slider("Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0)
             speed.on_update(lambda event: drive.do(lambda: drive.set_speed(float(event.target.value))))
+            self._push = gui.add_checkbox("Drag the robot", initial_value=False, hint="instead of its target")
+            self._push.on_update(lambda _: self._offer_start())
             self._drop = gui.add_button("Drop a cube ahead", visible=False)
             self._drop.on_click(lambda _: self._drop_obstacle())
         with gui.add_folder("Policy"):
@@ -130,8 +132,10 @@ class DrivePanel:
             self._server,
             view.stage,
             on_target=drive.drag_target,
+            on_robot=drive.drag_robot,
             on_obstacle=lambda index, at: drive.do(lambda: drive.move_obstacle(index, at)),
         )
+        self._offer_start()
         aim_cameras(self._server, *env.viewpoint())
         self._drop.visible = len(env.obstacle_positions()) > 0
         self._robot.visible = not env.IS_PLANAR
@@ -139,6 +143,10 @@ class DrivePanel:
         self._payload.visible = not env.IS_PLANAR
         set_value(self._ghost, NO_GHOST)
         self._drawn = view.stage
+
+    def _offer_start(self) -> None:
+        if self._scenery is not None:
+            self._scenery.offer_start(self._push.value)
 
     def _rebuild_readings(self, view: View) -> None:
         if self._readings is not None:

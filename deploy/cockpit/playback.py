@@ -104,7 +104,7 @@ class PlaybackPanel:
         self._stage = Stage(EMPTY_FLOOR if "Mir100" in home else home, home_arguments(contract))
         self._stage.begin()
         self._period_s = 1.0 / (contract.control_rate_hz or 10.0)
-        self._scenery = Scenery(server, self._stage, on_target=None, on_obstacle=None)
+        self._scenery = Scenery(server, self._stage)
         self._episode, self._row = 0, 0.0
         self._is_playing = True
         self._cycles = tape.cycles(0)

@@ -1,4 +1,4 @@
-"""What the policy sees, as a table and in words, and what it does, as moving plots."""
+"""Readings of a policy: a table and words for its observation, moving plots for what it does."""
 
 from __future__ import annotations
 
@@ -83,7 +83,8 @@ class Elements:
             colour = RED if outside[index] or off > VERY_FAR else AMBER if off > FAR else ""
             trained = ""
             if self.moments is not None:
-                trained = f"{self.moments[0][index]:.2g} &plusmn; {self.moments[1][index]:.2g}"
+                mean, std = float(self.moments[0][index]), float(self.moments[1][index])
+                trained = f"{mean if abs(mean) > std / 100 else 0:.2g} &plusmn; {std:.2g}"
             style = f" style='background:{colour};color:#000'" if colour else ""
             rows.append(
                 f"<tr{style} title='{deviations[index]:+.1f} standard deviations'>"
@@ -93,8 +94,8 @@ class Elements:
             )
         return (
             "<div style='overflow-x:auto;padding:0 0.5em'><table style='font-size:0.72em;line-height:1.3;width:100%;"
-            "border-spacing:3px 0'><thead><tr><th align=left>element</th><th align=right>value</th><th align=left>unit"
-            "</th><th align=left>bounds</th><th align=left>training</th></tr></thead><tbody>"
+            "border-spacing:3px 0;white-space:nowrap'><thead><tr><th align=left>element</th><th align=right>value</th>"
+            "<th align=left>unit</th><th align=left>bounds</th><th align=left>training</th></tr></thead><tbody>"
             f"{''.join(rows)}</tbody></table></div>"
         )
 
@@ -198,7 +199,7 @@ def _without_common_end(names: Sequence[str]) -> list[str]:
 def _bounds(low: float, high: float) -> str:
     if not (np.isfinite(low) or np.isfinite(high)):
         return ""
-    return f"{low:.3g} .. {high:.3g}"
+    return f"&plusmn;{high:.3g}" if low == -high else f"{low:.3g} .. {high:.3g}"
 
 
 def escape(text: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,19 +13,21 @@ import viser
 import viser.transforms
 from numpy.typing import NDArray
 
-from rlservo.deploy.cockpit.stage import Scene, Stage
+from rlservo.deploy.cockpit.stage import Scene, Stage, Vector
 from rlservo.envs.shapes import Poses, Shape, body_poses, moving_bodies, visible_shapes
 
 SHOWN_BEAMS = 128  # of a thousand
 PATH_LENGTH = 400  # control cycles
 BEAM_COLOUR, PATH_COLOUR, GHOST_COLOUR = (220, 60, 50), (40, 120, 220), (60, 130, 240)
 GHOST_OPACITY = 0.35
-TARGET_LIFT, OBSTACLE_LIFT = 0.1, 0.55  # [m], of handles that move on the floor: above what they move
+TARGET_LIFT, ROBOT_LIFT, OBSTACLE_LIFT = 0.1, 0.45, 0.55  # [m], of handles on the floor: above what they move
+CELL_M, FLOOR_PIXELS = 0.5, 2048
+FLOOR_COLOUR, LINE_COLOUR = (225, 229, 233), (190, 194, 198)
 HELD_S = 1.0  # after the last movement
 HANDLE_SIZE, PLANAR_HANDLE_SIZE = 0.3, 1.0  # [m]
 
-Move = Callable[[NDArray[np.float64]], None]
-MoveOne = Callable[[int, NDArray[np.float64]], None]
+Move = Callable[[Vector], None]
+MoveOne = Callable[[int, Vector], None]
 
 
 class Scenery:
@@ -35,71 +38,72 @@ class Scenery:
         server: viser.ViserServer,
         stage: Stage,
         *,
-        on_target: Move | None,
-        on_obstacle: MoveOne | None,
+        on_target: Move | None = None,
+        on_robot: Move | None = None,
+        on_obstacle: MoveOne | None = None,
     ) -> None:
-        """Draw a stage; `on_target` and `on_obstacle` (index, position) are called while somebody drags a handle."""
+        """Draw a stage; `on_...` (of obstacles with an index) are called with a position while a handle is dragged."""
         self._server = server
-        env, model = stage.env, stage.env.model
+        env = stage.env
         self._robot = _Bodies(server, "/robot", stage, ghost=False)
         self._ghost = _Bodies(server, "/ghost", stage, ghost=True)
-        self._lift = np.array([0.0, 0.0, TARGET_LIFT if env.IS_PLANAR else 0.0])
-        self._obstacle_lift = np.array([0.0, 0.0, OBSTACLE_LIFT])
         self._beams = server.scene.add_line_segments("/beams", _no_lines(), BEAM_COLOUR, thickness=0.004)
         self._path = server.scene.add_line_segments("/path", _no_lines(), PATH_COLOUR, thickness=0.008)
-        self._points: list[NDArray[np.float64]] = []
-        self._drawn_beams: NDArray[np.float64] | None = None
-        self._handles: list[_Handle] = []
-        size = PLANAR_HANDLE_SIZE if env.IS_PLANAR else HANDLE_SIZE
-        self._target: _Handle | None = None
+        self._points: list[Vector] = []
+        self._drawn_beams: Vector | None = None
+        self._target, self._start = None, None
         if on_target is not None and env.target_position() is not None:
-            self._target = _Handle(server, "/target", size, env.IS_PLANAR, lambda at: on_target(at - self._lift))
-        for index in range(len(env.obstacle_positions()) if on_obstacle is not None else 0):
-            self._handles.append(
-                _Handle(
-                    server,
-                    f"/obstacle_{index}",
-                    size,
-                    env.IS_PLANAR,
-                    lambda at, index=index: on_obstacle(index, at - self._obstacle_lift),  # type: ignore[misc]
-                )
-            )
-        extent = float(model.stat.extent)
-        self._floor = server.scene.add_grid(
+            self._target = _Handle(server, "/target", TARGET_LIFT, env.IS_PLANAR, on_target)
+        if on_robot is not None:
+            self._start = _Handle(server, "/start", ROBOT_LIFT, env.IS_PLANAR, on_robot)
+        self._obstacles = [
+            _Handle(server, f"/obstacle_{index}", OBSTACLE_LIFT, env.IS_PLANAR, partial(on_obstacle, index))
+            for index in range(len(env.obstacle_positions()) if on_obstacle is not None else 0)
+        ]
+        self.offer_start(False)
+        cells = 4 * int(4 * float(env.model.stat.extent) / (4 * CELL_M))  # whole metres to both sides
+        self._floor = server.scene.add_image(
             "/floor",
-            width=4 * extent,
-            height=4 * extent,
-            cell_size=0.5,
-            section_size=1.0,
-            plane_color=(225, 229, 233),
-            plane_opacity=1.0,
+            _floor_picture(cells),
+            cells * CELL_M,
+            cells * CELL_M,
+            format="png",
+            cast_shadow=False,
+            receive_shadow=False,
         )
+
+    def offer_start(self, offered: bool) -> None:
+        """Show the robot's handle or the target's: where the robot has arrived, both would be in one place."""
+        if self._start is not None:
+            self._start.show(offered)
+        if self._target is not None:
+            self._target.show(not offered)
 
     def draw(self, before: Scene, after: Scene, share: float, ghost: tuple[Scene, Scene] | None) -> None:
         """Draw the moment a share of the way from one control cycle to the next."""
+        robot = before.robot + share * (after.robot - before.robot)
         with self._server.atomic():
             self._robot.place(before.poses.towards(after.poses, share))
             self._ghost.show(ghost is not None)
             if ghost is not None:
                 self._ghost.place(ghost[0].poses.towards(ghost[1].poses, share))
+            if self._start is not None:
+                self._start.follow(robot)
             if self._target is not None and after.target is not None:
-                self._target.follow(after.target + self._lift)
-            for handle, position in zip(self._handles, after.obstacles, strict=False):
-                handle.follow(position + self._obstacle_lift)
+                self._target.follow(after.target)
+            for handle, position in zip(self._obstacles, after.obstacles, strict=False):
+                handle.follow(position)
             self._draw_beams((before if share < 0.5 else after).beams)
-            self._draw_path(before.robot + share * (after.robot - before.robot))
+            self._draw_path(robot)
 
     def remove(self) -> None:
         """Take everything away again."""
-        self._robot.remove()
-        self._ghost.remove()
-        for handle in (self._target, *self._handles):
-            if handle is not None:
-                handle.remove()
-        for node in (self._beams, self._path, self._floor):
-            node.remove()
+        parts = (self._robot, self._ghost, self._target, self._start, *self._obstacles)
+        for part in (*parts, self._beams, self._path, self._floor):
+            if part is not None:
+                part.remove()
 
-    def _draw_beams(self, beams: NDArray[np.float64]) -> None:
+    def _draw_beams(self, beams: Vector) -> None:
         if self._drawn_beams is beams:
             return
         self._drawn_beams = beams
@@ -108,7 +112,7 @@ class Scenery:
         if len(shown):
             self._beams.points = shown.astype(np.float32)
 
-    def _draw_path(self, position: NDArray[np.float64]) -> None:
+    def _draw_path(self, position: Vector) -> None:
         last = self._points[-1] if self._points else None
         moved = None if last is None else float(np.linalg.norm(position - last))
         if moved is not None and moved < 0.01:
@@ -170,23 +174,33 @@ class _Bodies:
 class _Handle:
     """Something to drag with the mouse or a finger; it stays under the finger that holds it."""
 
-    def __init__(self, server: viser.ViserServer, name: str, size: float, is_planar: bool, on_move: Move) -> None:
+    def __init__(self, server: viser.ViserServer, name: str, lift: float, is_planar: bool, on_move: Move) -> None:
         self._control = server.scene.add_transform_controls(
-            name, scale=size, active_axes=(True, True, not is_planar), disable_rotations=True, depth_test=False
+            name,
+            scale=PLANAR_HANDLE_SIZE if is_planar else HANDLE_SIZE,
+            active_axes=(True, True, not is_planar),
+            disable_rotations=True,
+            depth_test=False,
         )
+        self._lift = np.array([0.0, 0.0, lift if is_planar else 0.0])
         self._held_until = 0.0  # a browser that goes away while it drags never lets go
         self._control.on_update(lambda event: self._moved(event, on_move))
 
-    def follow(self, position: NDArray[np.float64]) -> None:
-        if time.monotonic() > self._held_until and not np.allclose(self._control.position, position, atol=1e-6):
-            self._control.position = position
+    def show(self, visible: bool) -> None:
+        self._control.visible = visible
+
+    def follow(self, position: Vector) -> None:
+        at = position + self._lift
+        is_elsewhere = self._control.visible and not np.allclose(self._control.position, at, atol=1e-6)
+        if is_elsewhere and time.monotonic() > self._held_until:
+            self._control.position = at
 
     def remove(self) -> None:
         self._control.remove()
 
     def _moved(self, event: viser.TransformControlsEvent, on_move: Move) -> None:
         self._held_until = 0.0 if event.phase == "end" else time.monotonic() + HELD_S
-        on_move(np.array(event.target.position, np.float64))
+        on_move(np.array(event.target.position, np.float64) - self._lift)
 
 
 def _by_body(shapes: list[Shape]) -> dict[int, list[Shape]]:
@@ -222,6 +236,15 @@ def _mesh(shape: Shape) -> Any:
     if shape.kind not in ("sphere", "capsule"):
         mesh.unmerge_vertices()  # edges are drawn as edges
     return mesh
+
+
+def _floor_picture(cells: int) -> NDArray[np.uint8]:
+    """Return a picture of a grid: without a graphics card, a shader that computes one costs a third of a frame."""
+    pixels = max(8, FLOOR_PIXELS // cells)
+    picture = np.full((cells * pixels, cells * pixels, 3), FLOOR_COLOUR, np.uint8)
+    for axis in (picture, picture.swapaxes(0, 1)):
+        axis[::pixels] = LINE_COLOUR
+    return picture
 
 
 def _no_lines() -> NDArray[np.float32]:

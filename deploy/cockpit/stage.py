@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -75,13 +76,25 @@ class Stage:
             payload=(disturbance.payload, disturbance.payload),
         )
 
-    def begin(self, *, start: Start = "own", keep_target: bool = False, seed: int | None = None) -> Any:
-        """Begin an episode and return its first observation. One that cannot start so starts as the task has it."""
+    def begin(
+        self,
+        *,
+        start: Start = "own",
+        position: Vector | None = None,
+        keep_target: bool = False,
+        seed: int | None = None,
+    ) -> Any:
+        """Begin an episode, with the robot at `position` where that is given, and return its first observation.
+
+        One that cannot start there starts as `start` says, and one that cannot start so as the task has it.
+        """
         options = self.env.reset_options(start=start, keep_target=keep_target)
-        try:
-            return self._disturbed.reset(seed=seed, options=options)[0]
-        except InvalidResetError:
-            return self._disturbed.reset(options=self.env.reset_options(keep_target=keep_target))[0]
+        own = self.env.reset_options(keep_target=keep_target)
+        pushed = {} if position is None else self.env.start_at(position)
+        for tried in ({**options, **pushed}, options):
+            with contextlib.suppress(InvalidResetError):
+                return self._disturbed.reset(seed=seed, options=tried)[0]
+        return self._disturbed.reset(options=own)[0]
 
     def begin_like(self, other: Stage) -> Any:
         """Begin an episode where another robot of the same kind stands, with the same target."""

@@ -1,4 +1,4 @@
-"""What a drive shows: everything of one moment, and the control cycles that led there."""
+"""The view of a drive: everything of one moment, and the control cycles that led there."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ class WatchPanel:
         self._stage.begin()
         scene = self._shown(state)
         self._scenes = scene, scene, time.perf_counter()
-        self._scenery = Scenery(self._server, self._stage, on_target=None, on_obstacle=None)
+        self._scenery = Scenery(self._server, self._stage)
         aim_cameras(self._server, *self._stage.env.viewpoint())
 
     def _shown(self, state: RobotState) -> Scene:

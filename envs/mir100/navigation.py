@@ -189,6 +189,11 @@ class Mir100Navigation(RenderedEnv):
         options: dict[str, Any] = {"target_pose": self.simulation.target} if keep_target else {}
         return {**options, "start_pose": self.simulation.pose} if start == "here" else options
 
+    def start_at(self, position: ArrayLike) -> dict[str, Any]:
+        """Return the options of an episode that starts there on the map [m] (3,), turned as the robot is."""
+        x, y, _ = as_vector("position", position, 3).tolist()
+        return {"start_pose": (x, y, self.simulation.pose[2])}
+
     def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
         """Put the robot where an episode's observations have it: round the target, which stands at the origin.
 

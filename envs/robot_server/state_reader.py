@@ -13,7 +13,7 @@ from rlservo.envs.rendering import RenderedEnv
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, Empty, State
 from rlservo.envs.robot_server.mir100_robot import CUBES, ROBOT, STATE_LENGTH, TARGET
 from rlservo.envs.robot_server.robot import RobotState
-from rlservo.envs.ur.arm_env import LIMITS, URArmEnv
+from rlservo.envs.ur.arm_env import BASE, LIMITS, URArmEnv
 from rlservo.envs.ur.parameters import JOINTS
 
 SCAN = slice(8, 8 + BEAM_COUNT)
@@ -69,8 +69,8 @@ def show_state(env: RenderedEnv, state: RobotState) -> None:
     if isinstance(env, URArmEnv) and f"{JOINTS[0]}_joint_position" in state.names:
         joints = np.array([state.names[f"{joint}_joint_position"] for joint in JOINTS])
         env.simulation.place(np.clip(joints, -LIMITS, LIMITS))
-        if env.simulation.object_count and OBJECT[0] in state.names:
-            env.simulation.place_object(0, [state.names[name] for name in OBJECT])
+        if env.target_position() is not None and OBJECT[0] in state.names:
+            env.move_target(BASE + [state.names[name] for name in OBJECT])
     elif isinstance(env, Mir100Navigation) and len(state.values) == STATE_LENGTH:
         values = np.array(state.values)
         cubes = values[CUBES].reshape(-1, 3) if len(env.simulation.cubes) else None

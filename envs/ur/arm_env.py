@@ -157,6 +157,11 @@ class URArmEnv(RenderedEnv):
         """Return tool0's position in MuJoCo's world [m] (3,)."""
         return self.simulation.tool_position + BASE
 
+    def start_at(self, position: ArrayLike) -> dict[str, Any]:
+        """Return the options of an episode that starts with tool0 there, or as near as the arm gets from here."""
+        joints = self.simulation.joints_towards(as_vector("position", position, 3) - BASE)
+        return {"joint_positions": np.clip(joints, -LIMITS, LIMITS).tolist()}
+
     # -- what a task adds
 
     @classmethod

@@ -26,6 +26,11 @@ UPDATE_SUBSTEPS = round(1.0 / (UPDATE_RATE_HZ * TIMESTEP))  # of physics, betwee
 # Of a camera.
 VIEW: dict[str, Any] = {"lookat": (0.0, 0.05, 0.42), "distance": 2.3, "azimuth": 145.0, "elevation": -18.0}
 
+# Of `joints_towards`.
+REACH_STEPS = 60
+REACH_STEP = 0.05  # [m], of tool0 at once
+REACH_DAMPING = 0.05  # [m], which keeps the joints calm where the arm is stretched
+
 MAX_PAYLOAD = 20.0  # [kg], more than the largest arm carries (ur16e: 16 kg)
 
 Vector = NDArray[np.float64]
@@ -193,6 +198,24 @@ class URSimulation:
         position: Vector = self._tool_xpos.copy()
         position[2] -= BASE_HEIGHT
         return position
+
+    def joints_towards(self, position: ArrayLike) -> Vector:
+        """Return joint positions [rad] (6,) that bring tool0 to a position in base_link [m] (3,), or near it.
+
+        Damped least squares from where the arm is, so that it keeps its posture; nothing moves.
+        """
+        goal = np.asarray(position, dtype=np.float64) + (0.0, 0.0, BASE_HEIGHT)
+        trial, jacobian = mujoco.MjData(self.model), np.zeros((3, self.model.nv))
+        trial.qpos[:] = self.data.qpos
+        for _ in range(REACH_STEPS):
+            mujoco.mj_kinematics(self.model, trial)
+            mujoco.mj_comPos(self.model, trial)
+            way = goal - trial.site_xpos[self._tool]
+            mujoco.mj_jacSite(self.model, trial, jacobian, None, self._tool)
+            way *= min(1.0, REACH_STEP / max(float(np.linalg.norm(way)), 1e-9))
+            damped = jacobian @ jacobian.T + REACH_DAMPING**2 * np.eye(3)
+            trial.qpos += jacobian.T @ np.linalg.solve(damped, way)
+        return np.array(trial.qpos)
 
     @property
     def tool_rotation(self) -> Vector:

@@ -97,6 +97,25 @@ def test_an_episode_goes_on_where_the_robot_is(name: str) -> None:
     assert not np.allclose(env.target_position(), target)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("name", IDS)
+def test_an_episode_starts_with_the_robot_where_it_is_put(name: str) -> None:
+    env = make(name)
+    env.reset(seed=3)
+    there = np.array([0.5, 2.5, 0.0]) if env.IS_PLANAR else np.array([0.35, 0.25, 0.6])
+    before = env.data.qpos.copy()
+    options = env.start_at(there)
+    assert np.array_equal(env.data.qpos, before)  # nothing has moved yet
+    env.reset(options=options)
+    assert np.allclose(env.robot_position(), there, atol=2e-3)
+
+
+def test_an_arm_that_cannot_reach_points_there() -> None:
+    env = make("EndEffectorPositioningURSim-v0")
+    env.reset(options=env.start_at(np.array([3.0, 0.0, 0.5])))
+    x, y, z = env.robot_position()
+    assert x > 0.6 and abs(y) < 0.3 and 0.1 < z < 1.0
+
+
 def test_a_random_start_differs_from_the_arms_own() -> None:
     env = make("EndEffectorPositioningURSim-v0")
     env.reset(seed=1)

@@ -16,14 +16,19 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from bundles import SHIPPED
+from cockpits import cockpit_of, wait_for
 from rlservo.envs.robot_server.manager import RobotServers, ServerManager
 from rlservo.envs.robot_server.server import RobotServer
 from rlservo.envs.robot_server.settings import URSettings
+from rlservo.envs.ur.model import BASE_HEIGHT
 from rlservo.serve_app.ray_serve.processes import free_ports
 from servers import HEEDING_CTRL_C, ShippedServer
 
@@ -312,6 +317,47 @@ def test_policy_that_ships_needs_the_frame_of_the_documents_commands(
     # 95 % and 5 % arrive: less than 7 of 12, or more than 4 of 8, comes once in some sixty thousand times.
     assert successes["base_link"] >= 7
     assert successes["base"] <= 4
+
+
+def test_the_cockpit_shows_the_robot_that_robo_gyms_environment_drives(
+    robo_gym_python: Path, light_client: Path, url: str
+) -> None:
+    """And robo-gym's environment goes through its episodes as if nobody looked."""
+    pytest.importorskip("viser", reason="the cockpit draws with viser")
+    from rlservo.deploy.cockpit.watch import WatchPanel
+
+    robot = RobotServer(
+        URSettings(
+            rs_mode="1object", reference_frame="base_link", action_cycle_rate=10.0, max_velocity_scale_factor=0.1
+        )
+    )
+    try:
+        with (
+            cockpit_of(lambda page: WatchPanel(page, f"127.0.0.1:{robot.port}", {})) as cockpit,
+            ThreadPoolExecutor(1) as beside,
+        ):
+            line = ("--url", url, "--rs-address", f"127.0.0.1:{robot.port}", "--episodes", "3", "--json")
+            driving = beside.submit(run, robo_gym_python, light_client, *line)
+            seen = [cockpit.panel.scene]
+            while not driving.done():
+                if cockpit.panel.scene is not seen[-1]:
+                    seen.append(cockpit.panel.scene)
+                time.sleep(0.02)
+            done = driving.result()
+            assert done.returncode == 0, done.stderr
+            assert json.loads(done.stdout)["episodes"] == 3
+            assert cockpit.panel.trouble == ""
+            simulation: Any = robot.robot.simulation
+            table = (0.0, 0.0, BASE_HEIGHT)
+            wait_for(
+                lambda: np.allclose(cockpit.panel.scene.robot, simulation.tool_position + table, atol=1e-4),
+                "the arm is shown where it is",
+            )
+            last = cockpit.panel.scene
+            assert np.abs(last.robot - seen[0].robot).max() > 0.02
+            assert np.abs(last.target - seen[0].target).max() > 1e-3  # robo-gym's, not the cockpit's own
+    finally:
+        robot.stop()
 
 
 def test_example_environment_is_refused_with_the_reason_in_the_managers_log(

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bundles import write_leaky_policy
 from cockpits import served_on, wait_for
 from rlservo.deploy.cockpit.drive import Drive
-from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, Link, ServedPolicies
-from rlservo.deploy.cockpit.stage import Disturbance
+from rlservo.deploy.cockpit.ghost import Ghost
+from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, Link, PolicySource, ServedPolicies
+from rlservo.deploy.cockpit.stage import Disturbance, Scene, Stage
+from rlservo.export.contract.bundle import read_contract
 from rlservo.export.contract.errors import UnavailableError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
+from servers import over_uvicorn
 from stores import load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
+ENV = "rlservo/EndEffectorPositioningURSim-v0"
 FAST = 4.0
 REACHABLE = np.array([0.35, 0.25, 0.6])  # [m], in MuJoCo's world
 
@@ -140,6 +146,76 @@ def test_disturbances_begin_with_an_episode_where_the_robot_stands(drives: Calla
     wait_for(lambda: drive.history[-1].number > cycles + 3, "it drives")
     seen = np.array([cycle.obs[18:21] for cycle in list(drive.history)[-3:]])
     assert np.abs(seen[-1] + (0, 0, 0.1) - drive.view.after.robot).max() > 1e-4  # noisy, and not where it is
+
+
+def in_the_table(_scene: Scene) -> Any:
+    return (0.0, 0.1, 0.0)
+
+
+def first_cube(scene: Scene) -> Any:
+    return scene.obstacles[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "there", "blocked"),
+    [("ur5", REACHABLE, in_the_table), ("mir100_obstacle_avoidance", (1.0, 3.0, 0.0), first_cube)],
+    ids=["ur5", "mir100"],
+)
+def test_the_robot_is_dragged_and_drives_on_from_there(
+    drives: Callable[..., Drive], name: str, there: Any, blocked: Callable[[Scene], Any]
+) -> None:
+    """And from where it was, when it cannot stand where it was dragged to."""
+    drive = drives(name)
+    drive.do(drive.pause)
+    wait_for(lambda: drive.view.phase == "paused", "it stands")
+    target = drive.view.after.target
+    for _ in range(3):  # of many positions the last one counts
+        drive.drag_robot(np.asarray(there) + (0.0, 0.1, 0.0))
+        drive.drag_robot(np.asarray(there))
+    wait_for(lambda: np.allclose(drive.view.after.robot, there, atol=5e-3), "the robot is where it was dragged to")
+    drive.drag_robot(np.asarray(blocked(drive.view.after)))
+    drive.do(lambda: drive.set_speed(1.0))
+    wait_for(lambda: drive.view.period_s > 0.09, "both were done")
+    assert np.allclose(drive.view.after.robot, there, atol=5e-3) and np.allclose(drive.view.after.target, target)
+    drive.do(drive.play)
+    wait_for(lambda: np.linalg.norm(drive.view.after.robot - there) > 0.05, "it drives on from there")
+
+
+@pytest.mark.parametrize("served", [False, True])
+def test_a_ghost_with_a_memory_has_one_of_its_own(two_versions: Path, tmp_path: Path, served: bool) -> None:
+    """The same recurrent version beside itself does the same, from the first step of an episode to the next one's."""
+    write_leaky_policy(tmp_path, name="ur5", like=read_contract(two_versions / "ur5" / "1"))
+    with ExitStack() as cleanup:
+        source: PolicySource = BundledPolicies(tmp_path)
+        if served:
+            store = load_store(tmp_path)
+            port = cleanup.enter_context(over_uvicorn(create_app(lambda: store, ServerSettings())))
+            source = ServedPolicies(f"http://127.0.0.1:{port}")
+        cleanup.callback(source.close)
+        policy, choice = source.open(Choice("ur5", "1"), Link()), Choice("ur5", "1")
+        cleanup.callback(policy.close)
+        stage = Stage(ENV, {}, policy.contract)
+        cleanup.callback(stage.close)
+        ghost = Ghost(source.open(choice, Link()), stage)
+        cleanup.callback(ghost.close)
+        seen = []
+        for _ in range(2):
+            obs = stage.begin(seed=5)
+            policy.reset()
+            ghost.begin(stage)
+            actions = []
+            for _ in range(4):
+                action = policy.act(obs)
+                difference = ghost.step(obs, action)
+                assert np.abs(difference).max() < 1e-6
+                obs = stage.step(action)[0]
+                actions.append(action)
+            assert np.allclose(ghost.scenes[1].robot, stage.scene().robot, atol=1e-6)
+            seen.append(actions)
+        assert np.array_equal(seen[0], seen[1])  # an episode begins without a memory
+        fresh = source.open(choice, Link())
+        cleanup.callback(fresh.close)
+        assert np.abs(fresh.act(obs) - policy.act(obs)).max() > 1e-3  # there is one
 
 
 def test_a_server_that_goes_away_is_waited_for_and_driven_on_with(two_versions: Path, free_port: int) -> None:

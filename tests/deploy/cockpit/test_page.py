@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -22,7 +22,7 @@ from cockpits import Browser, Cockpit, Windows, cockpit_of, served_on, wait_for
 from rlservo.deploy.cockpit.drive import Drive
 from rlservo.deploy.cockpit.panel import DrivePanel
 from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
-from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, ServedPolicies
+from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, PolicySource, ServedPolicies
 from rlservo.deploy.cockpit.scenery import OBSTACLE_LIFT, TARGET_LIFT
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.rollout.control_loop import rollout
@@ -63,10 +63,24 @@ def cockpit(drive: Drive, two_versions: Path) -> Iterator[Cockpit]:
 @pytest.fixture(scope="module")
 def window(cockpit: Cockpit, windows: Windows) -> Iterator[Browser]:
     """One window for all tests of the drive."""
-    opened = windows(1100, 620)
+    opened = windows(1000, 560)
     opened.open(cockpit.address)
     yield opened
     opened.close()
+
+
+@contextmanager
+def driven(windows: Windows, source: PolicySource, choice: Choice, seed: int) -> Iterator[tuple[Drive, Any, Browser]]:
+    """A drive of its own, its cockpit and a window on that."""
+    with ExitStack() as cleanup:
+        drive = Drive(source, choice, seed=seed)
+        cleanup.callback(drive.close)
+        drive.start()
+        cockpit = cleanup.enter_context(cockpit_of(lambda server: DrivePanel(server, drive, source)))
+        window = windows(1000, 560)
+        cleanup.callback(window.close)
+        window.open(cockpit.address)
+        yield drive, cockpit, window
 
 
 def test_the_handle_is_dragged_and_the_robot_reaches_the_new_target(
@@ -96,7 +110,7 @@ def test_the_plots_move_and_the_table_tells_what_the_policy_sees(drive: Drive, w
     window.click("Observation", role="tab")
     window.wait_for("shoulder_velocity")
     text = window.text()
-    assert "rad/s" in text and "-1.1 .. 1.1" in text and "±" in text
+    assert "rad/s" in text and "±1.1" in text and " ± " in text
     window.click("Plots", role="tab")
 
 
@@ -117,11 +131,23 @@ def test_the_ghost_appears_and_the_difference_is_plotted(drive: Drive, window: B
     window.click("Play")
 
 
+def phone_shows(pixel: Any) -> bool:
+    """Return whether that is on a phone's screen and above the sheet."""
+    x, y = pixel
+    return bool(0 < x < 390 and 0 < y < 0.4 * 844)
+
+
 def test_a_second_browser_may_watch_on_a_phone_and_go(cockpit: Cockpit, window: Browser, windows: Windows) -> None:
     phone = windows(390, 844)
     phone.open(cockpit.address)
     assert phone.page.evaluate("document.documentElement.scrollWidth") <= 390
     assert len(cockpit.server.get_clients()) == 2
+    # The sheet with the panels covers three fifths of the screen: what the camera looks at is above it.
+    sheet = phone.page.get_by_text("frames/s").first.bounding_box()
+    assert sheet is not None and sheet["y"] > 0.4 * 844
+    for height in (0.0, 0.9):  # of the arm
+        at = np.array([0.0, 0.0, height])
+        wait_for(lambda at=at: phone_shows(cockpit.pixel(at, 1)), "the arm is seen")
     phone.close()
     wait_for(lambda: len(cockpit.server.get_clients()) == 1, "the phone is gone")
     first = window.text()
@@ -130,7 +156,7 @@ def test_a_second_browser_may_watch_on_a_phone_and_go(cockpit: Cockpit, window: 
 
 def test_a_picture_for_the_readme(cockpit: Cockpit, drive: Drive, windows: Windows, tmp_path: Path) -> None:
     window = windows(1280, 720)
-    window.open(cockpit.address)
+    window.open(cockpit.address, resolution=1.0)
     window.page.get_by_role("alert").locator("button").first.click()  # that it draws in software
     drive.drag_target(np.array([-0.35, 0.45, 0.35]))
     drive.do(drive.play)
@@ -180,13 +206,8 @@ def test_a_server_that_goes_away_is_said_and_comes_back(app: Any, windows: Windo
     with ExitStack() as cleanup:
         cleanup.callback(source.close)
         with served_on(app, free_port):
-            drive = Drive(source, Choice("ur5", "production"), seed=5)
-            cleanup.callback(drive.close)
-            drive.start()
-            cockpit = cleanup.enter_context(cockpit_of(lambda server: DrivePanel(server, drive, source)))
-            window = windows(700, 500)
-            cleanup.callback(window.close)
-            window.open(cockpit.address)
+            opened = driven(windows, source, Choice("ur5", "production"), seed=5)
+            drive, _, window = cleanup.enter_context(opened)
         window.wait_for("waiting for the policy, the robot stands")
         with served_on(app, free_port):
             wait_for(lambda: "waiting for the policy" not in window.text(), "it is back")
@@ -195,15 +216,8 @@ def test_a_server_that_goes_away_is_said_and_comes_back(app: Any, windows: Windo
 
 
 def test_target_and_cubes_of_a_mir100_are_dragged_and_dropped(two_versions: Path, windows: Windows) -> None:
-    source = BundledPolicies(two_versions)
-    with ExitStack() as cleanup:
-        drive = Drive(source, Choice("mir100_obstacle_avoidance", "1"), seed=3)
-        cleanup.callback(drive.close)
-        drive.start()
-        cockpit = cleanup.enter_context(cockpit_of(lambda server: DrivePanel(server, drive, source)))
-        window = windows(1200, 700)
-        cleanup.callback(window.close)
-        window.open(cockpit.address)
+    choice = Choice("mir100_obstacle_avoidance", "1")
+    with driven(windows, BundledPolicies(two_versions), choice, seed=3) as (drive, cockpit, window):
         window.click("Pause")
         window.wait_for("paused")
         left = np.array([0.0, 1.0, 0.0])
@@ -231,7 +245,7 @@ def test_a_recording_scrubs_and_jumps_to_the_worst_moment(two_versions: Path, wi
     tape = Tape(file, bundle=two_versions / "ur5" / "2")
     assert len(tape.episodes) == 2 and tape.moments
     with cockpit_of(lambda server: PlaybackPanel(server, tape, env_id=None)) as cockpit:
-        window = windows(1100, 620)
+        window = windows(1000, 560)
         window.open(cockpit.address)
         window.click("Pause")
         window.fill("Decision", "7")
