@@ -25,7 +25,7 @@ def publish(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Publish a bundle as a version that never changes, for `rlservo serve URI`.
+    """Publish a bundle for `rlservo serve URI`. A published version never changes.
 
     The bundle is proven first. Its files are written before its manifest, without which nobody sees the version; one
     that is there is never overwritten. Credentials come from the environment (AWS_..., as the provider's tools).
