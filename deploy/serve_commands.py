@@ -22,7 +22,10 @@ TransportKind = Literal["http", "ws"]
 
 def serve(
     directories: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Bundles, policy folders or repositories.")
+        list[str],
+        typer.Argument(
+            metavar="DIR|URI...", help="Bundles, policy folders, repositories; s3://... as `rlservo publish` writes it."
+        ),
     ],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
@@ -39,6 +42,10 @@ def serve(
     ] = None,
     record: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Record every decision into this folder (`rlservo log`).")
+    ] = None,
+    poll: Annotated[
+        float | None,
+        typer.Option(min=1, metavar="SECONDS", help="Look for new versions this often; they are loaded, not in use."),
     ] = None,
     config: policy_commands.ConfigOption = None,
     versions: policy_commands.VersionsOption = None,
@@ -82,7 +89,11 @@ def serve(
         replicas=replicas,
         settings={
             name: value
-            for name, value in (("default_policy", default_policy), ("record", record and str(record)))
+            for name, value in (
+                ("default_policy", default_policy),
+                ("record", record and str(record)),
+                ("poll_s", poll),
+            )
             if value is not None
         },
         served=policy_commands.served_config(config, versions, alias, canary, shadow),

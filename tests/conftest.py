@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-pytest_plugins = ["checkpoints", "bundles", "clusters", "cockpits", "environments", "servers", "trainings"]
+pytest_plugins = [
+    "checkpoints", "bundles", "clusters", "cockpits", "environments", "servers", "storages", "trainings",
+]
 
 # Tests that share what is costly to make, by the beginning of their id. All others share their file's own.
 TOGETHER = {

@@ -9,8 +9,6 @@ serve` comes here through `cluster_process.py`. A replica imports neither torch 
 
 import asyncio
 import logging
-from functools import partial
-from pathlib import Path
 from typing import Any, cast
 
 import ray
@@ -32,11 +30,10 @@ from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.server.start_check import version_loader
+from rlservo.serve_app.versions.object_storage import place_of
 from rlservo.serve_app.versions.plan import ServedConfig
-from rlservo.serve_app.versions.policy_store import load_policy
 from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
-from rlservo.serve_app.versions.repository import Repository
-from rlservo.serve_app.versions.version_loader import VersionLoader
 from rlservo.serve_app.wire.loopback import is_loopback
 
 logger = logging.getLogger(__name__)
@@ -54,7 +51,8 @@ class BuildArguments(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     policies: list[str] = Field(min_length=1)
-    """Bundle folders, policy folders or repositories; on the command line separated by commas."""
+    """Bundle folders, policy folders, repositories, or URIs of published ones; on the command line separated by
+    commas."""
 
     replicas: int = Field(1, ge=1)
     """Processes that serve the same policies; each loads all of them."""
@@ -81,12 +79,12 @@ def build(args: BuildArguments) -> Application:
     settings = ServerSettings.from_environment(args.settings)
     ServedConfig.parse(args.served)
     # A folder may exist only on the nodes that run replicas, so it is the replica that looks.
-    folders = [str(Path(folder).expanduser().absolute()) for folder in args.policies]
+    places = [place_of(place) for place in args.policies]
     server: Deployment = cast("Deployment", PolicyServer)  # the decorator's type says it is still the class
     options = server.options(
         num_replicas=args.replicas, max_ongoing_requests=_serve_limit(settings), user_config=args.served
     )
-    return options.bind(folders, settings.model_dump())
+    return options.bind(places, settings.model_dump())
 
 
 def _serve_limit(settings: ServerSettings) -> int:
@@ -113,7 +111,7 @@ def _serve_limit(settings: ServerSettings) -> int:
 class PolicyServer(InferenceService):
     """A replica: the policies, the HTTP application and the gRPC methods over them."""
 
-    def __init__(self, folders: list[str], settings: dict[str, Any]) -> None:
+    def __init__(self, places: list[str], settings: dict[str, Any]) -> None:
         """Check the settings. Serve calls `reconfigure` next, and sends requests only after that."""
         self._settings = ServerSettings(**settings)
         context = serve.get_replica_context()
@@ -121,24 +119,13 @@ class PolicyServer(InferenceService):
         self._id = context.replica_id.deployment_id
         self._core: Core | None = None
         self._watch: asyncio.Task[None] | None = None
+        self._poll: asyncio.Task[None] | None = None
         self._load = Load()
         try:
             configure(self._settings, replica=self._replica)
             self._host = _listening_host()
             check_exposure(self._host, self._settings)
-            limits = self._settings.bundle_limits
-            load = partial(
-                load_policy,
-                threads=self._settings.threads,
-                options=self._settings.policy_options,
-                limits=limits,
-            )
-            loader = VersionLoader(
-                Repository(folders, limits),
-                load,
-                scan_timeout_s=self._settings.scan_timeout_s,
-                load_timeout_s=self._settings.load_timeout_s,
-            )
+            loader = version_loader(places, self._settings)
         except RlservoError as error:
             raise _plain(error) from None
         self._control = ReplicaVersions(
@@ -178,6 +165,8 @@ class PolicyServer(InferenceService):
             except RlservoError as error:
                 raise _plain(error) from None
             self._watch = asyncio.create_task(self._control.poll_ledger())
+            if self._settings.poll_s is not None:
+                self._poll = asyncio.create_task(self._control.poll_repository(self._settings.poll_s))
         else:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
 

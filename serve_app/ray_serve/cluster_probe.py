@@ -75,7 +75,8 @@ def check(plan: dict[str, Any], wait: Callable[[str], None]) -> Iterator[Result]
     serve, problem = _serve(context.dashboard_url)
     wait(f"a task on each node ({addresses})")
     applications = [each for each in serve.get("applications", {}).values() if _is_ours(each)]
-    folders = plan["policies"] or [folder for each in applications for folder in _folders(each)]
+    places = plan["policies"] or [place for each in applications for place in _places(each)]
+    folders = [place for place in places if "://" not in place]  # a replica fetches the others
     settings = proxy_settings(applications)
     reports = _inspect_nodes(nodes, [*plan["variables"], *plan["any_value"], *settings], folders)
     yield from check_nodes(reports, plan, settings, folders)
@@ -255,7 +256,7 @@ def _arguments(application: dict[str, Any]) -> dict[str, Any]:
     return arguments
 
 
-def _folders(application: dict[str, Any]) -> list[str]:
+def _places(application: dict[str, Any]) -> list[str]:
     policies = _arguments(application).get("policies", [])
     return policies.split(",") if isinstance(policies, str) else [str(policy) for policy in policies]
 

@@ -34,6 +34,7 @@ from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
 from rlservo.serve_app.server.start_check import load_served
+from rlservo.serve_app.versions.object_storage import place_of
 from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.wire.loopback import is_loopback
 
@@ -73,7 +74,7 @@ def serve_policies(
     on_ready: Callable[[RunningServer], None] | None = None,
     stop: threading.Event | None = None,
 ) -> None:
-    """Serve the policies at or below `dirs` until Ctrl-C, SIGTERM or `stop`; return when everything is shut down.
+    """Serve the policies at or below `dirs`, folders or URIs, until Ctrl-C, SIGTERM or `stop`; return when all is down.
 
     `served` is a `ServedConfig`: versions, aliases, canary, shadow. With an `admin_key_file`, and no admin key in the
     settings, a key for administration is written there, readable for this user alone, and removed in the end.
@@ -87,7 +88,7 @@ def serve_policies(
     if replicas < 1:
         raise UsageError(f"replicas must be 1 or more, got {replicas}")
     chosen = ServerSettings.from_environment(settings)
-    paths = [str(Path(path).expanduser().absolute()) for path in dirs]
+    paths = [place_of(path) for path in dirs]
     _check_ray()
     with contextlib.closing(load_served(paths, ServedConfig.parse(served), chosen)) as store:
         policies = tuple((name, store.default(name)) for name in store.names)

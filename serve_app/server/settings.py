@@ -139,6 +139,21 @@ class ServerSettings(BaseModel):
     """[s] Loading and proving one version that takes longer is given up. Below 45, within which every replica has to
     follow a change."""
 
+    cache: str | None = None
+    """Folder of this machine into which versions of remote repositories (`rlservo serve s3://...`) are fetched;
+    replicas share it. `$XDG_CACHE_HOME/rlservo/bundles`, else the same below `~/.cache`, when left out."""
+
+    cache_bytes: int = Field(10 << 30, ge=1 << 20)
+    """The cache's size at most: what was used longest ago is removed for what is new, what is in use never."""
+
+    storage_timeout_s: float = Field(15.0, gt=0, allow_inf_nan=False)
+    """[s] A call to a remote repository (a list, a manifest, a block of a file) that takes longer is given up. Below
+    `load_timeout_s`."""
+
+    poll_s: float | None = Field(None, ge=1, allow_inf_nan=False)
+    """[s] Look through the places of policies this often, and load versions that are newer than those known, as
+    `rlservo policy load` does: ready, not in use. Off by default. `rlservo serve --poll` sets it, too."""
+
     docs: bool = True
     """Serve web pages, from files that come with the server: what runs at `/`, the API's documentation at /docs."""
 
@@ -155,7 +170,7 @@ class ServerSettings(BaseModel):
             max_contract_bytes=self.max_contract_bytes,
         )
 
-    @field_validator("api_keys_file", "audit_file", "log_file", "record")
+    @field_validator("api_keys_file", "audit_file", "log_file", "record", "cache")
     @classmethod
     def _absolute(cls, value: str | None) -> str | None:
         """A replica's working directory is not the caller's."""

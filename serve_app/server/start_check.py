@@ -22,18 +22,29 @@ def load_served(
 ) -> PolicyStore:
     """Load and prove what a server of these folders would start with.
 
-    Raises UsageError or BundleError, and UnavailableError where the file system hangs.
+    Raises UsageError or BundleError, and UnavailableError where a file system or storage does not answer.
     """
-    settings = settings or ServerSettings.from_environment(environment={})
+    loader = version_loader(paths, settings or ServerSettings.from_environment(environment={}))
+    return asyncio.run(_load_all(loader, config))
+
+
+def version_loader(places: Iterable[str | Path], settings: ServerSettings) -> VersionLoader:
+    """Return what loads the versions of these folders and URIs as the settings say. Raises UsageError."""
     limits = settings.bundle_limits
     load = partial(load_policy, threads=settings.threads, options=settings.policy_options, limits=limits)
-    loader = VersionLoader(
-        Repository(paths, limits),
+    repository = Repository(
+        places,
+        limits,
+        cache=settings.cache,
+        cache_bytes=settings.cache_bytes,
+        storage_timeout_s=settings.storage_timeout_s,
+    )
+    return VersionLoader(
+        repository,
         load,
         scan_timeout_s=settings.scan_timeout_s,
         load_timeout_s=settings.load_timeout_s,
     )
-    return asyncio.run(_load_all(loader, config))
 
 
 async def _load_all(loader: VersionLoader, config: ServedConfig) -> PolicyStore:

@@ -14,6 +14,7 @@ import logging
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NoReturn
 
 from rlservo.export.contract.contract import version_key
@@ -104,6 +105,7 @@ class ReplicaVersions:
         self._proposed: list[set[Loadable]] = []  # what changes that are under way have loaded, and no plan has yet
         self._failed: dict[Key, str] = {}  # why this replica serves something older than the plan says
         self._tried_at = 0.0
+        self._config = ServedConfig()  # the last one that could be parsed: what may be loaded without being asked for
         self._writing = asyncio.Lock()  # held while a change that has been proven is written down
 
     async def configure(self, document: Any) -> None:
@@ -113,6 +115,8 @@ class ReplicaVersions:
         written down as refused, and what ran before goes on.
         """
         digest = config_hash(document)
+        with contextlib.suppress(UsageError):
+            self._config = ServedConfig.parse(document)
         for _ in range(ATTEMPTS):
             before = await self._ledger.newest()
             if before is not None and (before.config == digest or await self._is_late(document)):
@@ -127,7 +131,7 @@ class ReplicaVersions:
     async def load(self, name: str, version: str | None, *, what: str) -> Plan:
         """Find a version in the repository (None: the newest), and add it as `change` does.
 
-        Raises what `Repository.find` and `change` raise, and UnavailableError where the repository does not answer.
+        Raises what `Repository.find_digest` and `change` raise.
         """
         try:
             found, digest = await self._loader.find_digest(name, version)
@@ -221,6 +225,54 @@ class ReplicaVersions:
                     await self.follow(again=late)
             except Exception as error:  # the ledger may be out of reach for a while; what is served goes on
                 logger.warning("the ledger of policies could not be followed: %s", error)
+
+    async def poll_repository(self, period_s: float) -> None:
+        """Load what is newer than all versions that the plan knows of a policy, as `load` does, until cancelled.
+
+        What the configuration leaves out is left out here, too. Each version is tried once, unless it could not be
+        reached: what an operator unloads stays unloaded.
+        """
+        tried: set[Loadable] = set()
+        told: set[str] = set()
+        while True:
+            await asyncio.sleep(period_s)
+            try:
+                digests, errors = await self._loader.look()
+                wrong = {error.message for error in errors}
+                for name, version in self._newer(digests):
+                    digest = digests[name, version]
+                    if (name, version, digest) in tried:
+                        continue
+                    try:
+                        add = partial(plan_changes.load, name=name, version=version, digest=digest)
+                        await self.change(add, what=f"poll {name} {version}")
+                    except UnavailableError as error:
+                        wrong.add(error.message)
+                        if not isinstance(error, PartlyAppliedError):
+                            continue
+                    except RlservoError as error:
+                        wrong.add(error.message)
+                    tried.add((name, version, digest))
+            except Exception as error:
+                wrong = {str(error)}
+            for sentence in sorted(wrong - told):
+                logger.warning("looking for new versions, what is served goes on: %s", sentence)
+            told = wrong
+
+    def _newer(self, digests: Mapping[Key, str]) -> list[Key]:
+        """Return the versions that a policy's known ones are all older than; of an unknown policy only the newest."""
+        policies = {} if self.plan is None else self.plan.policies
+        newer: list[Key] = []
+        for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1]))):
+            listed, known = self._config.policies.get(name), policies.get(name)
+            if self._config.unlisted == "ignore" if listed is None else listed.versions is not None:
+                continue
+            if known is None and newer and newer[-1][0] == name:
+                newer.pop()
+            before = () if known is None else (*known.versions, *known.unloaded)
+            if all(version_key(version) > version_key(each) for each in before):
+                newer.append((name, version))
+        return newer
 
     def states(self) -> dict[str, dict[str, VersionState]]:
         """Return how every version stands that is served, should be, or was refused."""

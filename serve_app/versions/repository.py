@@ -1,109 +1,215 @@
-"""Bundles on disk: find them by name and version, tell them apart by their hashes.
+"""Bundles by name and version, in folders and behind URIs; their hashes tell them apart.
 
-A name or version that a request brings is only ever compared with what the folders hold; no path is made of it.
-Everything here blocks (hashing, onnxruntime, golden vectors), and may do so for ever where a file system hangs:
-`version_loader.py` calls it through `BlockingCalls`.
+A name or version that a request brings is only ever compared with what the places hold; no path is made of it.
+Everything here blocks (hashing, onnxruntime, golden vectors, networks), and may do so for ever where a file system
+hangs: `version_loader.py` calls it through `BlockingCalls`.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, digest_of, find_bundles, read_contract
 from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import (
     BundleError,
+    BundleTamperedError,
     RlservoError,
+    UnavailableError,
     UnknownPolicyError,
     UnknownVersionError,
     UsageError,
 )
+from rlservo.serve_app.versions.bundle_cache import BundleCache, Lease, default_folder
+from rlservo.serve_app.versions.object_storage import ObjectStorage, is_uri, place_of
 from rlservo.serve_app.versions.plan import ServedConfig
+from rlservo.serve_app.versions.remote_repository import RemoteRepository
+
+logger = logging.getLogger(__name__)
 
 Key = tuple[str, str]  # (name, version)
+CACHE_BYTES = 10 << 30
+STORAGE_TIMEOUT_S = 15.0
+
+
+@dataclass(frozen=True)
+class _Found:
+    """One bundle: its hash, and for a message where it is."""
+
+    digest: str
+    place: str
+
+
+@dataclass
+class _Listing:
+    """What one look through all places saw."""
+
+    found: dict[Key, _Found] = field(default_factory=dict)
+    errors: dict[Key, RlservoError] = field(default_factory=dict)  # of what cannot be served
+    away: dict[RemoteRepository, UnavailableError] = field(default_factory=dict)
+    twice: set[Key] = field(default_factory=set)
+
+    def add(self, key: Key, digest: str, place: str) -> None:
+        """Add a bundle. A copy of one that is there is the same; another one makes neither of them usable."""
+        there = self.found.setdefault(key, _Found(digest, place))
+        if there.digest != digest:
+            self.twice.add(key)
+            self.errors[key] = UsageError(
+                f"policy '{key[0]}' version {key[1]} is in both {there.place} and {place}: "
+                "serve one of them, or export one under another name or version"
+            )
 
 
 class Repository:
-    """The folders of bundles that a server was given."""
+    """The folders and URIs of bundles that a server was given."""
 
-    def __init__(self, paths: Iterable[str | Path], limits: BundleLimits = DEFAULT_LIMITS) -> None:
-        self._paths = [Path(path) for path in paths]
-        self._limits = limits
-        if not self._paths:
+    def __init__(
+        self,
+        places: Iterable[str | Path],
+        limits: BundleLimits = DEFAULT_LIMITS,
+        *,
+        cache: str | Path | None = None,
+        cache_bytes: int = CACHE_BYTES,
+        storage_timeout_s: float = STORAGE_TIMEOUT_S,
+    ) -> None:
+        """`cache` is the folder that bundles behind URIs are fetched into. Raises UsageError."""
+        given = [place_of(place) for place in places]
+        if not given:
             raise UsageError("no policy to serve: give at least one bundle folder")
-
-    def scan(self) -> tuple[dict[Key, Path], dict[Path, RlservoError]]:
-        """Return the bundles by name and version, and what cannot be served, by folder.
-
-        Two bundles of the same policy in the same version are among the latter: nobody could say which one is meant.
-        A copy of a bundle is the bundle.
-        """
-        found: dict[Key, Path] = {}
-        errors: dict[Path, RlservoError] = {}
-        folders: dict[Path, Path] = {}  # resolved -> as given: the same folder given twice counts once
-        for path in self._paths:
-            try:
-                folders.update({folder.resolve(): folder for folder in find_bundles(path)})
-            except BundleError as error:
-                errors[path] = error
-        twice: set[Key] = set()
-        for folder in folders.values():
-            try:
-                contract = read_contract(folder, self._limits)
-                key = (contract.name, contract.version)
-                copied = key in found and digest_of(folder) == digest_of(found[key])
-            except BundleError as error:
-                errors[folder] = error
-                continue
-            if key in found and not copied:
-                twice.add(key)
-                errors[folder] = UsageError(
-                    f"policy '{key[0]}' version {key[1]} is in both {found[key]} and {folder}: "
-                    "serve one of them, or export one under another name or version"
-                )
-            elif not copied:
-                found[key] = folder
-        return {key: folder for key, folder in found.items() if key not in twice}, errors
+        self._paths = [Path(place) for place in given if not is_uri(place)]
+        self._limits = limits
+        bundles = BundleCache(Path(cache) if cache is not None else default_folder(), cache_bytes)
+        storages = [ObjectStorage(place, timeout_s=storage_timeout_s) for place in given if is_uri(place)]
+        self._remote = [RemoteRepository(storage, bundles, limits) for storage in storages]
+        self.patience_s = 3 * storage_timeout_s * len(storages)
+        """[s] by which a look through storages, each call with its time-out, may take longer than one on disk."""
 
     def available(self, config: ServedConfig) -> dict[str, dict[str, str]]:
-        """Return every bundle's hash by name and version.
+        """Return every bundle's hash by name and version; of a storage that is away what the cache has of it.
 
-        Where the configuration means all that is there, all of it has to be good: raises BundleError or UsageError.
+        Where the configuration means all that is there, all of it has to be good: raises BundleError or UsageError, and
+        UnavailableError where a storage is away and the cache does not have what the configuration names.
         """
-        found, errors = self.scan()
+        listing = self._look()
+        for remote, error in listing.away.items():
+            for key, digest in remote.remembered(error).items():
+                listing.add(key, digest, f"{remote.uri}/{key[0]}/{key[1]}")
         if config.wants_all:
-            raise_all(list(errors.values()))
+            raise_all(list(listing.errors.values()))
         hashes: dict[str, dict[str, str]] = {}
-        for (name, version), folder in sorted(found.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
-            hashes.setdefault(name, {})[version] = digest_of(folder)
+        found = {key: each for key, each in listing.found.items() if key not in listing.twice}
+        for (name, version), each in sorted(found.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
+            hashes.setdefault(name, {})[version] = each.digest
+        for error in listing.away.values():
+            for name, policy in config.policies.items():
+                if any(version not in hashes.get(name, {}) for version in policy.versions or ()):
+                    raise error
         return hashes
 
-    def find(self, name: str, version: str | None) -> tuple[str, Path]:
-        """Return (version, folder) of a bundle; None is the newest one.
+    def look(self) -> tuple[dict[Key, str], list[RlservoError]]:
+        """Return the hash of every bundle that can be served now, and a sentence for each thing that is wrong."""
+        listing = self._look()
+        digests = {key: each.digest for key, each in listing.found.items() if key not in listing.twice}
+        return digests, [*listing.errors.values(), *listing.away.values()]
 
-        Raises UnknownPolicyError or UnknownVersionError, or what is wrong with the folder of that name and version.
+    def find_digest(self, name: str, version: str | None) -> tuple[str, str]:
+        """Return (version, hash) of a bundle; None is the newest one.
+
+        Raises UnknownPolicyError or UnknownVersionError, what is wrong with the bundle of that name and version, and
+        UnavailableError where a storage that does not answer may have it.
         """
-        found, errors = self.scan()
-        versions = sorted((v for n, v in found if n == name), key=version_key)
+        listing = self._look()
+        versions = sorted((v for n, v in listing.found if n == name and (n, v) not in listing.twice), key=version_key)
+        if listing.away and (version is None or version not in versions):
+            raise next(iter(listing.away.values()))
         wanted = version if version is not None else (versions[-1] if versions else None)
-        if wanted is not None and (name, wanted) in found:
-            return wanted, found[name, wanted]
-        # A folder of that name and version that cannot be served says more than that there is none.
-        for folder, error in errors.items():
-            if folder.parent.name == name and version in (folder.name, None):
+        if wanted is not None and wanted in versions:
+            return wanted, listing.found[name, wanted].digest
+        # A bundle of that name and version that cannot be served says more than that there is none.
+        for key, error in listing.errors.items():
+            if key[0] == name and version in (key[1], None):
                 raise error
+        if not listing.found:
+            raise_all(list(listing.errors.values()))
         if not versions:
-            known = ", ".join(sorted({n for n, _ in found})) or "none"
+            known = ", ".join(sorted({n for n, _ in listing.found})) or "none"
             raise UnknownPolicyError(f"the repository has no policy '{name[:64]}': it has {known}")
         raise UnknownVersionError(
             f"the repository has no version '{str(version)[:32]}' of policy '{name}': it has {', '.join(versions)}"
         )
 
-    def find_digest(self, name: str, version: str | None) -> tuple[str, str]:
-        """Return (version, hash) of a bundle, as `find`."""
-        found, folder = self.find(name, version)
-        return found, digest_of(folder)
+    def fetch(self, name: str, version: str, digest: str) -> Lease:
+        """Return the folder of an accepted bundle, which stays until the lease is released.
+
+        Raises BundleTamperedError where the bundle of that name and version has another hash by now, and what is wrong
+        with it where it cannot be served.
+        """
+        errors: list[RlservoError] = []
+        if self._paths:
+            listing = _Listing()
+            folders = self._look_in_folders(listing)
+            folder = folders.get((name, version, digest))
+            if folder is not None:
+                return Lease(folder)
+            there = listing.found.get((name, version))
+            if there is not None:
+                errors.append(
+                    BundleTamperedError(
+                        f"{there.place} is not the bundle that was accepted as version {version} of '{name}' (its "
+                        "hashes are others): export changes under a new version, or load this one again"
+                    )
+                )
+            errors += [error for key, error in listing.errors.items() if key == (name, version)]
+        for remote in self._remote:
+            try:
+                return remote.fetch(name, version, digest)
+            except RlservoError as error:
+                errors.append(error)
+        raise (
+            errors[0]
+            if errors
+            else UnknownVersionError(f"the repository has no version '{version[:32]}' of policy '{name}' any more")
+        )
+
+    def _look(self) -> _Listing:
+        """Look through all places."""
+        listing = _Listing()
+        self._look_in_folders(listing)
+        for remote in self._remote:
+            try:
+                digests, errors = remote.versions()
+            except UnavailableError as error:
+                listing.away[remote] = error
+            except BundleError as error:
+                listing.errors["", remote.uri] = error
+            else:
+                listing.errors.update(errors)
+                for key, digest in digests.items():
+                    listing.add(key, digest, f"{remote.uri}/{key[0]}/{key[1]}")
+        return listing
+
+    def _look_in_folders(self, listing: _Listing) -> dict[tuple[str, str, str], Path]:
+        """Add what the folders hold; return them by name, version and hash."""
+        by_digest: dict[tuple[str, str, str], Path] = {}
+        folders: dict[Path, Path] = {}  # resolved -> as given: the same folder given twice counts once
+        for path in self._paths:
+            try:
+                folders.update({folder.resolve(): folder for folder in find_bundles(path)})
+            except BundleError as error:
+                listing.errors["", str(path)] = error
+        for folder in folders.values():
+            try:
+                contract = read_contract(folder, self._limits)
+                key, digest = (contract.name, contract.version), digest_of(folder)
+            except BundleError as error:
+                listing.errors[folder.parent.name, folder.name] = error
+                continue
+            by_digest.setdefault((*key, digest), folder)
+            listing.add(key, digest, str(folder))
+        return by_digest
 
 
 def raise_all(errors: Sequence[RlservoError]) -> None:

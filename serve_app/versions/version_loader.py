@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import weakref
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rlservo.export.contract.bundle import digest_of
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import (
     BundleError,
@@ -65,15 +65,18 @@ class VersionLoader:
         """Return every bundle's hash by name and version, as `Repository.available`. Raises UnavailableError, too."""
         return await self._look(self._repository.available, config)
 
+    async def look(self) -> tuple[dict[Key, str], list[RlservoError]]:
+        """Return what the repository holds now and what is wrong with it, as `Repository.look`."""
+        return await self._look(self._repository.look)
+
     async def find_digest(self, name: str, version: str | None) -> tuple[str, str]:
-        """Return (version, hash) of a bundle, as `Repository.find_digest`. Raises UnavailableError, too."""
+        """Return (version, hash) of a bundle, as `Repository.find_digest`."""
         return await self._look(self._repository.find_digest, name, version)
 
     async def load(self, name: str, version: str, digest: str, *, again: bool = True) -> Policy:
         """Load and prove a version unless it is in memory; not `again`: one that timed out is not waited for once more.
 
-        Raises what `Repository.find` and `Policy.load` raise, BundleTamperedError when the folder holds another bundle
-        than the one that was accepted, and UnavailableError when it takes too long.
+        Raises what `Repository.fetch` and `Policy.load` raise, and UnavailableError when it takes too long.
         """
         key = (name, version, digest)
         if key in self._loaded:
@@ -126,7 +129,8 @@ class VersionLoader:
 
     async def _look(self, function: Callable[..., Result], *arguments: Any) -> Result:
         what = "looking through the policies' folders"
-        return await self._calls.run(function, *arguments, timeout_s=self._scan_timeout_s, what=what)
+        timeout_s = self._scan_timeout_s + self._repository.patience_s
+        return await self._calls.run(function, *arguments, timeout_s=timeout_s, what=what)
 
     async def _load(self, key: Loadable) -> Policy:
         what = f"loading policy '{key[0]}' version {key[1]}"
@@ -140,21 +144,24 @@ class VersionLoader:
 
     def _load_accepted(self, name: str, version: str, digest: str) -> Policy:
         """Load the bundle that was accepted, in a thread; it is in memory also where nobody waits for it any more."""
-        _, folder = self._repository.find(name, version)
-        if digest_of(folder) == digest:
-            try:
-                policy = self._load_bundle(folder)
-            except MemoryError:
-                raise BundleError(f"{folder} needs more memory than there is") from None
+        lease = self._repository.fetch(name, version, digest)
+        try:
+            policy = self._load_bundle(lease.folder)
             contract = policy.contract
             # It was not exchanged meanwhile, neither now nor when its name was read and its hash accepted.
-            if (contract.name, contract.version, policy.digest) == (name, version, digest):
-                self._loaded[name, version, digest] = policy
-                return policy
-        raise BundleTamperedError(
-            f"{folder} is not the bundle that was accepted as version {version} of '{name}' (its hashes are others): "
-            "export changes under a new version, or load this one again"
-        )
+            if (contract.name, contract.version, policy.digest) != (name, version, digest):
+                raise BundleTamperedError(
+                    f"{lease.folder} is not the bundle that was accepted as version {version} of '{name}': export "
+                    "changes under a new version, or load this one again"
+                )
+        except BaseException as error:
+            lease.release()
+            if isinstance(error, MemoryError):
+                raise BundleError(f"{lease.folder} needs more memory than there is") from None
+            raise
+        weakref.finalize(policy, lease.release)  # it stays in the cache for as long as somebody uses the policy
+        self._loaded[name, version, digest] = policy
+        return policy
 
     def _end(self, key: Loadable, done: asyncio.Task[Policy]) -> None:
         del self._tasks[key]

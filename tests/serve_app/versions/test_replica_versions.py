@@ -319,7 +319,7 @@ def test_names_and_versions_do_not_leave_the_repository(folder: Path, tmp_path: 
     repository = Repository([folder])
     for name, version in (("../secret", "1"), ("ur5", "../../secret/1"), ("..", None), ("", None), ("ur5/1", None)):
         with pytest.raises(Exception, match="the repository has no"):
-            repository.find(name, version)
+            repository.find_digest(name, version)
 
 
 def test_nothing_changes_before_the_policies_are_loaded(folder: Path) -> None:

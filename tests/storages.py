@@ -1,0 +1,156 @@
+"""Object storages: moto's S3, and a proxy before it that lies."""
+
+from __future__ import annotations
+
+import http.client
+import http.server
+import itertools
+import os
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+SECRET = "moto-secret-key-that-must-not-be-shown"
+Lie = Callable[[str, int, dict[str, str], bytes], tuple[int, dict[str, str], bytes] | None]
+"""From a path and what the storage replied to what is sent; None: the connection is closed without a word."""
+
+_buckets = itertools.count(1)
+
+
+@dataclass
+class Storage:
+    """One bucket, reached through a proxy whose `lie` a test may set."""
+
+    uri: str
+    endpoint: str
+    environment: dict[str, str]
+    proxy: _Proxy
+    requests: list[str] = field(default_factory=list)
+
+    def tell(self, lie: Lie | None) -> None:
+        self.proxy.lie = lie
+
+    def go_away(self) -> None:
+        """From now on every connection is closed at once."""
+        self.proxy.lie = lambda *_: None
+
+    def gets(self, end: str) -> int:
+        """How often an object whose name ends so was read."""
+        return sum(line.startswith("GET ") and line.endswith(end) for line in self.proxy.requests)
+
+    def change(self, method: str, name: str, content: bytes = b"") -> None:
+        """Write or delete an object behind everybody's back."""
+        path = self.uri.removeprefix("s3:/") + "/" + name
+        assert _ask(self.proxy.upstream, method, path, {}, content)[0] < 300
+
+
+class _Proxy(http.server.ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    lie: Lie | None = None
+
+    def __init__(self, upstream: int) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.upstream = upstream
+        self.requests: list[str] = []
+        self.stopped = threading.Event()
+
+    def handle_error(self, *_: Any) -> None:
+        """A client that gave up is what is tested."""
+
+
+class _Handler(http.server.BaseHTTPRequestHandler):
+    server: _Proxy
+    protocol_version = "HTTP/1.1"
+
+    def _pass_on(self) -> None:
+        content = self.rfile.read(int(self.headers.get("content-length") or 0))
+        self.server.requests.append(f"{self.command} {self.path.partition('?')[0]}")
+        lie = self.server.lie
+        status, headers, body = _ask(self.server.upstream, self.command, self.path, dict(self.headers), content)
+        answer = (status, headers, body) if lie is None else lie(self.path, status, headers, body)
+        if answer is None:
+            self.close_connection = True
+            return
+        status, headers, body = answer
+        self.send_response(status)
+        for name, value in headers.items():
+            if name.lower() not in ("content-length", "connection", "transfer-encoding", "date", "server"):
+                self.send_header(name, value)
+        self.send_header("content-length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    do_GET = do_PUT = do_HEAD = do_POST = do_DELETE = _pass_on
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+def _ask(
+    port: int, method: str, path: str, headers: dict[str, str], content: bytes
+) -> tuple[int, dict[str, str], bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    try:
+        connection.request(method, path, content, {k: v for k, v in headers.items() if k.lower() != "accept-encoding"})
+        reply = connection.getresponse()
+        return reply.status, dict(reply.headers), reply.read()
+    finally:
+        connection.close()
+
+
+@pytest.fixture(scope="session")
+def moto() -> Iterator[int]:
+    """The port of an S3."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from moto.server import ThreadedMotoServer
+
+        server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+        server.start()
+    yield server.get_host_and_port()[1]
+    server.stop()
+
+
+@pytest.fixture
+def storage(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Storage]:
+    """A bucket of its own, and the environment to reach it through a proxy."""
+    proxy = _Proxy(moto)
+    thread = threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
+    thread.start()
+    bucket = f"policies-{os.getpid()}-{next(_buckets)}"
+    assert _ask(moto, "PUT", f"/{bucket}", {}, b"")[0] == 200
+    environment = {
+        "AWS_ACCESS_KEY_ID": "moto",
+        "AWS_SECRET_ACCESS_KEY": SECRET,
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{proxy.server_address[1]}",
+        "AWS_EC2_METADATA_DISABLED": "true",
+    }
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    yield Storage(f"s3://{bucket}/policies", environment["AWS_ENDPOINT_URL"], environment, proxy)
+    proxy.stopped.set()
+    proxy.shutdown()
+    proxy.server_close()
+    thread.join()
+
+
+def only(end: str, lie: Lie) -> Lie:
+    """A lie about objects whose name ends so, and the truth about all others."""
+    return lambda path, *reply: lie(path, *reply) if path.partition("?")[0].endswith(end) else reply
+
+
+def late(seconds: float) -> Lie:
+    """Every reply comes so late."""
+
+    def wait(_path: str, *reply: Any) -> tuple[int, dict[str, str], bytes]:
+        time.sleep(seconds)
+        return reply  # type: ignore[return-value]
+
+    return wait
