@@ -220,7 +220,7 @@ class RequestPath:
         except RlservoError as error:
             self.record_failure(request, error.code, error.message)
             if self.recorder is not None:
-                self.recorder.record_failure(request, self._store_provider(), error)
+                self.recorder.note_failure(request, self._store_provider(), error)
             raise
         except Exception as error:
             self.record_bug(request)
@@ -228,7 +228,7 @@ class RequestPath:
         taken = time.perf_counter() - request.received
         self.metrics.record_answer(request.protocol, decision, taken)
         if self.recorder is not None:
-            self.recorder.record_answer(request, decision, taken)
+            self.recorder.note_answer(request, decision, taken)
         if self.log.every:
             self.log.write_answer(request, decision, taken)
         return reply

@@ -29,8 +29,8 @@ from rlservo.serve_app.versions.micro_batching import Batcher
 from rlservo.serve_app.versions.plan import PolicyPlan
 
 
-class EpisodeMark(NamedTuple):
-    """Which episode of a recording a state that the client carries is of, and which step comes next, from 0."""
+class EpisodeStep(NamedTuple):
+    """A step of an episode in a recording, from 0."""
 
     episode: str
     step: int
@@ -43,7 +43,7 @@ class EpisodeNote:
     state: Mapping[str, Any] | None = None  # for the client to carry, as `carried_state.py` has it
     session_id: str | int | None = None
     step: int | None = None  # how many actions this session or stream has given since its episode began
-    recorded: EpisodeMark | None = None  # whose step it was, where the client carries the state and it is recorded
+    recorded_step: EpisodeStep | None = None  # which it was, where the client carries the state and it is recorded
 
 
 @dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
@@ -62,7 +62,7 @@ class Decision:
     notices: tuple[str, ...] = ()  # what was out of bounds or limited, and used all the same
     episode: EpisodeNote | None = None
     sharers: int = 1  # requests whose observations were computed in the same run of the network
-    is_repeated: bool = False  # the answer to a session's last request once more
+    is_repeat: bool = False  # the answer to a session's last request once more
 
 
 @dataclass(frozen=True, slots=True)

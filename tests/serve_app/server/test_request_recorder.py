@@ -313,11 +313,30 @@ def test_records_keep_no_large_request_alive(start: Callable[..., Server], monke
     server.act("ur5", {"obs": [0] * 27}, **{"x-session-id": long, "x-request-id": long})
     state = server.act("lstm_box", {"obs": [0, 0, 0], "state": {}}, **{"x-session-id": long})[1]["state"]
     server.act("lstm_box", {"obs": [0, 0, 0], "state": state}, **{"x-session-id": long})
+    server.recorder.close()
     assert len(kept) == 4
     for record in kept:
         assert all(array.base is None for array in record.obs.values())
         assert len(record.request_id or "") <= 128 and len(record.episode) <= 140
     assert kept[2].episode == kept[3].episode and (kept[2].step, kept[3].step) == (0, 1)
+
+
+def test_a_fault_of_the_recorder_costs_no_request_and_one_line(
+    start: Callable[..., Server], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    server = start()
+
+    def fail(*_: Any) -> None:
+        raise KeyError("a fault")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(server.recorder, "_place", fail)
+        assert [server.act("ur5", {"obs": [0] * 27})[0] for _ in range(3)] == [200] * 3
+    assert server.act("ur5", {"obs": [0] * 27})[0] == 200
+    (episode,) = server.recorded()
+    assert len(episode) == 1 and server.metrics()["rlservo_records_dropped_total"] == 3
+    (line,) = [record for record in caplog.records if record.levelname == "ERROR"]
+    assert line.name == request_recorder.__name__ and "was not recorded" in line.message
 
 
 def test_policies_whose_options_say_so_are_left_out(start: Callable[..., Server]) -> None:
