@@ -45,6 +45,11 @@ class Episodes:
         what `Policy.step` raises; the recurrent state has then not moved on.
         """
         episode, stream = request.episode or NO_EPISODE, request.stream
+        if episode.final_status is not None and (episode.reset or (episode.state is not None and not episode.state)):
+            raise RequestError(
+                "'final_status' ends an episode, and this request begins one ('reset', or an empty 'state'): tell how "
+                "the last one ended in a request of its own, before"
+            )
         if episode.session_id is not None:
             request.label = str(episode.session_id)
             name = request.policy

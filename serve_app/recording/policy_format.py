@@ -245,7 +245,7 @@ def decision_schema(policy: PolicyFormat) -> dict[str, Any]:
             "logp": {"type": "number", "description": "Log-probability of own_action"},
             "explore": {"type": "boolean"},
             "reward_input": {"type": "number", "description": "The reward that the policy was given to see"},
-            "last_action_input": {**action, "description": "What a limit on the step counted from, at a beginning"},
+            "last_action_input": {**action, "description": "What a limit on the step counted from, if the client told"},
             "latency_ms": {"type": "number", "description": "[ms]", "unit": "ms"},
             "seq": _integer("The request's number"),
             "request_id": _text("The request's id in the server's log"),

@@ -117,8 +117,8 @@ class RequestRecorder:
             known, obs, decision.action, episode, step, taken_s * 1e3, request.explore, seq=request.seq,
             request_id=_request_id(request), warnings=decision.notices, rows=rows,
         )  # fmt: skip
-        if policy.has_step_limit and not step:
-            record.last_action_input = said.last_action
+        if policy.has_step_limit and decision.last_action is not None:
+            record.last_action_input = LeafArrays(decision.last_action)
         if policy.sees_reward:
             record.reward_input = reward
         if draw is not None:
@@ -129,12 +129,11 @@ class RequestRecorder:
         said = request.episode or NO_EPISODE
         if said.final_status is not None:
             return  # no decision was asked for, and the episode goes on until its end is told
+        session_id = said.session_id
+        label = request.label if session_id is None else str(session_id)
         try:
-            policy = (
-                request.stream.policy
-                if request.stream is not None
-                else store.choose(request.policy, request.version, _session_of(request) or request.label)
-            )
+            stream = request.stream
+            policy = store.choose(request.policy, request.version, label) if stream is None else stream.policy
         except UnknownPolicyError:
             return
         if not policy.options.record:
@@ -193,8 +192,10 @@ def _episode_of(request: Request) -> str:
 
 
 def _session_of(request: Request) -> str | None:
-    episode = request.episode
-    return None if episode is None or episode.session_id is None else str(episode.session_id)
+    if request.episode is None or request.episode.session_id is None:
+        return None
+    session_id = request.episode.session_id
+    return session_id if isinstance(session_id, str) else f"#{session_id}"  # 7 and "7" are two sessions
 
 
 def _request_id(request: Request) -> str | None:

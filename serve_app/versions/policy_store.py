@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from numpy.typing import NDArray
+
 from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, read_contract
 from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import (
@@ -62,6 +64,7 @@ class Decision:
     notices: tuple[str, ...] = ()  # what was out of bounds or limited, and used all the same
     episode: EpisodeNote | None = None
     sharers: int = 1  # requests whose observations were computed in the same run of the network
+    last_action: Mapping[str, NDArray[Any]] | None = None  # which the client gave, by tensor name `[batch, *shape]`
     is_repeat: bool = False  # the answer to a session's last request once more
 
 
@@ -294,7 +297,9 @@ def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision,
     step = policy.step(obs, **given)
     infer_ms = (time.perf_counter() - started) * 1e3
     name, version = policy.contract.name, policy.contract.version
-    return Decision(step.action, policy, step.inputs, name, version, infer_ms, step.batch, step.notices), step
+    decision = Decision(step.action, policy, step.inputs, name, version, infer_ms, step.batch, step.notices)
+    decision.last_action = step.last_action
+    return decision, step
 
 
 def _draw(name: str, label: str | None, canary: Policy) -> float:
