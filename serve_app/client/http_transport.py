@@ -37,6 +37,7 @@ except ModuleNotFoundError:
 FIRST_WAIT_S = 0.05  # before the second attempt; doubles each time
 LONGEST_WAIT_S = 2.0
 MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; keeps a wrong URL from filling the memory
+LABEL = b"x-session-id"
 KEEPALIVE_S = 5.0  # that an idle connection is kept
 SCHEMES = {"http": "http", "https": "https"}
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -90,6 +91,8 @@ class Transport:
         self._backend = DeadlineBackend()
         self._pool = _connection_pool(self.url, self._backend)
         self._is_closed = False
+        self.label: str | None = None
+        """Whose requests the following are, for the server's recording."""
 
     @property
     def reconnects(self) -> int:
@@ -157,6 +160,8 @@ class Transport:
         if remaining <= 0:
             raise timeout_error
         headers = self._headers
+        if self.label is not None:
+            headers = [*headers, (LABEL, self.label.encode())]
         if body is not None:
             headers = [*headers, (b"content-type", b"application/json"), (b"content-length", b"%d" % len(body))]
         timeout = dict.fromkeys(("connect", "read", "write", "pool"), remaining)

@@ -6,6 +6,7 @@ a running number `seq`, and an answer with another number, a late one or a malfo
 
 from __future__ import annotations
 
+import secrets
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,15 +55,21 @@ class PolicyClient(RemotePolicy):
         deadline_ms: float | None = None,
         server_state: bool = False,
         record: str | Path | Recorder | None = None,
+        label: str | None = None,
     ) -> None:
         """Check the arguments; the server is first asked when `contract` or `act` needs it.
 
         `policy` may be None where the server has exactly one. `timeout_s` bounds one call, its retries included, and
         `deadline_ms` instead of it each `act`; `retries` counts further attempts after a failed connection or a 503,
         nothing else is ever sent twice. `record` keeps every decision: a new .mcap file, a folder, or a Recorder.
+        `label` names this loop: in the server's own recording, what it asks from `reset` to `reset` is one episode.
         """
+        if label is not None and not (label and label.isascii() and label.isprintable() and len(label) <= 100):
+            raise UsageError(f"label must be 1 to 100 printable ASCII characters, got {label[:100]!r}")
         self._transport = Transport(url, timeout_s=timeout_s, retries=retries, api_key=api_key)
         self.url = self._transport.url
+        self._label = label
+        self._begin_label()
         super().__init__(
             policy,
             version=version,
@@ -76,6 +83,15 @@ class PolicyClient(RemotePolicy):
     def reconnects(self) -> int:
         """How many connections were made after the first."""
         return self._transport.reconnects
+
+    def reset(self) -> None:
+        """Start an episode: the next request says so. Sends nothing."""
+        super().reset()
+        self._begin_label()
+
+    def _begin_label(self) -> None:
+        if self._label is not None:
+            self._transport.label = f"{self._label}.{secrets.token_hex(4)}"
 
     def _act(self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None = None) -> Any:
         contract = self.contract

@@ -13,7 +13,7 @@ from typing import Any
 
 from rlservo.export.contract.errors import RequestError
 from rlservo.serve_app.runtime.policy import Policy, Step
-from rlservo.serve_app.versions.policy_store import EpisodeMark
+from rlservo.serve_app.versions.policy_store import EpisodeStep
 from rlservo.serve_app.wire.state_names import BELONGS_TO, LAST_ACTION, MARK
 
 MARK_BEGINS = "~"  # no policy's identity has one
@@ -35,7 +35,7 @@ class CarriedState:
 
     last_action: Any = None
 
-    mark: EpisodeMark | None = None
+    mark: EpisodeStep | None = None
 
     @classmethod
     def parse(cls, state: Mapping[str, Any]) -> CarriedState:
@@ -62,16 +62,16 @@ class CarriedState:
 NO_STATE = CarriedState({}, is_empty=True)
 
 
-def split_identity(belongs_to: str) -> tuple[str, EpisodeMark | None]:
+def split_identity(belongs_to: str) -> tuple[str, EpisodeStep | None]:
     """Return the policy's identity and the episode's mark, of which a client may have made anything."""
     identity, _, rest = belongs_to.partition(MARK_BEGINS)
     episode, _, step = rest.rpartition(MARK_BEGINS)
     if not episode or len(episode) > LONGEST_EPISODE_ID or not (step.isascii() and step.isdigit() and len(step) < 16):
         return identity, None
-    return identity, EpisodeMark(episode, int(step))
+    return identity, EpisodeStep(episode, int(step))
 
 
-def carry(policy: Policy, step: Step, mark: EpisodeMark | None) -> dict[str, Any]:
+def carry(policy: Policy, step: Step, mark: EpisodeStep | None) -> dict[str, Any]:
     """Return the state that a client is to send with its next request; `mark` is for a recording."""
     carried: dict[str, Any] = dict(step.own_state)
     carried[BELONGS_TO] = policy.identity

@@ -20,8 +20,8 @@ from rlservo.serve_app.versions.policy_store import (
     NEEDS_LAST,
     NEEDS_STATE,
     Decision,
-    EpisodeMark,
     EpisodeNote,
+    EpisodeStep,
     PolicyStore,
     take_step,
 )
@@ -45,6 +45,11 @@ class Episodes:
         what `Policy.step` raises; the recurrent state has then not moved on.
         """
         episode, stream = request.episode or NO_EPISODE, request.stream
+        if episode.final_status is not None and (episode.reset or (episode.state is not None and not episode.state)):
+            raise RequestError(
+                "'final_status' ends an episode, and this request begins one ('reset', or an empty 'state'): tell how "
+                "the last one ended in a request of its own, before"
+            )
         if episode.session_id is not None:
             request.label = str(episode.session_id)
             name = request.policy
@@ -102,15 +107,15 @@ class Episodes:
         decision, step = _take_step(policy, request, episode, carried)
         if policy.is_stateful:
             mark = self._mark(carried, request) if self.marks_states else None
-            next_mark = None if mark is None else EpisodeMark(mark.episode, mark.step + 1)
-            decision.episode = EpisodeNote(state=carry(policy, step, next_mark), recorded=mark)
+            next_mark = None if mark is None else EpisodeStep(mark.episode, mark.step + 1)
+            decision.episode = EpisodeNote(state=carry(policy, step, next_mark), recorded_step=mark)
         return decision
 
-    def _mark(self, carried: CarriedState, request: Request) -> EpisodeMark:
+    def _mark(self, carried: CarriedState, request: Request) -> EpisodeStep:
         """Return which step of which episode of the recording this is."""
         if carried.is_empty:
-            return EpisodeMark(new_episode_id(request.label), 0)
-        return carried.mark or EpisodeMark(new_episode_id(request.label), 1)  # nobody knows which, but not the first
+            return EpisodeStep(new_episode_id(request.label), 0)
+        return carried.mark or EpisodeStep(new_episode_id(request.label), 1)  # nobody knows which, but not the first
 
     def _act_on_stream(self, store: PolicyStore, request: Request, episode: Episode, stream: Session) -> Decision:
         """Act from the state that the connection keeps."""
@@ -163,7 +168,7 @@ class Episodes:
         decision.episode = EpisodeNote(session_id=session_id, step=session.steps)
         session.seq, session.answer, session.inputs_hash = seq, None, b""
         if seq is not None:  # without the inputs: they may be views of a whole request's body
-            session.answer = replace(decision, inputs={}, is_repeated=True)
+            session.answer = replace(decision, inputs={}, is_repeat=True)
             session.inputs_hash = session.policy.fingerprint(step.inputs)
         return decision
 

@@ -1,4 +1,4 @@
-"""What a recording's conversions share: one policy at a time, a folder that is new, Gymnasium's spaces."""
+"""Parts of every conversion of a recording: episodes of one policy, a new folder, spaces as Gymnasium's."""
 
 from __future__ import annotations
 

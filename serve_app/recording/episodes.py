@@ -140,7 +140,7 @@ class Episode:
 
     @cached_property
     def last_action_input(self) -> dict[int, Columns]:
-        """By row the action `[1, *shape]` that a limit on the step counted from, where no earlier row holds it."""
+        """By row the action `[1, *shape]` that a limit on the step counted from, where the client gave it."""
         key = "last_action_input"
         given = [(row, one[key]) for row, one in enumerate(self._decisions) if key in one]
         return {row: self.policy.actions.columns([action]) for row, action in given}
@@ -170,6 +170,10 @@ class Episode:
     def field(self, name: str) -> list[Any]:
         """Return a field as it was recorded, such as `seq` or `request_id`; None where it is absent."""
         return [one.get(name) for one in self._decisions]
+
+    def _drop_last(self) -> None:
+        for rows in (self._decisions, self._outcomes, self._log_times_ns, self._wall_ns):
+            rows.pop()
 
     def _numbers(self, name: str) -> NDArray[np.float64]:
         return np.array([one.get(name, math.nan) for one in self._decisions], np.float64)
@@ -202,9 +206,11 @@ def _add_decision(
 ) -> Iterator[Episode]:
     episode = opened.get(key)
     step = entry.fields["step"]
+    if episode is not None and key[1] and 0 < step == episode._decisions[-1]["step"]:
+        episode._drop_last()  # decided again: the client had no answer to the first request
     first = True
     if episode is not None:
-        begins_anew = bool(key[1]) and step <= episode._decisions[-1]["step"]
+        begins_anew = bool(key[1] and episode._decisions) and step <= episode._decisions[-1]["step"]
         full = len(episode) >= (LONGEST_PIECE if key[1] else LOOSE_PIECE)
         first = begins_anew or not key[1]
         if begins_anew or full:

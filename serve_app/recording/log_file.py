@@ -21,9 +21,10 @@ from mcap.writer import CompressionType, Writer
 import rlservo
 from rlservo.serve_app.recording.policy_format import (
     DROPPED_SCHEMA,
-    NUMBERS,
+    LeafArrays,
     PolicyFormat,
     decision_schema,
+    json_rows,
     outcome_schema,
 )
 from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
@@ -31,6 +32,7 @@ from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
 PROFILE = "rlservo"
 CHUNK_BYTES = 256 * 1024
 YIELD_EVERY = 8  # messages written at a stretch before other threads get the interpreter
+YIELD_S = 2e-5  # a sleep of 0 has the interpreter back before a thread that waits for it is awake
 DROPPED_TOPIC = "/rlservo/dropped"
 
 
@@ -76,53 +78,37 @@ class LogFile:
 
     def add_decision(self, record: DecisionRecord) -> None:
         """Write a decision, of a batch one for each row. Raises ValueError or RequestError where it does not fit."""
-        policy = record.policy
-        observed = policy.observations.rows(record.obs)
-        acted = None if record.action is None else policy.actions.rows(record.action)
-        commanded = None if record.commanded is None else policy.actions.rows(record.commanded)
-        last = None if record.last_action_input is None else policy.actions.rows(record.last_action_input)
-        shared = self._shared(record)
-        own, inputs = record.own_action, record.dist_inputs
-        logp = None if own is None or inputs is None else policy.log_probability(inputs, own)
-        for row, leaves in enumerate(observed):
-            episode = _row_episode(record.episode, row, len(observed))
-            parts = [_head(episode, record.step), b'"obs":' + policy.observations.encode(leaves)]
-            if acted is not None:
-                parts.append(b'"action":' + policy.actions.encode(acted[row]))
-            if commanded is not None:
-                parts.append(b'"commanded":' + policy.actions.encode(commanded[row]))
-            if last is not None:
-                parts.append(b'"last_action_input":' + policy.actions.encode(last[row]))
-            if own is not None and inputs is not None:
-                chosen = {name: leaf[row] for name, leaf in own.items()}
-                parts.append(b'"own_action":' + policy.actions.encode(chosen))
-                parts.append(b'"dist_inputs":' + orjson.dumps(inputs[row], option=NUMBERS))
+        policy, own, inputs = record.policy, record.own_action, record.dist_inputs
+        columns = [_member("obs", policy.observations.encode_rows(record.obs))]
+        for name, action in (
+            ("action", record.action),
+            ("commanded", record.commanded),
+            ("last_action_input", record.last_action_input),
+        ):
+            if action is not None:
+                columns.append(_member(name, policy.actions.encode_rows(action)))
+        if own is not None and inputs is not None:
+            columns.append(_member("own_action", policy.actions.encode_rows(LeafArrays(own))))
+            columns.append([b'"dist_inputs":[%b]' % row for row in json_rows(inputs)])
+            logp = policy.log_probability(inputs, own)
             if logp is not None:
-                parts.append(b'"logp":%b' % orjson.dumps(float(logp[row])))
-            if record.reward_input is not None:
-                parts.append(b'"reward_input":%b' % _row_reward(record.reward_input, row))
-            self._add(policy, "decision", b"{" + b",".join([*parts, *shared]) + b"}", record)
+                columns.append(_member("logp", json_rows(logp[:, None])))
+        if record.reward_input is not None:
+            columns.append(_rewards("reward_input", record.reward_input, len(columns[0])))
+        self._add_rows("decision", record, columns, _details(record))
 
     def add_outcome(self, record: OutcomeRecord) -> None:
         """Write what came of a decision. Raises ValueError or RequestError where it does not fit."""
-        policy = record.policy
-        observed = None if record.final_obs is None else policy.observations.rows(record.final_obs)
-        commanded = None if record.commanded is None else policy.actions.rows(record.commanded)
-        for row in range(record.rows):
-            parts = [_head(_row_episode(record.episode, row, record.rows), record.step)]
-            if record.reward is not None:
-                parts.append(b'"reward":%b' % _row_reward(record.reward, row))
-            if record.terminated:
-                parts.append(b'"terminated":true')
-            if record.truncated:
-                parts.append(b'"truncated":true')
-            if record.final_status is not None:
-                parts.append(b'"final_status":%b' % orjson.dumps(record.final_status))
-            if observed is not None:
-                parts.append(b'"final_obs":' + policy.observations.encode(observed[row]))
-            if commanded is not None:
-                parts.append(b'"commanded":' + policy.actions.encode(commanded[row]))
-            self._add(policy, "outcome", b"{" + b",".join(parts) + b"}", record)
+        policy, columns = record.policy, []
+        if record.reward is not None:
+            columns.append(_rewards("reward", record.reward, record.rows))
+        if record.final_obs is not None:
+            columns.append(_member("final_obs", policy.observations.encode_rows(record.final_obs)))
+        if record.commanded is not None:
+            columns.append(_member("commanded", policy.actions.encode_rows(record.commanded)))
+        told = {"terminated": record.terminated or None, "truncated": record.truncated or None}
+        told |= {"final_status": record.final_status}
+        self._add_rows("outcome", record, columns, _members(told))
 
     def add_dropped(self, count: int) -> None:
         """Mark that `count` records are missing before this place."""
@@ -147,30 +133,19 @@ class LogFile:
         with contextlib.suppress(OSError):  # it tries once more to write what it still holds
             self._stream.close()
 
-    def _shared(self, record: DecisionRecord) -> list[bytes]:
-        """Return the fields that are the same for every row of a batch."""
-        fields: dict[str, Any] = {
-            "explore": record.explore or None,
-            "latency_ms": None if record.latency_ms is None else round(record.latency_ms, 4),
-            "seq": record.seq,
-            "request_id": record.request_id,
-            "warnings": list(record.warnings) or None,
-            "error": record.error,
-        }
-        given = {name: value for name, value in fields.items() if value is not None}
-        return [orjson.dumps(given)[1:-1]] if given else []
-
-    def _add(self, policy: PolicyFormat, kind: str, message: bytes, record: DecisionRecord | OutcomeRecord) -> None:
-        self._sequence += 1
-        self._writer.add_message(
-            self._channel(policy, kind),
-            self._log_time(record.monotonic_ns),
-            message,
-            record.wall_ns,
-            self._sequence % 2**32,
-        )
-        if self._sequence % YIELD_EVERY == 0:
-            time.sleep(0)
+    def _add_rows(
+        self, kind: str, record: DecisionRecord | OutcomeRecord, columns: list[list[bytes]], shared: list[bytes]
+    ) -> None:
+        """Write a message for each row, of its own members in `columns` and those that all rows share."""
+        channel = self._channel(record.policy, kind)
+        log_time = self._log_time(record.monotonic_ns)
+        for row, members in enumerate(zip(*columns, strict=True) if columns else [()] * record.rows):
+            head = _head(_row_episode(record.episode, row, record.rows), record.step)
+            self._sequence += 1
+            message = b"{%b}" % b",".join((head, *members, *shared))
+            self._writer.add_message(channel, log_time, message, record.wall_ns, self._sequence % 2**32)
+            if self._sequence % YIELD_EVERY == 0:
+                time.sleep(YIELD_S)
 
     def _log_time(self, monotonic_ns: int) -> int:
         return max(0, self._wall_ns + monotonic_ns - self._monotonic_ns)
@@ -213,6 +188,32 @@ def _row_episode(episode: str, row: int, rows: int) -> str:
     return episode if rows == 1 or not episode else f"{episode}.{row}"
 
 
-def _row_reward(reward: Any, row: int) -> bytes:
-    rewards = np.ravel(np.asarray(reward, np.float64))
-    return orjson.dumps(float(rewards[row if len(rewards) > 1 else 0]))
+def _member(name: str, values: list[bytes]) -> list[bytes]:
+    key = b'"%b":' % name.encode()
+    return [key + value for value in values]
+
+
+def _members(fields: dict[str, Any]) -> list[bytes]:
+    """Return the fields that are not None as members of an object."""
+    given = {name: value for name, value in fields.items() if value is not None}
+    return [orjson.dumps(given)[1:-1]] if given else []
+
+
+def _details(record: DecisionRecord) -> list[bytes]:
+    """Return the fields that are the same for every row of a batch."""
+    return _members(
+        {
+            "explore": record.explore or None,
+            "latency_ms": None if record.latency_ms is None else round(record.latency_ms, 4),
+            "seq": record.seq,
+            "request_id": record.request_id,
+            "warnings": list(record.warnings) or None,
+            "error": record.error,
+        }
+    )
+
+
+def _rewards(name: str, reward: Any, rows: int) -> list[bytes]:
+    """Return one reward a row, of one for each, or one for all."""
+    rewards = np.broadcast_to(np.ravel(np.asarray(reward, np.float64)), rows)
+    return _member(name, json_rows(np.ascontiguousarray(rewards)[:, None]))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from typing import Any
 
@@ -21,7 +21,6 @@ from rlservo.export.contract.log_probability import log_probability
 from rlservo.export.contract.nested import action_leaves
 from rlservo.export.contract.spaces import DictSpec, DiscreteSpec, LeafSpec, SpaceSpec, TupleSpec, leaf_specs
 
-NUMBERS = orjson.OPT_SERIALIZE_NUMPY
 Leaves = Mapping[str, NDArray[Any]]
 
 
@@ -74,37 +73,27 @@ class SpaceFormat:
         self._space = space
         self._path = path
         self.leaves = leaf_specs(space, path)
-        self._formats = {name: _LeafFormat(leaf) for name, leaf in self.leaves.items()}
+        self._formats = {name: _LeafFormat(name, leaf) for name, leaf in self.leaves.items()}
+        self._is_leaf = path in self.leaves
+        self._template = self._nest(space, path)
 
-    def rows(self, value: Any) -> list[dict[str, NDArray[Any]]]:
-        """Return the leaves of one value, or of each row of a batch, in the space's own types.
+    def arrays(self, value: Any) -> LeafArrays:
+        """Return one value, or a batch, as `[rows, *shape]` in the space's own types.
 
         Raises ValueError or RequestError where the value is not of the space.
         """
-        found: dict[str, NDArray[Any]] = {}
-        batch: int | None = None
-        parts = {name: value[name] for name in self.leaves} if isinstance(value, LeafArrays) else self._parts(value)
-        for name, given in parts.items():
-            leaf = self.leaves[name]
-            array = np.asarray(given)
-            if array.ndim and array.shape[-1:] == (1,) and not leaf.shape:  # a choice with an axis of its own
-                array = array.reshape(array.shape[:-1])
-            if array.ndim == len(leaf.shape) + 1:
-                batch = len(array)
-            elif array.shape != leaf.shape:
-                raise ValueError(f"{name} has shape {array.shape}, expected {leaf.shape}")
-            found[name] = array.astype(leaf.dtype, copy=False)
-        if batch is None:
-            return [found]
-        return [{name: array[row] for name, array in found.items()} for row in range(batch)]
+        parts = value if isinstance(value, LeafArrays) else self._parts(value)
+        return LeafArrays({name: self._formats[name].array(parts[name]) for name in self.leaves})
+
+    def encode_rows(self, value: Any) -> list[bytes]:
+        """Return the JSON of each row of what `arrays` takes."""
+        parts = value if isinstance(value, LeafArrays) else self._parts(value)
+        columns = [self._formats[name].encode_rows(parts[name]) for name in self.leaves]
+        return columns[0] if self._is_leaf else [self._template % row for row in zip(*columns, strict=True)]
 
     def count_rows(self, value: Any) -> int:
         """Return how many values an array, or a nest of arrays, holds."""
         return max(1, _total_size(value) // sum(leaf.size for leaf in self.leaves.values()))
-
-    def encode(self, leaves: Mapping[str, Any]) -> bytes:
-        """Return one value's JSON."""
-        return self._encode(self._space, self._path, leaves)
 
     def columns(self, documents: Sequence[Any]) -> dict[str, NDArray[Any]]:
         """Return the leaves `[len(documents), *shape]` of parsed values; a value of None becomes zeros."""
@@ -131,13 +120,11 @@ class SpaceFormat:
             return {self._path: array.reshape((*array.shape[:-1], *self._space.shape))}
         return {self._path: value}
 
-    def _encode(self, space: SpaceSpec, path: str, leaves: Mapping[str, Any]) -> bytes:
+    def _nest(self, space: SpaceSpec, path: str) -> bytes:
+        """Return the JSON of a value with `%b` for each leaf, in the order of `leaves`."""
         if path in self._formats:
-            return self._formats[path].encode(leaves[path])
-        inside = (
-            orjson.dumps(key) + b":" + self._encode(child, f"{path}.{key}", leaves) for key, child in _children(space)
-        )
-        return b"{" + b",".join(inside) + b"}"
+            return b"%b"
+        return _object_template((key, self._nest(child, f"{path}.{key}")) for key, child in _children(space))
 
     def _columns(self, space: SpaceSpec, path: str, documents: Sequence[Any], found: dict[str, NDArray[Any]]) -> None:
         if path in self._formats:
@@ -151,6 +138,17 @@ class SpaceFormat:
             return self._formats[path].schema()
         inside = {key: self._schema(child, f"{path}.{key}") for key, child in _children(space)}
         return {"type": "object", "properties": inside}
+
+
+def json_rows(array: NDArray[Any]) -> list[bytes]:
+    """Return the numbers of each row of `[rows, n]` as JSON, without brackets."""
+    return orjson.dumps(array, option=orjson.OPT_SERIALIZE_NUMPY)[2:-2].split(b"],[")
+
+
+def _object_template(members: Iterable[tuple[str, bytes]]) -> bytes:
+    """Return the JSON of an object of which `%` fills the values in."""
+    inside = (json.dumps(key).encode().replace(b"%", b"%%") + b":" + value for key, value in members)
+    return b"{" + b",".join(inside) + b"}"
 
 
 def _total_size(value: Any) -> int:
@@ -170,22 +168,33 @@ def _children(space: SpaceSpec) -> list[tuple[str, SpaceSpec]]:
 class _LeafFormat:
     """One array: an object by element name where all elements have one, else a flat array; a choice is a number."""
 
-    def __init__(self, leaf: LeafSpec) -> None:
-        self._leaf = leaf
+    def __init__(self, path: str, leaf: LeafSpec) -> None:
+        self._path, self._leaf = path, leaf
+        self._shape, self._dtype, self._size = leaf.shape, np.dtype(leaf.dtype), leaf.size
         names = [element.name for element in leaf.elements]
         self._names = names if leaf.shape and len(set(names)) == leaf.size else None
         self._template = b""
         if self._names is not None:
-            keys = [json.dumps(name).encode().replace(b"%", b"%%") for name in self._names]
-            self._template = b"{" + b",".join(key + b":%b" for key in keys) + b"}"
+            self._template = _object_template((name, b"%b") for name in self._names)
             getter = itemgetter(*self._names)
             self._values = getter if len(names) > 1 else lambda document: (getter(document),)
 
-    def encode(self, array: NDArray[Any]) -> bytes:
-        if not self._leaf.shape:
-            return orjson.dumps(array.item())
-        flat = orjson.dumps(np.ascontiguousarray(array).reshape(-1), option=NUMBERS)
-        return flat if self._names is None else self._template % tuple(flat[1:-1].split(b","))
+    def array(self, value: Any) -> NDArray[Any]:
+        """Return `[rows, *shape]`."""
+        array, shape = np.asarray(value), self._shape
+        if not shape and array.shape[1:] == (1,):  # a batch of choices with an axis of their own
+            array = array[:, 0]
+        if array.shape != shape and array.shape[1:] != shape:
+            raise ValueError(f"{self._path} has shape {array.shape}, expected {shape}")
+        return np.ascontiguousarray(array, self._dtype).reshape(-1, *shape)
+
+    def encode_rows(self, value: Any) -> list[bytes]:
+        rows = json_rows(self.array(value).reshape(-1, self._size))
+        if not self._shape:
+            return rows
+        if self._names is None:
+            return [b"[%b]" % row for row in rows]
+        return [self._template % tuple(row.split(b",")) for row in rows]
 
     def column(self, documents: Sequence[Any]) -> NDArray[Any]:
         size = self._leaf.size
@@ -236,7 +245,7 @@ def decision_schema(policy: PolicyFormat) -> dict[str, Any]:
             "logp": {"type": "number", "description": "Log-probability of own_action"},
             "explore": {"type": "boolean"},
             "reward_input": {"type": "number", "description": "The reward that the policy was given to see"},
-            "last_action_input": {**action, "description": "What a limit on the step counted from, at a beginning"},
+            "last_action_input": {**action, "description": "What a limit on the step counted from, if the client told"},
             "latency_ms": {"type": "number", "description": "[ms]", "unit": "ms"},
             "seq": _integer("The request's number"),
             "request_id": _text("The request's id in the server's log"),

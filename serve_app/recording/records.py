@@ -39,7 +39,7 @@ class DecisionRecord:
     reward_input: Any = None
     """The reward that the policy was given to see."""
     last_action_input: Any = None
-    """The action that a limit on the step counted from, where no earlier decision of the episode holds it."""
+    """The action that a limit on the step counted from, where the client gave it."""
     seq: int | None = None
     request_id: str | None = None
     warnings: Sequence[str] = ()

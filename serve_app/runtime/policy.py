@@ -80,6 +80,8 @@ class Step:
     """What the network was given, by tensor name."""
     notices: tuple[str, ...] = ()
     """What was out of bounds or beyond a limit, and used all the same."""
+    last_action: dict[str, NDArray[Any]] | None = None
+    """The caller's last action as a limit on the step counted from it, by tensor name; None where it gave none."""
 
     @property
     def rows(self) -> int:
@@ -273,9 +275,10 @@ class Policy(Closeable):
             )
         if state is not None:
             before = self._state_tensors.parse(state, rows, batch=batch)
+        given: dict[str, NDArray[Any]] | None = None
         if last_action is not None:
-            given = action_leaves(self._contract.action_space, last_action, "action")
-            last = self._step_limit.parse_last_action(given, rows, batch=batch)
+            parts = action_leaves(self._contract.action_space, last_action, "action")
+            last = given = self._step_limit.parse_last_action(parts, rows, batch=batch)
         action, after = self._decide(feed, rows, before, explore, seed, reward)
         if self._step_limit and last is not None:
             action, limit_notices = self._step_limit.apply(action, last)
@@ -285,7 +288,7 @@ class Policy(Closeable):
                 check.check(action[name])
         space = self._contract.action_space
         own = action if batch else {name: leaf[0, ...] for name, leaf in action.items()}
-        return Step(build_action(space, own), action, after, rows if batch else None, feed, notices)
+        return Step(build_action(space, own), action, after, rows if batch else None, feed, notices, given)
 
     def follow(
         self,

@@ -220,7 +220,7 @@ class RequestPath:
         except RlservoError as error:
             self.record_failure(request, error.code, error.message, asked=blamed_version(error))
             if self.recorder is not None:
-                self.recorder.record_failure(request, self._store_provider(), error)
+                self.recorder.note_failure(request, self._store_provider(), error)
             raise
         except Exception as error:
             self.record_bug(request, asked=blamed_version(error))
@@ -230,7 +230,7 @@ class RequestPath:
         if request.episode is not None and request.episode.final_status is not None:
             self._count_end(request, decision, request.episode.final_status)
         if self.recorder is not None:
-            self.recorder.record_answer(request, decision, taken)
+            self.recorder.note_answer(request, decision, taken)
         if self.log.every:
             self.log.write_answer(request, decision, taken)
         return reply

@@ -1,12 +1,18 @@
 """Recording of what the server decides: each answer, what clients say came of it, and requests that got no action.
 
-A record is a few references into what the request path has anyway; `recording/recorder.py` writes it in a thread.
+The request path leaves a note; the record is made of it when the reply has been written, in the event loop's next turn,
+and `recording/recorder.py` writes it in a thread. A fault in here costs records, and no request.
 """
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import threading
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -17,6 +23,7 @@ from numpy.typing import NDArray
 from rlservo.export.contract.errors import ObservationError, RequestError, RlservoError, UnknownPolicyError, UsageError
 from rlservo.serve_app.episodes.request import Episode, Request, shorten_label
 from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
+from rlservo.serve_app.runtime.exploration import Draw
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.request_path import count_rows
 from rlservo.serve_app.server.settings import ServerSettings
@@ -29,6 +36,8 @@ except ModuleNotFoundError as error:
     if (error.name or "").startswith("rlservo"):
         raise
     raise UsageError(f"recording needs the Python package {error.name!r}: pip install 'rlservo[record]'") from error
+
+logger = logging.getLogger(__name__)
 
 MOST_EPISODES = 65_536  # whose steps are counted; of more, the one that was silent longest begins anew
 LONGEST_REQUEST_ID = 128  # of a longer one, the beginning: a header may have 16 KB
@@ -47,12 +56,48 @@ class RequestRecorder:
         self._formats: WeakKeyDictionary[Policy, PolicyFormat] = WeakKeyDictionary()
         self._steps: OrderedDict[tuple[str, str], int] = OrderedDict()
         """The last recorded step of each episode, by policy name and episode; the longest silent come first."""
+        self._notes: deque[Callable[[], None]] = deque()
+        """Of requests whose records are still to be made."""
+        self._lock = threading.Lock()
+        self._has_failed = False
 
-    def record_answer(self, request: Request, decision: Decision, taken_s: float) -> None:
-        """Record a decision, and what its request says of the one before."""
+    def note_answer(self, request: Request, decision: Decision, taken_s: float) -> None:
+        """Record a decision, and what its request says of the one before, when the reply has been written."""
         policy = decision.policy
-        if not policy.options.record or decision.is_repeated:
-            return
+        if policy.options.record and not decision.is_repeat:
+            draw = policy.draw if request.explore else None  # the next request's takes its place
+            self._note(partial(self._record_answer, request, decision, taken_s, draw))
+
+    def note_failure(self, request: Request, store: PolicyStore | None, error: RlservoError) -> None:
+        """Record a single observation that got no action, where it is one of the policy's at all."""
+        if store is not None and request.obs is not None and not isinstance(error, ObservationError | RequestError):
+            taken_ms = (time.perf_counter() - request.received) * 1e3
+            self._note(partial(self._record_failure, request, store, error.code, taken_ms))
+
+    def close(self) -> None:
+        """Write what there is and end the file."""
+        self._make_records()
+        self.recorder.close()
+
+    def _note(self, make_record: Callable[[], None]) -> None:
+        if not self._notes:
+            asyncio.get_running_loop().call_soon(self._make_records)
+        self._notes.append(make_record)
+
+    def _make_records(self) -> None:
+        with self._lock:  # `close` may come from another thread
+            while self._notes:
+                make_record = self._notes.popleft()
+                try:
+                    make_record()
+                except Exception:  # ours: nothing of a request comes this far unchecked
+                    self.recorder.dropped += 1
+                    if not self._has_failed:
+                        self._has_failed = True
+                        logger.exception("a request was not recorded; further ones are only counted")
+
+    def _record_answer(self, request: Request, decision: Decision, taken_s: float, draw: Draw | None) -> None:
+        policy = decision.policy
         said = request.episode or NO_EPISODE
         episode, step = self._place(request, decision, said)
         known, rows = self._format(policy), decision.batch or 1
@@ -72,27 +117,23 @@ class RequestRecorder:
             known, obs, decision.action, episode, step, taken_s * 1e3, request.explore, seq=request.seq,
             request_id=_request_id(request), warnings=decision.notices, rows=rows,
         )  # fmt: skip
-        if policy.has_step_limit and not step:
-            record.last_action_input = said.last_action
+        if policy.has_step_limit and decision.last_action is not None:
+            record.last_action_input = LeafArrays(decision.last_action)
         if policy.sees_reward:
             record.reward_input = reward
-        if request.explore and policy.draw is not None:
-            record.own_action, record.dist_inputs = policy.draw.own, policy.draw.inputs
+        if draw is not None:
+            record.own_action, record.dist_inputs = draw.own, draw.inputs
         self.recorder.record(record)
 
-    def record_failure(self, request: Request, store: PolicyStore | None, error: RlservoError) -> None:
-        """Record a single observation that got no action, where it is one of the policy's at all."""
+    def _record_failure(self, request: Request, store: PolicyStore, code: str, taken_ms: float) -> None:
         said = request.episode or NO_EPISODE
-        if store is None or request.obs is None or isinstance(error, ObservationError | RequestError):
-            return
         if said.final_status is not None:
             return  # no decision was asked for, and the episode goes on until its end is told
+        session_id = said.session_id
+        label = request.label if session_id is None else str(session_id)
         try:
-            policy = (
-                request.stream.policy
-                if request.stream is not None
-                else store.choose(request.policy, request.version, _session_of(request) or request.label)
-            )
+            stream = request.stream
+            policy = store.choose(request.policy, request.version, label) if stream is None else stream.policy
         except UnknownPolicyError:
             return
         if not policy.options.record:
@@ -101,27 +142,22 @@ class RequestRecorder:
         if count_rows(policy.contract.observation_space, request.obs) > 1:
             return
         try:
-            (leaves,) = known.observations.rows(request.obs)
+            arrays = known.observations.arrays(request.obs)
         except Exception:  # it may be anything: nothing has looked at it yet
             return
-        taken_ms = (time.perf_counter() - request.received) * 1e3
         episode = "" if _carries_state(request) else _episode_of(request)
         step = self._count(policy.contract.name, episode, said.reset) if episode else 0
         record = DecisionRecord(
-            known, LeafArrays({name: leaf.copy() for name, leaf in leaves.items()}), None, episode, step, taken_ms,
-            request.explore, seq=request.seq, request_id=_request_id(request), error=error.code,
+            known, LeafArrays({name: array.copy() for name, array in arrays.items()}), None, episode, step, taken_ms,
+            request.explore, seq=request.seq, request_id=_request_id(request), error=code,
         )  # fmt: skip
         self.recorder.record(record)
-
-    def close(self) -> None:
-        """Write what there is and end the file."""
-        self.recorder.close()
 
     def _place(self, request: Request, decision: Decision, said: Episode) -> tuple[str, int]:
         """Return (episode, step)."""
         note = decision.episode
-        if note is not None and note.recorded is not None:
-            return note.recorded
+        if note is not None and note.recorded_step is not None:
+            return note.recorded_step
         episode = _episode_of(request)
         if not episode:
             return "", 0
@@ -156,8 +192,10 @@ def _episode_of(request: Request) -> str:
 
 
 def _session_of(request: Request) -> str | None:
-    episode = request.episode
-    return None if episode is None or episode.session_id is None else str(episode.session_id)
+    if request.episode is None or request.episode.session_id is None:
+        return None
+    session_id = request.episode.session_id
+    return session_id if isinstance(session_id, str) else f"#{session_id}"  # 7 and "7" are two sessions
 
 
 def _request_id(request: Request) -> str | None:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from numpy.typing import NDArray
+
 from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, read_contract
 from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import (
@@ -29,8 +31,8 @@ from rlservo.serve_app.versions.micro_batching import Batcher
 from rlservo.serve_app.versions.plan import PolicyPlan
 
 
-class EpisodeMark(NamedTuple):
-    """Which episode of a recording a state that the client carries is of, and which step comes next, from 0."""
+class EpisodeStep(NamedTuple):
+    """A step of an episode in a recording, from 0."""
 
     episode: str
     step: int
@@ -43,7 +45,7 @@ class EpisodeNote:
     state: Mapping[str, Any] | None = None  # for the client to carry, as `carried_state.py` has it
     session_id: str | int | None = None
     step: int | None = None  # how many actions this session or stream has given since its episode began
-    recorded: EpisodeMark | None = None  # whose step it was, where the client carries the state and it is recorded
+    recorded_step: EpisodeStep | None = None  # which it was, where the client carries the state and it is recorded
 
 
 @dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
@@ -62,7 +64,8 @@ class Decision:
     notices: tuple[str, ...] = ()  # what was out of bounds or limited, and used all the same
     episode: EpisodeNote | None = None
     sharers: int = 1  # requests whose observations were computed in the same run of the network
-    is_repeated: bool = False  # the answer to a session's last request once more
+    last_action: Mapping[str, NDArray[Any]] | None = None  # which the client gave, by tensor name `[batch, *shape]`
+    is_repeat: bool = False  # the answer to a session's last request once more
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,7 +310,9 @@ def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision,
         raise
     infer_ms = (time.perf_counter() - started) * 1e3
     name, version = policy.contract.name, policy.contract.version
-    return Decision(step.action, policy, step.inputs, name, version, infer_ms, step.batch, step.notices), step
+    decision = Decision(step.action, policy, step.inputs, name, version, infer_ms, step.batch, step.notices)
+    decision.last_action = step.last_action
+    return decision, step
 
 
 def blame(error: Exception, policy: Policy) -> None:

@@ -84,7 +84,7 @@ def test_any_number_of_a_type_comes_back(dtype: str, rng: Rng) -> None:
     values = bits[np.isfinite(bits)][:3999] if kind.kind == "f" else bits[:3999]
     space = SpaceFormat(BoxSpec(shape=(3,), dtype=dtype, low=None, high=None), "obs")
     rows = values[: len(values) // 3 * 3].reshape(-1, 3)
-    back = space.columns([json.loads(space.encode({"obs": row})) for row in rows])["obs"]
+    back = space.columns([json.loads(text) for text in space.encode_rows(rows)])["obs"]
     assert back.tobytes() == rows.tobytes()
 
 
@@ -101,14 +101,14 @@ def test_nested_spaces_come_back(rng: Rng) -> None:
     )
     format_ = SpaceFormat(space, "obs")
     value = {"arm": rng.standard_normal((2, 2)), "more": (3, np.array([1, 2]))}
-    (leaves,) = format_.rows(value)
-    document = json.loads(format_.encode(leaves))
+    (text,) = format_.encode_rows(value)
+    document = json.loads(text)
     jsonschema.validate(document, format_.schema())
     back = format_.columns([document, document])
     assert {name: column[1].tolist() for name, column in back.items()} == {
         "obs.arm": value["arm"].astype(np.float32).tolist(), "obs.more.0": 3, "obs.more.1": [1, 2],
     }  # fmt: skip
-    batch = format_.rows({"arm": np.zeros((5, 2, 2)), "more": (np.zeros(5), np.zeros((5, 2)))})
+    batch = format_.encode_rows({"arm": np.zeros((5, 2, 2)), "more": (np.zeros(5), np.zeros((5, 2)))})
     assert len(batch) == 5
 
 

@@ -21,6 +21,7 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.spaces import DiscreteSpec
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording
@@ -313,11 +314,33 @@ def test_records_keep_no_large_request_alive(start: Callable[..., Server], monke
     server.act("ur5", {"obs": [0] * 27}, **{"x-session-id": long, "x-request-id": long})
     state = server.act("lstm_box", {"obs": [0, 0, 0], "state": {}}, **{"x-session-id": long})[1]["state"]
     server.act("lstm_box", {"obs": [0, 0, 0], "state": state}, **{"x-session-id": long})
+    server.recorder.close()
     assert len(kept) == 4
     for record in kept:
         assert all(array.base is None for array in record.obs.values())
         assert len(record.request_id or "") <= 128 and len(record.episode) <= 140
     assert kept[2].episode == kept[3].episode and (kept[2].step, kept[3].step) == (0, 1)
+
+
+def test_a_fault_of_the_recorder_costs_no_request_and_one_line(
+    start: Callable[..., Server], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    server = start()
+
+    place = server.recorder._place
+
+    def fail(request: Request, *rest: Any) -> Any:
+        if request.seq == 1:
+            raise KeyError("a fault")
+        return place(request, *rest)
+
+    monkeypatch.setattr(server.recorder, "_place", fail)
+    for seq in (1, 1, 1, 2):
+        assert server.act("ur5", {"obs": [0] * 27, "seq": seq})[0] == 200
+    (episode,) = server.recorded()
+    assert len(episode) == 1 and server.metrics()["rlservo_records_dropped_total"] == 3
+    (line,) = [record for record in caplog.records if record.levelname == "ERROR"]
+    assert line.name == request_recorder.__name__ and "was not recorded" in line.message
 
 
 def test_policies_whose_options_say_so_are_left_out(start: Callable[..., Server]) -> None:
@@ -362,3 +385,72 @@ def test_a_folder_that_cannot_be_written_to_is_a_sentence(tmp_path: Path) -> Non
     file.touch()
     with pytest.raises(UsageError, match="file exists: a recording is a new file, or a folder"):
         create_app(lambda: None, ServerSettings(record=str(file)))
+
+
+@pytest.mark.parametrize(
+    "begins", [{"session_id": "a", "reset": True}, {"state": {}}], ids=["a session", "a carried state"]
+)
+def test_a_request_that_begins_an_episode_cannot_tell_how_one_ended(
+    start: Callable[..., Server], begins: dict[str, Any]
+) -> None:
+    server = start()
+    body = {"obs": [0.5, 0.25, 0.125], **begins}
+    status, reply = server.act("lstm_box", body | {"final_status": "success"})
+    assert status == 400 and reply["error"].startswith("'final_status' ends an episode, and this request begins one")
+    assert server.act("lstm_box", body)[0] == 200
+
+
+def test_a_carried_state_that_is_sent_again_is_one_decision(start: Callable[..., Server], recurrent: Path) -> None:
+    server, state, obs = start(), {}, [0.5, 0.25, 0.125]
+    for step in range(4):
+        before = state
+        state = server.act("lstm_box", {"obs": obs, "state": before, "seq": step})[1]["state"]
+    state = server.act("lstm_box", {"obs": obs, "state": before, "seq": 4, "reward": 0.5})[1]["state"]
+    last = {"obs": obs, "state": state, "reward": 1, "final_status": "success"}
+    assert server.act("lstm_box", last)[0] == 200
+    (episode,) = server.recorded()
+    assert (episode.field("seq"), episode.gap, episode.final_status) == ([0, 1, 2, 4], None, "success")
+    assert np.isfinite(episode.reward).tolist() == [False, False, True, True]
+    report = replay(Recording(server.folder), recurrent / "lstm_box" / "1")
+    assert (report.identical, report.changed) == (4, 0)
+
+
+def test_a_number_and_its_digits_are_two_sessions(start: Callable[..., Server]) -> None:
+    server = start()
+    for session_id in (7, "7"):
+        for step in range(2):
+            body = {
+                "inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [0] * 27}],
+                "parameters": {"sequence_id": session_id, "sequence_start": step == 0},
+            }
+            assert server.post("/v2/models/ur5/infer", body)[0] == 200
+    assert sorted((one.id, len(one), one.begins) for one in server.recorded()) == [("#7", 2, True), ("7", 2, True)]
+
+
+def test_what_a_client_by_label_asks_from_reset_to_reset_is_an_episode(start: Callable[..., Server]) -> None:
+    server = start()
+    with PolicyClient(server.url, "ur5", label="cell-7") as policy:
+        for _ in range(2):
+            policy.reset()
+            for obs in observations(policy, 3):
+                policy.act(obs)
+    found = server.recorded()
+    assert [(one.id.partition(".")[0], len(one), one.begins) for one in found] == [("cell-7", 3, True)] * 2
+    for label in ("", "a\r\nb", "é", "x" * 101):
+        with pytest.raises(UsageError, match="label must be"):
+            PolicyClient(server.url, "ur5", label=label)
+
+
+def test_limits_that_count_from_an_altered_state_replay(start: Callable[..., Server], ur5: Path) -> None:
+    server, rng = start({"ur5": PolicyOptions(max_action_step=0.05, out_of_bounds="clip")}), np.random.default_rng(0)
+    state: dict[str, Any] = {}
+    for step in range(5):
+        status, reply = server.act("ur5", {"obs": (3 * rng.standard_normal(27)).tolist(), "state": state})
+        assert status == 200
+        state = reply["state"]
+        if step == 2:
+            state = {**state, "@last_action": [0.1] * 6}
+    (episode,) = server.recorded()
+    assert len(episode) == 5
+    report = replay(Recording(server.folder), ur5)
+    assert (report.compared, report.identical, report.changed) == (5, 5, 0)
