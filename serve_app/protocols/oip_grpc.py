@@ -176,6 +176,7 @@ class Grpc:
             time.perf_counter(),
             label=texts.get(LABEL),
             request_id=texts.get(REQUEST_ID),
+            headers=headers,
             waited=self._core.admission.waited(headers.get(STAMP.encode())),
         )
         try:

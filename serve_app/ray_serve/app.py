@@ -21,12 +21,14 @@ from ray.serve import Application, Deployment
 from ray.serve.config import HTTPOptions, gRPCOptions
 
 from rlservo.export.contract.errors import PartlyAppliedError, RlservoError
+from rlservo.serve_app.episodes.shared_sessions import SharedSessions
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import InferenceService
 from rlservo.serve_app.ray_serve import ingress, ray_parts
 from rlservo.serve_app.ray_serve.autoscaling import BUSY, Load
 from rlservo.serve_app.ray_serve.gcs_ledger import GcsLedger
+from rlservo.serve_app.ray_serve.replica_peers import GcsRecords, ReplicaPeers
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.core import Core
@@ -45,6 +47,7 @@ APPLICATION = "rlservo"
 DEPLOYMENT = "PolicyServer"
 SPARE = 64  # health, metrics, documentation
 GRPC_SERVICE = "rlservo.serve_app.ray_serve.grpc_ingress:add_service"
+SWEEP_PERIOD_S = 300.0  # [s] between looks for records of sessions that are no more
 FOLLOW_TIMEOUT_S = 45.0  # [s] for every replica to load and prove what a change brought
 
 
@@ -61,6 +64,9 @@ class BuildArguments(BaseModel):
 
     served: dict[str, Any] = {}
     """Versions, aliases, canary and shadow (ServedConfig), for where `user_config` cannot be given; that wins."""
+
+    single: bool = False
+    """Whether there is never another replica, as in `rlservo serve`: sessions by id need no records then."""
 
     settings: dict[str, Any] = {}
     """Fields of ServerSettings; what is not given comes from RLSERVO_* variables, then from the defaults."""
@@ -86,7 +92,7 @@ def build(args: BuildArguments) -> Application:
     options = server.options(
         num_replicas=args.replicas, max_ongoing_requests=_serve_limit(settings), user_config=args.served
     )
-    return options.bind(folders, settings.model_dump())
+    return options.bind(folders, settings.model_dump(), args.single)
 
 
 def _serve_limit(settings: ServerSettings) -> int:
@@ -113,7 +119,7 @@ def _serve_limit(settings: ServerSettings) -> int:
 class PolicyServer(InferenceService):
     """A replica: the policies, the HTTP application and the gRPC methods over them."""
 
-    def __init__(self, folders: list[str], settings: dict[str, Any]) -> None:
+    def __init__(self, folders: list[str], settings: dict[str, Any], single: bool = False) -> None:
         """Check the settings. Serve calls `reconfigure` next, and sends requests only after that."""
         self._settings = ServerSettings(**settings)
         context = serve.get_replica_context()
@@ -141,9 +147,11 @@ class PolicyServer(InferenceService):
             )
         except RlservoError as error:
             raise _plain(error) from None
+        place = (_controller()._actor_id.hex(), context.app_name, context.deployment)
+        self._records = None if single else GcsRecords(*place)
         self._control = ReplicaVersions(
             loader,
-            GcsLedger(_controller()._actor_id.hex(), context.app_name, context.deployment),
+            GcsLedger(*place),
             replica=self._replica,
             broadcast=self._tell_all,
             gather=self._ask_all,
@@ -156,12 +164,14 @@ class PolicyServer(InferenceService):
             self._settings,
             replica=self._replica,
             control=self._control,
-            alone=_alone,
             host=self._host,
         )
         core: Core = app.state.core
         self._core = core
         core.admission.loop_clock.start()
+        if self._records is not None:
+            peers = ReplicaPeers(self._id, "answer_peer", self._running)
+            core.shared_sessions = SharedSessions(core.episodes, self._records, peers, self._replica)
         # By way of the module: Serve pickles this class with copies of the objects that it names.
         ingress.bypass.install(app, answers=self._settings.ahead_of_serve and _can_bypass_serve())
         self.serve_grpc(core, local_only=is_loopback(self._host))
@@ -178,6 +188,7 @@ class PolicyServer(InferenceService):
             except RlservoError as error:
                 raise _plain(error) from None
             self._watch = asyncio.create_task(self._control.poll_ledger())
+            self._sweep = asyncio.create_task(self._sweep_records())
         else:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
 
@@ -199,11 +210,28 @@ class PolicyServer(InferenceService):
         """Return this replica's listing; replicas call this of each other."""
         return {} if self._core is None else listing.describe(self._core)
 
-    def __del__(self) -> None:
-        """End the recording: Serve calls this when the replica has answered its last request."""
+    async def answer_peer(self, method: str, *arguments: Any) -> Any:
+        """Take a step of a session for another replica; replicas call this of each other."""
+        return None if self._core is None else await self._core.answer_peer(method, *arguments)
+
+    async def __del__(self) -> None:
+        """Hand sessions over and end the recording: Serve calls this when the replica has answered its last request."""
         core = getattr(self, "_core", None)
+        if core is not None and core.shared_sessions is not None:
+            await core.shared_sessions.hand_over()
         if core is not None and core.recorder is not None:
             core.recorder.close()
+
+    async def _running(self) -> list[str]:
+        return [str(each["replica"]) for each in await self._ask_all() if each]
+
+    async def _sweep_records(self) -> None:
+        while self._core is not None and self._core.shared_sessions is not None:
+            await asyncio.sleep(SWEEP_PERIOD_S)
+            try:
+                await self._core.shared_sessions.sweep()
+            except Exception as error:  # the next one may do
+                logger.warning("records of sessions could not be looked at: %s", error)
 
     async def _configure(self, user_config: Any) -> None:
         try:
@@ -268,11 +296,6 @@ def _can_bypass_serve() -> bool:
     return not ray_parts.find("ray.serve._private.tracing_utils:is_tracing_enabled")()
 
 
-def _alone() -> bool:
-    """Whether this is the deployment's only replica, as Serve's controller last told it."""
-    return int(serve.get_replica_context().world_size) <= 1
-
-
 def _listening_host() -> str:
     """Return the address that Serve's HTTP options name; it is where this replica's own port listens, too."""
     options: Any = ray.get(_controller().get_http_config.remote())
@@ -294,5 +317,8 @@ def start(
     services = [] if grpc_port is None else [GRPC_SERVICE]
     grpc_options = gRPCOptions(port=grpc_port or 0, grpc_servicer_functions=services, enable_reflection=False)
     serve.start(http_options=HTTPOptions(host=host, port=port), grpc_options=grpc_options)
-    app = build(BuildArguments(policies=policies, replicas=replicas, served=served, settings=settings))
+    arguments = BuildArguments(
+        policies=policies, replicas=replicas, served=served, single=replicas == 1, settings=settings
+    )
+    app = build(arguments)
     serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)
