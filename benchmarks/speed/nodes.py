@@ -139,6 +139,8 @@ class Nodes(Cluster):
         if node.namespace is None:
             words.append("--dashboard-agent-listen-port=0")
         if node is self.head:
+            # Ray takes other nodes' processes, which name this address, for a head that runs here already.
+            (self.folder / "r" / "ray_current_cluster").unlink(missing_ok=True)
             words += ["--head", f"--port={self.gcs_port}", f"--dashboard-host={node.address}"]
             words += [
                 f"--dashboard-port={self.dashboard}",

@@ -222,6 +222,8 @@ class SharedSessions:
                     sent = _bare(session)
                     parts[number % len(others)].append(HandedOver(name, session_id, session.policy.identity, sent))
             await asyncio.gather(*(self._send(*each) for each in zip(others, parts, strict=True) if each[1]))
+        except Exception as error:
+            logger.warning("the sessions end with this replica: %s", error)
         finally:
             self._leaving.set()
 
