@@ -61,16 +61,12 @@ class Peers(Protocol):
     """The other replicas."""
 
     async def call(self, replica: str, method: str, *arguments: Any) -> Any:
-        """Call a method of `SharedSessions` there. Raises GoneError where that replica has ended."""
+        """Call a method of `SharedSessions` there. Raises ProcessLookupError where it has ended."""
         ...
 
     async def running(self) -> Sequence[str]:
         """Return the replicas that take requests, as far as is known."""
         ...
-
-
-class GoneError(Exception):
-    """A replica that has ended, and everything that it remembered."""
 
 
 @dataclass
@@ -184,7 +180,7 @@ class SharedSessions:
             sent.deadline_ms = request.deadline_ms - (time.perf_counter() - request.received) * 1e3
         try:
             found = await asyncio.wait_for(self._peers.call(record.replica, "act", sent, record.token), HOP_TIMEOUT_S)
-        except GoneError:
+        except ProcessLookupError:
             return None
         except Exception as error:
             logger.debug("the replica %s did not answer for a session: %s", record.replica, error)

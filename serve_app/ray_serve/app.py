@@ -21,7 +21,6 @@ from ray.serve import Application, Deployment
 from ray.serve.config import HTTPOptions, gRPCOptions
 
 from rlservo.export.contract.errors import PartlyAppliedError, RlservoError
-from rlservo.serve_app.episodes.shared_sessions import SharedSessions
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import InferenceService
@@ -170,8 +169,7 @@ class PolicyServer(InferenceService):
         self._core = core
         core.admission.loop_clock.start()
         if self._records is not None:
-            peers = ReplicaPeers(self._id, "answer_peer", self._running)
-            core.shared_sessions = SharedSessions(core.episodes, self._records, peers, self._replica)
+            core.share_sessions(self._records, ReplicaPeers(self._id, "answer_peer", self._running))
         # By way of the module: Serve pickles this class with copies of the objects that it names.
         ingress.bypass.install(app, answers=self._settings.ahead_of_serve and _can_bypass_serve())
         self.serve_grpc(core, local_only=is_loopback(self._host))

@@ -7,14 +7,13 @@ behind it, it reads and writes there: keep Redis from forgetting (`appendonly ye
 from __future__ import annotations
 
 import asyncio
-import pickle
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 import ray
+from ray import cloudpickle
 from ray.exceptions import ActorDiedError
 
-from rlservo.serve_app.episodes.shared_sessions import GoneError
 from rlservo.serve_app.ray_serve.gcs_ledger import NAMESPACE
 from rlservo.serve_app.ray_serve.ray_parts import GCS_CLIENT, REPLICA_ID, REQUEST_METADATA, find
 
@@ -66,12 +65,12 @@ class ReplicaPeers:
         self._running = running
         self._actors: dict[str, Any] = {}
         metadata = find(REQUEST_METADATA)
-        self._metadata = pickle.dumps(
+        self._metadata = cloudpickle.dumps(
             metadata(request_id="", internal_request_id="", call_method=method, app_name=deployment.app_name)
         )
 
     async def call(self, replica: str, method: str, *arguments: Any) -> Any:
-        """Call a method of another replica. Raises GoneError where it has ended."""
+        """Call a method of another replica. Raises ProcessLookupError where it has ended."""
         try:
             actor = self._actors.get(replica)
             if actor is None:
@@ -81,7 +80,7 @@ class ReplicaPeers:
             return await actor.handle_request.remote(self._metadata, method, *arguments)
         except (ValueError, ActorDiedError):
             self._actors.pop(replica, None)
-            raise GoneError(replica) from None
+            raise ProcessLookupError(f"the replica {replica} has ended") from None
 
     async def running(self) -> Sequence[str]:
         """Return the replicas that take requests, as Serve's controller last told."""

@@ -22,7 +22,7 @@ import pytest
 
 from rlservo.export.contract.errors import SessionError, SessionLostError, UnavailableError
 from rlservo.serve_app.episodes.request import Episode, Request
-from rlservo.serve_app.episodes.shared_sessions import GoneError, SharedSessions, key_of
+from rlservo.serve_app.episodes.shared_sessions import SharedSessions, key_of
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.request_path import RequestPath
 from rlservo.serve_app.server.settings import ServerSettings
@@ -124,12 +124,12 @@ class Replica:
         await self.world.travel(self.name, replica)
         other = self.world.replicas.get(replica)
         if other is None:
-            raise GoneError(replica)
+            raise ProcessLookupError(replica)
         sent = pickle.loads(pickle.dumps(arguments))
         answer = await other.path.answer_peer(method, *sent)
         await self.world.travel(self.name, replica)
         if replica in self.world.dead:
-            raise GoneError(replica)
+            raise ProcessLookupError(replica)
         return pickle.loads(pickle.dumps(answer))
 
     async def running(self) -> Sequence[str]:
