@@ -1,12 +1,13 @@
 """Count what clients see when parts of a running server die or are replaced under load.
 
-    python benchmarks/faults.py [--on serve|cluster] [FAULT ...]
+    python benchmarks/faults.py [--on serve|cluster|nodes|namespaces] [FAULT ...]
 
 The UR5 policy and the LSTM policy that ship, two replicas, on `rlservo serve` or on a cluster by `serve deploy
-deploy/serve.yaml`. Meanwhile clients ask without end, over JSON, the Open Inference Protocol (binary, gRPC) and
-WebSockets, and through `PolicyClient` and `StreamClient` with the LSTM's memory; each tries once more when it has
-failed, and checks every action. Exits with 1 when an answer was wrong, when a client learned of our insides, or when
-what must cost nothing cost something. Written to bench/faults-serve.json or bench/faults-cluster.json.
+deploy/serve.yaml`; or three replicas on three Ray nodes with a proxy each (`nodes`), in network namespaces with
+addresses of their own as well (`namespaces`, as root). Meanwhile clients ask without end, over JSON, the Open Inference
+Protocol (binary, gRPC) and WebSockets, and through `PolicyClient` and `StreamClient` with the LSTM's memory; each tries
+once more when it has failed, and checks every action. Exits with 1 when an answer was wrong, when a client learned of
+our insides, or when what must cost nothing cost something. Written to bench/faults-WHERE.json.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,8 @@ from rich.table import Table
 
 from flood import flood
 from rlservo.export.contract.bundle import ONNX_FILE
+from rlservo.export.contract.errors import RlservoError
+from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from serving import OUT, ROOT
@@ -41,6 +45,7 @@ from speed.asks import Episode, WrongError, askers, episode_of, open_stream
 from speed.catalogue import Case, case_of, rlservo
 from speed.cluster import Cluster, cluster
 from speed.loads import LoadError, PoliteError, WebSocketLine
+from speed.nodes import KEY, NODES, Node, Nodes, nodes_running
 from speed.servers import Server, StartError, running, started, wait_until_answering
 
 CHECKPOINTS = ROOT / "examples" / "checkpoints"
@@ -51,6 +56,8 @@ DEADLINE_MS = 10_000.0  # of those who have one: what is counted is failures, no
 PAUSE_S = 0.02  # between a client's requests
 BEFORE_S, CALM_S = 2.0, 4.0  # of load before a fault, and without a failure before it counts as over
 BOUND_S = 90.0  # for a fault to be over
+HEAD_AWAY_S = 5.0
+CUT_S = 8.0  # Ray gives a node up that it has not reached for some 15 s
 OLD_STREAM_S = 140.0  # Ray's own limit for a replaced HAProxy is 120
 SETTLE_S = 10.0  # until a new proxy has taken over
 COME_S = 120.0  # for what was deployed to be there
@@ -372,6 +379,134 @@ def _answers(stream: WebSocketLine) -> bool:
     return True
 
 
+# Faults of several nodes
+
+
+def kill_node(bench: Bench, row: Row) -> None:
+    """Kill all of a worker node, wait for its replica elsewhere; then start it anew, and wait for its proxy."""
+    nodes = _nodes(bench)
+    victim, lost = nodes.nodes[NODES - 1], set(nodes.replicas())
+    began = time.monotonic()
+    victim.kill()
+    # Serve knows of it when Ray does.
+    wait_for(lambda: len(now := set(nodes.replicas())) == NODES and now != lost, "the lost replica")
+    row.notes.append(f"as many replicas as before after {time.monotonic() - began:.0f} s")
+    _start_node(nodes, victim, row)
+
+
+def add_node(bench: Bench, row: Row) -> None:
+    """Start one more node, and deploy one more replica."""
+    nodes = _nodes(bench)
+    _start_node(nodes, nodes.nodes[NODES], row)
+    deploy(_replicas(NODES + 1), _running(NODES + 1))(bench, row)
+    _await_proxy(nodes.nodes[NODES])  # Serve starts one where there is a replica
+
+
+def kill_head(bench: Bench, row: Row) -> None:
+    """Kill all of the head, start it again with what Redis kept; alias, canary and commands must be there still."""
+    nodes = _nodes(bench)
+    with _admin(bench) as admin:
+        admin.load("ur5", "2")
+        admin.alias("ur5", "candidate", "2")
+        admin.canary("ur5", "candidate", 0.2)
+    before = wait_for(lambda: _plans(bench, len(nodes.replicas())), "one plan on all replicas")
+    began = time.monotonic()
+    nodes.head.kill()
+    time.sleep(HEAD_AWAY_S)
+    alone = _plans(bench, NODES - 1, by_one=True)
+    if alone != before:
+        row.broken.append(f"without its head the plan was {alone}, before {before}")
+    nodes.start(nodes.head)
+    nodes.await_head()
+    wait_for(lambda: _listening(nodes), "the head's dashboard")
+    row.notes.append(f"the head was away for {time.monotonic() - began:.0f} s")
+    replicas = nodes.application["args"]["replicas"]
+    wait_for(lambda: nodes.status()["status"] == "RUNNING" and len(nodes.replicas()) == replicas, "all replicas")
+    row.notes.append(f"as many replicas as before after {time.monotonic() - began:.0f} s")
+    after = wait_for(lambda: _plans(bench, replicas), "one plan on all replicas")
+    if after != before:
+        row.broken.append(f"the plan was {before}, and is {after}")
+    with _admin(bench) as admin:
+        admin.canary("ur5", None)
+        admin.alias("ur5", "candidate", None)
+        admin.unload("ur5", "2")
+    wait_for(lambda: _plans(bench, replicas) not in (None, after), "a change after it")
+    _await_proxy(nodes.head)
+
+
+def cut_shortly(bench: Bench, row: Row) -> None:
+    """Cut the network between the head and a worker for less than Ray takes to give the node up."""
+    nodes = _nodes(bench)
+    replicas = set(nodes.replicas())
+    nodes.cut(nodes.head, nodes.nodes[1])
+    time.sleep(CUT_S)
+    nodes.mend(nodes.head, nodes.nodes[1])
+    wait_for(lambda: nodes.status()["status"] == "RUNNING", "Serve")
+    new = len(set(nodes.replicas()) - replicas)
+    row.notes.append(f"cut for {CUT_S:g} s, {new} new replicas")
+
+
+def cut_for_long(bench: Bench, row: Row) -> None:
+    """Cut it until Ray has given the node up, and Serve has replaced its replica; mend it, and start the node anew."""
+    nodes = _nodes(bench)
+    cut, lost = nodes.nodes[1], set(nodes.replicas())
+    began = time.monotonic()
+    nodes.cut(nodes.head, cut)
+    wait_for(lambda: len(now := set(nodes.replicas())) == len(lost) and now != lost, "another replica", BOUND_S * 3)
+    row.notes.append(f"as many replicas as before after {time.monotonic() - began:.0f} s")
+    nodes.mend(nodes.head, cut)
+    wait_for(lambda: not cut.runs(), "the given-up node's end", BOUND_S * 3)
+    row.notes.append(f"the node ended {time.monotonic() - began:.0f} s after the cut")
+    cut.stop()
+    _start_node(nodes, cut, row)
+
+
+def _nodes(bench: Bench) -> Nodes:
+    assert isinstance(bench.cluster, Nodes)
+    return bench.cluster
+
+
+def _start_node(nodes: Nodes, node: Node, row: Row) -> None:
+    began = time.monotonic()
+    nodes.start(node)
+    wait_for(node.has_joined, "the node")
+    row.notes.append(f"a node has joined {time.monotonic() - began:.0f} s after its start")
+
+
+def _await_proxy(node: Node) -> None:
+    """Wait until the node's own proxy answers; where all share an address, until its HAProxy is there."""
+    if node.namespace is None:
+        wait_for(lambda: any("/haproxy" in each.command.split(" ")[0] for each in node.members().values()), "a proxy")
+    else:
+        wait_for(lambda: _is_ready(node.address), "the node's proxy")
+
+
+def _is_ready(address: str) -> bool:
+    with closing(HTTPConnection(address, 8000, timeout=2)) as connection:
+        connection.request("GET", "/v2/health/ready")
+        return connection.getresponse().status == 200
+
+
+def _admin(bench: Bench) -> AdminClient:
+    return AdminClient(f"http://127.0.0.1:{bench.server.port}", api_key=KEY, timeout_s=60)
+
+
+def _plans(bench: Bench, replicas: int, *, by_one: bool = False) -> dict[str, Any] | None:
+    """Return what is served of ur5, where so many replicas say the same, or what one says; else None."""
+    if by_one:
+        told = [_versions(bench)]
+    else:
+        with suppress(RlservoError), _admin(bench) as admin:
+            told = admin.replicas()
+            if len(told) != replicas:
+                return None
+    plans = []
+    for each in told:
+        served = [policy for policy in each["policies"] if policy["name"] == "ur5"]
+        plans.append({key: served[-1].get(key) for key in ("aliases", "canary", "version")})
+    return plans[0] if plans and all(plan == plans[0] for plan in plans) else None
+
+
 def overload(bench: Bench, row: Row) -> None:
     """512 connections at once (`flood.py`)."""
     replicas = bench.pids("ServeReplica")
@@ -389,13 +524,14 @@ class Fault:
     do: Callable[[Bench, Row], None]
     free: bool = True  # nobody fails twice
     smooth: bool = False  # nobody fails at all
-    only_on: str | None = None
+    only_on: tuple[str, ...] = ()
     pause_s: float = PAUSE_S
 
 
 REPLICAS = 2
+CLUSTERS, NODED = ("cluster",), ("nodes", "namespaces")
 FAULTS = {
-    "replica": Fault(kill("ray::ServeReplica", REPLICAS)),
+    "replica": Fault(kill("ray::ServeReplica", REPLICAS), only_on=("serve", "cluster")),
     "haproxy": Fault(kill("/haproxy", 1, "ray::HAProxyManager"), free=False),
     "proxy-manager": Fault(kill("ray::HAProxyManager", 1), free=False),
     "proxy-actor": Fault(kill("ray::ProxyActor", 1)),
@@ -405,16 +541,22 @@ FAULTS = {
     "user-config": Fault(
         deploy(_user_config, lambda bench: _versions(bench)["policies"][-1]["version"] == "2"),
         smooth=True,
-        only_on="cluster",
+        only_on=CLUSTERS,
     ),
-    "broken-version": Fault(deploy(_broken_version, _refused), smooth=True, only_on="cluster"),
-    "broken-code": Fault(deploy(_broken_code, _failed), smooth=True, only_on="cluster"),
-    "broken-folder": Fault(deploy(_broken_folder, _failed), smooth=True, only_on="cluster"),
-    "more-replicas": Fault(deploy(_replicas(3), _running(3)), smooth=True, only_on="cluster"),
-    "fewer-replicas": Fault(deploy(_replicas(REPLICAS), _running(REPLICAS)), smooth=True, only_on="cluster"),
-    "variable": Fault(_all_new(_variable), smooth=True, only_on="cluster"),
-    "code": Fault(_all_new(_code), smooth=True, only_on="cluster"),
-    "autoscale": Fault(autoscale, smooth=True, only_on="cluster", pause_s=0.25),
+    "broken-version": Fault(deploy(_broken_version, _refused), smooth=True, only_on=CLUSTERS),
+    "broken-code": Fault(deploy(_broken_code, _failed), smooth=True, only_on=CLUSTERS),
+    "broken-folder": Fault(deploy(_broken_folder, _failed), smooth=True, only_on=CLUSTERS),
+    "more-replicas": Fault(deploy(_replicas(3), _running(3)), smooth=True, only_on=CLUSTERS),
+    "fewer-replicas": Fault(deploy(_replicas(REPLICAS), _running(REPLICAS)), smooth=True, only_on=CLUSTERS),
+    "variable": Fault(_all_new(_variable), smooth=True, only_on=CLUSTERS),
+    "code": Fault(_all_new(_code), smooth=True, only_on=CLUSTERS),
+    "autoscale": Fault(autoscale, smooth=True, only_on=CLUSTERS, pause_s=0.25),
+    "node": Fault(kill_node, only_on=NODED),
+    "add-node": Fault(add_node, smooth=True, only_on=NODED),
+    "head": Fault(kill_head, only_on=NODED),
+    "upgrade": Fault(_all_new(_variable), smooth=True, only_on=NODED),
+    "cut-shortly": Fault(cut_shortly, only_on=("namespaces",)),
+    "cut": Fault(cut_for_long, only_on=("namespaces",)),
 }
 
 
@@ -445,15 +587,17 @@ def main() -> None:
 
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--on", choices=("serve", "cluster"), default="serve")
+    parser.add_argument("--on", choices=("serve", *CLUSTERS, *NODED), default="serve")
     parser.add_argument("--keep", type=Path, help="a folder for the exported policies, to be used again")
     parser.add_argument("faults", nargs="*", metavar="FAULT", help=f"default: all. {', '.join(FAULTS)}")
     arguments = parser.parse_args()
     if unknown := [name for name in arguments.faults if name not in FAULTS]:
         parser.error(f"unknown fault {unknown[0]!r}: known are {', '.join(FAULTS)}")
-    possible = [name for name, fault in FAULTS.items() if fault.only_on in (None, arguments.on)]
+    possible = [name for name, fault in FAULTS.items() if arguments.on in (fault.only_on or ("serve", "cluster"))]
     if impossible := [name for name in arguments.faults if name not in possible]:
-        parser.error(f"{impossible[0]!r} needs --on {FAULTS[impossible[0]].only_on}")
+        parser.error(
+            f"{impossible[0]!r} needs --on {' or '.join(FAULTS[impossible[0]].only_on or ('serve', 'cluster'))}"
+        )
     arguments.faults = arguments.faults or possible
     return arguments
 
@@ -494,6 +638,22 @@ def serving(on: str, case: Case, policies: Path, folder: Path, console: Console)
             wait_for(lambda: len(bench.pids("ray::ServeReplica")) == REPLICAS, "the replicas")
             time.sleep(CALM_S)  # Serve replaces HAProxy for each
             yield bench
+        return
+    if on in NODED:
+        with nodes_running(case, policies, folder, mark, namespaces=on == "namespaces") as nodes, ExitStack() as front:
+            wait_for(lambda: _listening(nodes), "the cluster")
+            nodes.application["deployments"] = served("1")
+            taken, said = nodes.deploy()
+            if not taken:
+                raise StartError(f"`serve deploy` failed: {said[-1000:]}")
+            if nodes.server.command:
+                front.enter_context(started(nodes.server, folder, mark))
+            wait_for(lambda: len(nodes.replicas()) == NODES, "the replicas")
+            for node in nodes.nodes[:NODES]:
+                _await_proxy(node)
+                console.print(f"node {node.number} answers")
+            time.sleep(CALM_S)
+            yield Bench(case, lstm, nodes.server, nodes, folder, console)
         return
     made = cluster(case, policies, folder)
     made.application["args"]["replicas"] = REPLICAS
@@ -569,8 +729,6 @@ def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = COME_S)
 
 
 def get(server: Server, path: str) -> dict[str, Any]:
-    from http.client import HTTPConnection
-
     connection = HTTPConnection("127.0.0.1", server.port, timeout=10)
     try:
         connection.request("GET", path)

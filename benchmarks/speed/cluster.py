@@ -37,6 +37,8 @@ class Cluster:
     folder: Path
     variables: dict[str, str]
     configuration: dict[str, Any] = field(default_factory=dict)
+    host: str = "127.0.0.1"
+    """Where the head's dashboard listens."""
 
     @property
     def application(self) -> dict[str, Any]:
@@ -49,14 +51,14 @@ class Cluster:
         file.write_text(yaml.safe_dump(self.configuration))
         command = [sys.executable, "-m", "ray.serve.scripts", "deploy", str(file)]
         done = subprocess.run(
-            [*command, "-a", f"http://127.0.0.1:{self.dashboard}"],
+            [*command, "-a", f"http://{self.host}:{self.dashboard}"],
             env=environment("", self.variables), cwd=self.folder, capture_output=True, text=True, timeout=DEPLOY_S,
         )  # fmt: skip
         return done.returncode == 0, done.stdout + done.stderr
 
     def status(self) -> dict[str, Any]:
         """Return what `serve status` tells of the application."""
-        connection = HTTPConnection("127.0.0.1", self.dashboard, timeout=30)
+        connection = HTTPConnection(self.host, self.dashboard, timeout=30)
         try:
             headers = {"Authorization": f"Bearer {self.variables['RAY_AUTH_TOKEN']}"}
             connection.request("GET", "/api/serve/applications/", headers=headers)
@@ -80,7 +82,7 @@ def cluster(case: Case, policies: Path, folder: Path, *, cpus: int = 4) -> Clust
     plan = {"dashboard": dashboard, "folder": str(home / "r"), "cpus": cpus}
     variables = cluster_environment(home) | {
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
-        **_replica_ports(),
+        **replica_ports(),
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
@@ -100,7 +102,7 @@ def cluster(case: Case, policies: Path, folder: Path, *, cpus: int = 4) -> Clust
     return Cluster(server, dashboard, home, variables, configuration)
 
 
-def _replica_ports() -> dict[str, str]:
+def replica_ports() -> dict[str, str]:
     """Return ranges that no other Ray cluster on this machine uses: those of all clusters are the same by default."""
     first = 29_000 + 8 * secrets.randbelow(40)
     return {

@@ -7,7 +7,6 @@ right. A state goes to the version that it is of, and to no other. Whatever is r
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -31,10 +30,11 @@ from rlservo.serve_app.wire.state_names import BELONGS_TO
 class Episodes:
     """Acts for requests that belong to an episode."""
 
-    def __init__(self, *, max_sessions: int, idle_s: float, alone: Callable[[], bool] = lambda: True) -> None:
-        """`alone` says whether every request reaches this process; if not, no id finds its session reliably."""
+    def __init__(self, *, max_sessions: int, idle_s: float) -> None:
+        """`max_sessions` and `idle_s` bound what `Sessions` remembers."""
         self.sessions = Sessions(most=max_sessions, idle_s=idle_s)
-        self._alone = alone
+        self.is_shared = False
+        """Whether sessions are found by `shared_sessions.py`: ids of policies that remember nothing are labels then."""
         self.marks_states = False
         """Whether a state that goes to the client names its episode, for a recording."""
 
@@ -54,7 +54,7 @@ class Episodes:
             request.label = str(episode.session_id)
             name = request.policy
             has_session = self.sessions.peek(name, episode.session_id) is not None
-            begins = episode.reset and self._alone()
+            begins = episode.reset and not self.is_shared
             if has_session or begins or _choose(store, request).is_stateful:
                 return self._act_in_session(store, request, episode, episode.session_id)
             # There is nothing to remember: the id says only which requests belong together.
@@ -145,11 +145,6 @@ class Episodes:
             raise RequestError("the request has a 'state' and a 'session_id': either you carry the state, or we do")
         if episode.reset:
             policy = _choose(store, request)
-            if not self._alone():
-                raise SessionError(
-                    "this server has several replicas, and requests of a session would reach any of them: send the "
-                    "'state' along, use a WebSocket, or run one replica"
-                )
             if policy.is_stateful and not episode.end:
                 self.sessions.check_room(name, session_id)
             session = Session(policy)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import secrets
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from rlservo.export.contract.errors import DeadlineError
 from rlservo.serve_app.episodes.sessions import Session, SessionId
 
 LONGEST_LABEL = 128  # as a session's id; a header may have 16 KB
@@ -87,3 +89,13 @@ class Request:
     """Whether its JSON held NaN or Infinity, which JSON does not have."""
     reply_options: Any = None
     """How the reply is to be written: the codec's own affair, from its `parse` to its `encode`."""
+
+
+def check_deadline(request: Request) -> None:
+    """Raise DeadlineError for a request whose deadline has passed."""
+    late_ms = (time.perf_counter() - request.received) * 1e3
+    if request.deadline_ms is not None and late_ms >= request.deadline_ms:
+        raise DeadlineError(
+            f"the deadline of {request.deadline_ms:g} ms passed before the policy was asked: nothing computed",
+            {"deadline_ms": request.deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": request.seq},
+        )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -41,6 +41,9 @@ class Session:
     seq: int | None = None  # of the last request that was answered
     inputs_hash: bytes = b""  # of its observation
     answer: Decision | None = None  # to the last request, for the same request sent again
+    token: str = ""  # of its episode, where several replicas serve (`shared_sessions.py`, as the next two)
+    stamps: deque[bytes] = field(default_factory=lambda: deque(maxlen=8))  # the proxy's, of the last requests
+    stamped: Decision | None = None  # the answer to the last of them
 
     def keep(self, step: Step) -> None:
         """Remember what a step came to."""
@@ -168,6 +171,17 @@ class Sessions:
         if session is not None:
             self.rows -= session.rows
             self.lost[name] += lost
+
+    def tokens(self) -> set[str]:
+        """Return the tokens of all."""
+        return {session.token for session in self._sessions.values()}
+
+    def take_all(self) -> list[tuple[str, SessionId, Session]]:
+        """Forget all sessions, and return them."""
+        taken = [(name, session_id, session) for (name, session_id), session in self._sessions.items()]
+        for name, session_id, _ in taken:
+            self.end(name, session_id)
+        return taken
 
     def _full(self, rows: int) -> UnavailableError:
         what = "another episode" if rows == 1 else f"{rows} more episodes (a batch is so many)"

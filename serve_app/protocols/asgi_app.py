@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
@@ -36,16 +34,15 @@ def create_app(
     *,
     replica: str = "",
     control: ReplicaVersions | None = None,
-    alone: Callable[[], bool] = lambda: True,
     host: str = "127.0.0.1",
 ) -> PolicyApp:
     """Return the application; `store_provider` gives None for as long as the policies are being loaded.
 
-    With a `control` what is served can be administered. `replica` and `alone` are the `Core`'s, which is the
-    application's `state.core`; `host` is the address that is listened on. Raises UsageError when the API keys that
+    With a `control` what is served can be administered. `replica` is the `Core`'s, which is the application's
+    `state.core`; `host` is the address that is listened on. Raises UsageError when the API keys that
     `settings` name cannot be read.
     """
-    core = Core(store_provider, settings, replica=replica, control=control, alone=alone)
+    core = Core(store_provider, settings, replica=replica, control=control)
     checks = RequestChecks(Hosts(host, settings, keyed=bool(core.keys.accepted.keys)), core.keys)
     # A redirect would be an answer to a path that no route has: there is none.
     app = PolicyApp(

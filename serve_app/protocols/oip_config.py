@@ -51,7 +51,7 @@ def model_config(core: Core, name: str, version: str | None) -> dict[str, Any]:
         # So many are run at once as soon as they are there, and nobody waits for others to come.
         most = policy.options.micro_batch
         config["dynamic_batching"] = {"preferred_batch_size": [most], "max_queue_delay_microseconds": 0}
-    elif policy.is_stateful and core.is_alone():  # requests of one sequence could reach several replicas
+    elif policy.is_stateful:
         config["sequence_batching"] = _sequences(core, policy)
     return config
 

@@ -25,6 +25,7 @@ from rlservo.serve_app.protocols.oip_grpc import InferenceService
 from rlservo.serve_app.ray_serve import ingress, ray_parts
 from rlservo.serve_app.ray_serve.autoscaling import BUSY, Load
 from rlservo.serve_app.ray_serve.gcs_ledger import GcsLedger
+from rlservo.serve_app.ray_serve.replica_peers import GcsRecords, ReplicaPeers
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.core import Core
@@ -42,6 +43,7 @@ APPLICATION = "rlservo"
 DEPLOYMENT = "PolicyServer"
 SPARE = 64  # health, metrics, documentation
 GRPC_SERVICE = "rlservo.serve_app.ray_serve.grpc_ingress:add_service"
+SWEEP_PERIOD_S = 300.0  # [s] between looks for records of sessions that are no more
 FOLLOW_TIMEOUT_S = 45.0  # [s] for every replica to load and prove what a change brought
 
 
@@ -59,6 +61,9 @@ class BuildArguments(BaseModel):
 
     served: dict[str, Any] = {}
     """Versions, aliases, canary and shadow (ServedConfig), for where `user_config` cannot be given; that wins."""
+
+    single: bool = False
+    """Whether there is never another replica, as in `rlservo serve`: sessions by id need no records then."""
 
     settings: dict[str, Any] = {}
     """Fields of ServerSettings; what is not given comes from RLSERVO_* variables, then from the defaults."""
@@ -84,7 +89,7 @@ def build(args: BuildArguments) -> Application:
     options = server.options(
         num_replicas=args.replicas, max_ongoing_requests=_serve_limit(settings), user_config=args.served
     )
-    return options.bind(places, settings.model_dump())
+    return options.bind(places, settings.model_dump(), args.single)
 
 
 def _serve_limit(settings: ServerSettings) -> int:
@@ -111,7 +116,7 @@ def _serve_limit(settings: ServerSettings) -> int:
 class PolicyServer(InferenceService):
     """A replica: the policies, the HTTP application and the gRPC methods over them."""
 
-    def __init__(self, places: list[str], settings: dict[str, Any]) -> None:
+    def __init__(self, places: list[str], settings: dict[str, Any], single: bool = False) -> None:
         """Check the settings. Serve calls `reconfigure` next, and sends requests only after that."""
         self._settings = ServerSettings(**settings)
         context = serve.get_replica_context()
@@ -128,9 +133,11 @@ class PolicyServer(InferenceService):
             loader = version_loader(places, self._settings)
         except RlservoError as error:
             raise _plain(error) from None
+        place = (_controller()._actor_id.hex(), context.app_name, context.deployment)
+        self._records = None if single else GcsRecords(*place)
         self._control = ReplicaVersions(
             loader,
-            GcsLedger(_controller()._actor_id.hex(), context.app_name, context.deployment),
+            GcsLedger(*place),
             replica=self._replica,
             broadcast=self._tell_all,
             gather=self._ask_all,
@@ -143,12 +150,13 @@ class PolicyServer(InferenceService):
             self._settings,
             replica=self._replica,
             control=self._control,
-            alone=_alone,
             host=self._host,
         )
         core: Core = app.state.core
         self._core = core
         core.admission.loop_clock.start()
+        if self._records is not None:
+            core.share_sessions(self._records, ReplicaPeers(self._id, "answer_peer", self._running))
         # By way of the module: Serve pickles this class with copies of the objects that it names.
         ingress.bypass.install(app, answers=self._settings.ahead_of_serve and _can_bypass_serve())
         self.serve_grpc(core, local_only=is_loopback(self._host))
@@ -167,6 +175,7 @@ class PolicyServer(InferenceService):
             self._watch = asyncio.create_task(self._control.poll_ledger())
             if self._settings.poll_s is not None:
                 self._poll = asyncio.create_task(self._control.poll_repository(self._settings.poll_s))
+            self._sweep = asyncio.create_task(self._sweep_records())
         else:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
 
@@ -192,11 +201,28 @@ class PolicyServer(InferenceService):
         """Return what this replica counted of a policy; replicas call this of each other."""
         return {} if self._core is None else listing.count(self._core, name)
 
-    def __del__(self) -> None:
-        """End the recording: Serve calls this when the replica has answered its last request."""
+    async def answer_peer(self, method: str, *arguments: Any) -> Any:
+        """Take a step of a session for another replica; replicas call this of each other."""
+        return None if self._core is None else await self._core.answer_peer(method, *arguments)
+
+    async def __del__(self) -> None:
+        """Hand sessions over and end the recording: Serve calls this when the replica has answered its last request."""
         core = getattr(self, "_core", None)
+        if core is not None and core.shared_sessions is not None:
+            await core.shared_sessions.hand_over()
         if core is not None and core.recorder is not None:
             core.recorder.close()
+
+    async def _running(self) -> list[str]:
+        return [str(each["replica"]) for each in await self._ask_all() if each]
+
+    async def _sweep_records(self) -> None:
+        while self._core is not None and self._core.shared_sessions is not None:
+            await asyncio.sleep(SWEEP_PERIOD_S)
+            try:
+                await self._core.shared_sessions.sweep()
+            except Exception as error:  # the next one may do
+                logger.warning("records of sessions could not be looked at: %s", error)
 
     async def _configure(self, user_config: Any) -> None:
         try:
@@ -262,11 +288,6 @@ def _can_bypass_serve() -> bool:
     return not ray_parts.find("ray.serve._private.tracing_utils:is_tracing_enabled")()
 
 
-def _alone() -> bool:
-    """Whether this is the deployment's only replica, as Serve's controller last told it."""
-    return int(serve.get_replica_context().world_size) <= 1
-
-
 def _listening_host() -> str:
     """Return the address that Serve's HTTP options name; it is where this replica's own port listens, too."""
     options: Any = ray.get(_controller().get_http_config.remote())
@@ -288,5 +309,8 @@ def start(
     services = [] if grpc_port is None else [GRPC_SERVICE]
     grpc_options = gRPCOptions(port=grpc_port or 0, grpc_servicer_functions=services, enable_reflection=False)
     serve.start(http_options=HTTPOptions(host=host, port=port), grpc_options=grpc_options)
-    app = build(BuildArguments(policies=policies, replicas=replicas, served=served, settings=settings))
+    arguments = BuildArguments(
+        policies=policies, replicas=replicas, served=served, single=replicas == 1, settings=settings
+    )
+    app = build(arguments)
     serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)

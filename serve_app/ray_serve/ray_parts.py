@@ -14,11 +14,19 @@ KNOWN = "2.60"
 """The Ray these names are of."""
 
 KEY_VALUE_STORE = "ray.experimental.internal_kv"
+GCS_CLIENT = f"{KEY_VALUE_STORE}:internal_kv_get_gcs_client"
+REPLICA_ID = "ray.serve._private.common:ReplicaID"
+REQUEST_METADATA = "ray.serve._private.common:RequestMetadata"
 NEEDED = (
     "ray.serve.context:_get_global_client",
     "ray.serve._private.controller:ServeController.get_http_config",
     "ray.serve._private.controller:ServeController.get_deployment_config",
     *(f"{KEY_VALUE_STORE}:_internal_kv_{verb}" for verb in ("get", "put", "list", "del")),
+    GCS_CLIENT,
+    "ray._raylet:InnerGcsClient",
+    f"{REPLICA_ID}.to_full_id_str",
+    REQUEST_METADATA,
+    "ray.serve._private.replica:ReplicaActor.handle_request",
     "ray.serve._private.constants:RAY_SERVE_ENABLE_HA_PROXY",
     "ray.serve._private.default_impl:add_grpc_address",
     "ray.serve._private.grpc_util:gRPCGenericServer._override_method_handler",

@@ -5,9 +5,10 @@ What describes the server (`listing.py`, `gauges.py`) reads it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from rlservo.export.contract.errors import UnknownPolicyError
+from rlservo.serve_app.episodes.shared_sessions import Peers, RecordStore, SharedSessions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.request_path import RequestPath, StoreProvider
@@ -25,23 +26,24 @@ class Core(RequestPath):
         *,
         replica: str = "",
         control: ReplicaVersions | None = None,
-        alone: Callable[[], bool] = lambda: True,
     ) -> None:
         """Read the keys that `settings` name; `replica` names this process in the metrics. Raises UsageError.
 
-        With a `control` what is served can change while the server runs. `alone` says whether every request comes to
-        this process, as sessions by id need.
+        With a `control` what is served can change while the server runs.
         """
-        super().__init__(store_provider, settings, alone=alone)
+        super().__init__(store_provider, settings)
         self.control = control
         self.replica = replica
-        self.is_alone = alone
         self.keys = CurrentKeys(settings)
         if settings.record is not None:
             from rlservo.serve_app.server.request_recorder import RequestRecorder  # which needs an extra
 
             self.recorder = RequestRecorder(settings)
             self.episodes.marks_states = True
+
+    def share_sessions(self, records: RecordStore, peers: Peers) -> None:
+        """Let sessions by id be found by all replicas: requests of one reach any of them."""
+        self.shared_sessions = SharedSessions(self.episodes, records, peers, self.replica)
 
     @property
     def ready(self) -> bool:

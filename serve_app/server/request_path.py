@@ -33,7 +33,8 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec
 from rlservo.serve_app.episodes.episodes import Episodes
-from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.episodes.request import Request, check_deadline
+from rlservo.serve_app.episodes.shared_sessions import SharedSessions, without_policy
 from rlservo.serve_app.server.loop_clock import LoopClock
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
 from rlservo.serve_app.server.request_metrics import Metrics
@@ -106,7 +107,7 @@ class Admission:
         if stamp is None:
             return None
         since, _, whose = stamp.partition(b"-")
-        if whose != self._clock_id or not since.isdigit() or len(since) > 15:
+        if not whose.startswith(self._clock_id) or not since.isdigit() or len(since) > 15:
             return None
         return max(0.0, time.time() - int(since) / 1e3)
 
@@ -181,13 +182,14 @@ class Admission:
 class RequestPath:
     """Answers requests, and is the one place that admits, counts, logs and times them."""
 
-    def __init__(self, store_provider: StoreProvider, settings: ServerSettings, *, alone: Callable[[], bool]) -> None:
-        """`store_provider` gives None for as long as the policies are being loaded; `alone` is for `Episodes`."""
+    def __init__(self, store_provider: StoreProvider, settings: ServerSettings) -> None:
+        """`store_provider` gives None for as long as the policies are being loaded."""
         self._store_provider = store_provider
         self._max_batch = settings.max_batch
         self.settings = settings
         self.admission = Admission(settings)
-        self.episodes = Episodes(max_sessions=settings.max_sessions, idle_s=settings.session_idle_s, alone=alone)
+        self.episodes = Episodes(max_sessions=settings.max_sessions, idle_s=settings.session_idle_s)
+        self.shared_sessions: SharedSessions | None = None  # where requests of a session reach any of several replicas
         self.metrics = Metrics()
         self.log = RequestLog(settings)
         self.shadows = Shadows()
@@ -243,12 +245,16 @@ class RequestPath:
         """
         store, name, obs = self.store(), request.policy, request.obs
         if request.deadline_ms is not None:
-            _check_deadline(request)
+            check_deadline(request)
         single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
         if (len(obs) if single else most_rows(obs)) > self._max_batch:
             self._check_batch(store, request)
         if request.episode is not None or request.stream is not None:
-            decision = self.episodes.act(store, request)
+            shared = self.shared_sessions
+            if shared is not None and request.episode is not None and request.episode.session_id is not None:
+                decision = await shared.act(store, request)
+            else:
+                decision = self.episodes.act(store, request)
         elif store.batches and not request.explore:
             check = partial(_check_again, request, time.perf_counter(), self.admission.max_wait_s)
             decision = await store.act_together(name, request.version, obs, label=request.label, check=check)
@@ -260,6 +266,25 @@ class RequestPath:
         if shadow is not None and decision.version == shadow.of and not request.explore:
             self.shadows.offer(shadow, obs, decision)
         return decision
+
+    async def answer_peer(self, method: str, *arguments: Any) -> Any:
+        """Answer another replica's `SharedSessions`; what a request is refused with is returned."""
+        shared, store = self.shared_sessions, self.store()
+        assert shared is not None
+        if method != "act":
+            return shared.adopt(store, *arguments) if method == "adopt" else shared.forget(*arguments)
+        request, token = arguments
+        request.received = time.perf_counter()
+        try:
+            self.admission.enter()
+            decision = await shared.act_here(store, request, token)
+        except RlservoError as error:
+            return error
+        if decision is None:
+            return None
+        if self.recorder is not None:
+            self.recorder.note_answer(request, decision, time.perf_counter() - request.received)
+        return without_policy(decision)
 
     def record_failure(
         self, request: Request, code: str, sentence: str, *, peer: str | None = None, asked: str | None = None
@@ -305,7 +330,7 @@ class RequestPath:
         """Count an episode that ended, unless chance gave its requests to one version or another."""
         carries_state = decision.episode is not None and decision.episode.state is not None
         drawn = request.version is None and not carries_state and self.store().is_drawn(decision.name, request.label)
-        if not drawn and not decision.is_repeated:
+        if not drawn and not decision.is_repeat:
             self.metrics.count_end(decision, status)
 
     def _admit(self, request: Request) -> None:
@@ -338,16 +363,7 @@ def _check_again(request: Request, since: float, limit_s: float) -> None:
     if time.perf_counter() - since > limit_s:
         raise LateError(f"the observation waited longer than {limit_s * 1e3:g} ms for its batch: send a newer one")
     if request.deadline_ms is not None:
-        _check_deadline(request)
-
-
-def _check_deadline(request: Request) -> None:
-    late_ms = (time.perf_counter() - request.received) * 1e3
-    if request.deadline_ms is not None and late_ms >= request.deadline_ms:
-        raise DeadlineError(
-            f"the deadline of {request.deadline_ms:g} ms passed before the policy was asked: nothing computed",
-            {"deadline_ms": request.deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": request.seq},
-        )
+        check_deadline(request)
 
 
 # Number of observations in a request, before anything is computed of it.

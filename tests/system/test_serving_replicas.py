@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
+import os
 import signal
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import grpc
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import SessionError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.oip_messages import messages
@@ -63,12 +65,29 @@ def wait_until_followed(port: int, statuses: dict[str, int]) -> None:
     """Wait until either replica answers each key so."""
     deadline = time.monotonic() + 30
     for key, expected in statuses.items():
-        while {status(port, key) for _ in range(20)} != {expected}:
+        while not follows(port, key, expected):
             assert time.monotonic() < deadline
             time.sleep(0.02)
 
 
-def test_states_and_streams_keep_an_episode_and_ids_are_refused(server: Run, recurrent: Path, key_file: Path) -> None:
+def follows(port: int, key: str, expected: int) -> bool:
+    with contextlib.suppress(http.client.RemoteDisconnected, ConnectionError):  # of a replica that was killed
+        return {status(port, key) for _ in range(20)} == {expected}
+    return False
+
+
+def ask(port: int, obs: np.ndarray, session_id: str, **more: bool) -> tuple[int, dict[str, Any]]:
+    """Ask for an action of a session on a connection of its own: HAProxy chooses the replica; again if it is busy."""
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=20)) as connection:
+        headers = {"content-type": "application/json", "authorization": f"Bearer {OLD}"}
+        body = json.dumps({"obs": obs.tolist(), "session_id": session_id, **more})
+        connection.request("POST", f"/v1/policies/{MODEL}/act", body, headers)
+        reply = connection.getresponse()
+        content = json.loads(reply.read())
+    return ask(port, obs, session_id, **more) if reply.status == 503 else (reply.status, content)
+
+
+def test_states_streams_and_ids_keep_an_episode(server: Run, recurrent: Path, key_file: Path) -> None:
     key_file.write_text(OLD_LINE + "\n")
     wait_until_followed(server.port, {OLD: 200})
     assert len(server.processes("ServeReplica")) == 2
@@ -78,13 +97,19 @@ def test_states_and_streams_keep_an_episode_and_ids_are_refused(server: Run, rec
     with (
         PolicyClient(url, MODEL, api_key=OLD) as carrying,
         StreamClient(url, MODEL, api_key=OLD, server_state=True) as streaming,
-        PolicyClient(url, MODEL, api_key=OLD, server_state=True) as refused,
+        PolicyClient(url, MODEL, api_key=OLD, server_state=True) as named,
     ):
         for obs, action in zip(SEEN, expected, strict=True):
             np.testing.assert_allclose(carrying.act(obs), action, rtol=1e-4, atol=1e-5)
             np.testing.assert_allclose(streaming.act(obs), action, rtol=1e-4, atol=1e-5)
-        with pytest.raises(SessionError, match="several replicas"):
-            refused.act(SEEN[0])
+            np.testing.assert_allclose(named.act(obs), action, rtol=1e-4, atol=1e-5)
+    ids = [f"cell-{number}" for number in range(8)]
+    for step, (obs, action) in enumerate(zip(SEEN, expected, strict=True)):
+        for session_id in ids:
+            code, reply = ask(server.port, obs, session_id, reset=step == 0, end=step == len(SEEN) - 1)
+            assert (code, reply.get("session_step")) == (200, step + 1), reply
+            np.testing.assert_allclose(reply["action"], action, rtol=1e-4, atol=1e-5)
+    assert ask(server.port, SEEN[0], ids[0])[0] == 410
 
 
 def test_both_follow_the_file_of_keys_and_end_grpc_streams(server: Run, key_file: Path) -> None:
@@ -114,3 +139,33 @@ def test_both_follow_the_file_of_keys_and_end_grpc_streams(server: Run, key_file
             assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
     finally:
         stop.set()
+
+
+def test_sessions_of_a_killed_replica_are_lost_and_the_others_go_on(
+    server: Run, recurrent: Path, key_file: Path
+) -> None:
+    key_file.write_text(OLD_LINE + "\n")
+    wait_until_followed(server.port, {OLD: 200})
+    with Policy.load(recurrent / MODEL) as policy:
+        expected = [policy.act(obs) for obs in SEEN[:3]]
+    ids = [f"robot-{number}" for number in range(24)]
+    for step in range(2):
+        for session_id in ids:
+            assert ask(server.port, SEEN[step], session_id, reset=step == 0)[0] == 200
+    before = server.processes("ServeReplica")
+    os.kill(before[0], signal.SIGKILL)
+    wait_until_followed(server.port, {OLD: 200})  # HAProxy has heard of it
+    replies = [ask(server.port, SEEN[2], session_id) for session_id in ids]
+    lost = {session_id for session_id, (code, _) in zip(ids, replies, strict=True) if code == 410}
+    assert 0 < len(lost) < len(ids)
+    for code, reply in replies:
+        assert code in (200, 410), reply
+        if code == 200:
+            np.testing.assert_allclose(reply["action"], expected[2], rtol=1e-4, atol=1e-5)
+    deadline = time.monotonic() + 120
+    while len(set(server.processes("ServeReplica")) - {before[0]}) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    for session_id in lost:  # whoever comes after the dead one has nothing of it
+        assert ask(server.port, SEEN[2], session_id)[0] == 410
+        assert ask(server.port, SEEN[0], session_id, reset=True)[0] == 200

@@ -275,17 +275,6 @@ def test_a_refused_request_leaves_the_memory_where_it_was(ask: Ask, recurrent: P
         assert session(ask, obs, explore=True, seed=-1)[0] == 400
 
 
-def test_with_several_replicas_ids_are_refused_and_states_and_streams_go_on(store: PolicyStore, served: Serve) -> None:
-    (obs,) = observations("lstm_box", 1)
-    with served(create_app(lambda: store, ServerSettings(), alone=lambda: False)) as port:
-        ask = asking(port)
-        status, reply = session(ask, obs, reset=True)
-        assert (status, reply["code"]) == (409, "session-conflict") and "several replicas" in reply["error"]
-        assert ask("/v1/policies/lstm_box/act", {"obs": plain(obs), "state": {}})[0] == 200
-        with Socket(port, "/v1/policies/lstm_box/stream") as stream:
-            assert stream.ask(obs=obs)["session_step"] == 1
-
-
 def test_a_session_stays_with_its_version_until_that_is_gone(
     store: PolicyStore, served: Serve, box_policy: Callable[..., Path], tmp_path: Path
 ) -> None:

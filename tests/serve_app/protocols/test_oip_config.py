@@ -109,11 +109,6 @@ def test_every_input_and_output_of_the_metadata_is_in_the_configuration(ask: Ask
             ]
 
 
-def test_several_replicas_offer_no_sequences(store: PolicyStore) -> None:
-    app = create_app(lambda: store, ServerSettings(), alone=lambda: False)
-    assert "sequence_batching" not in model_config(app.state.core, "leaky", None)
-
-
 def test_an_alias_means_its_version(store: PolicyStore) -> None:
     plan = PolicyPlan(versions={"1": "", "2": "", "10": ""}, aliases={"production": "2"})
     aliased = PolicyStore([store.get("ur5", version) for version in ("1", "2", "10")], {"ur5": plan})
