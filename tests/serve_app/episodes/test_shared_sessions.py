@@ -391,7 +391,7 @@ def test_a_replica_that_ends_hands_its_episodes_over(world: World, obs: Any) -> 
         await owner.shared.hand_over()
         assert (await owner.act(request("s", obs))).episode.step == 3  # type: ignore[union-attr]
         world.kill(owner.name)
-        assert (await other.act(request("s", obs, stamp=b"2"))).is_repeated
+        assert (await other.act(request("s", obs, stamp=b"2"))).is_repeat
         assert (await other.act(request("s", obs))).episode.step == 4  # type: ignore[union-attr]
 
     asyncio.run(run())
