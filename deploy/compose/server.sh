@@ -10,9 +10,6 @@ export RAY_REDIS_ADDRESS="${RLSERVO_REDIS:?HOST:PORT of Redis}"
 environment="$(rlservo cluster env --one-machine --haproxy-folder "$HOME/haproxy" --max-connections-per-address 0)"
 eval "$environment"
 dashboard="${RLSERVO_DASHBOARD_PORT:-8265}"
-# A container's Ray takes over from the one before only when GCS has given that node up, and waits 30 s for it. Ten
-# refused connections are 5 s; a node that stands still still has ten time-outs of 10 s.
-export RAY_health_check_initial_delay_ms=0 RAY_health_check_period_ms=500 RAY_health_check_failure_threshold=10
 ray start --head --block --node-ip-address 127.0.0.1 --dashboard-host 127.0.0.1 --dashboard-port "$dashboard" \
   --object-store-memory 80000000 --disable-usage-stats \
   --redis-password "$(cat "${RLSERVO_REDIS_PASSWORD_FILE:?the file of its password}")" "$@" &
