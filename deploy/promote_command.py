@@ -14,7 +14,6 @@ import typer
 from rlservo.deploy import terminal
 from rlservo.deploy.policy_commands import LOCAL, KeyFile, Name, Url
 from rlservo.deploy.terminal import Json, needs_extra, print_json
-from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN
 from rlservo.export.contract.errors import RlservoError, UsageError
 
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -52,8 +51,9 @@ def promote(
     key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:
-    """Send a share of the sessions to a version, watch it on all replicas, then put it into production or not.
+    """Watch a canary, then promote it or roll it back.
 
+    A share of the sessions gets the version; what all replicas count of it decides whether it is put into production.
     Rolled back at once when a condition is surely met; at the end, when it is met at all. Exit code: 0 promoted, 1
     rolled back, 3 too little to judge, 4 stopped because somebody else has changed what is served or the server is out
     of reach, 2 bad input. Ctrl-C rolls back (130). Killed, it leaves the canary running; the same line, started again,
@@ -61,6 +61,8 @@ def promote(
 
     Example: `rlservo policy promote ur5 2 --canary 10% --for 10m --unless 'error_rate>0.1% or latency_p99>20ms'`
     """
+    from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN
+
     with needs_extra("client"):
         from rlservo.serve_app.client.admin_client import AdminClient, find_key
         from rlservo.serve_app.client.promotion import EXIT_CODES, Promotion, Terms
