@@ -21,7 +21,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -80,9 +80,9 @@ def wait_for_server(url: str, server: subprocess.Popen[str]) -> None:
             time.sleep(0.2)
 
 
-def cpu_seconds(programs: dict[str, int]) -> Counter[str]:
+def cpu_seconds(programs: dict[str, int]) -> dict[str, float]:
     """Return the processor time so far by what a process is for: `programs` by name, and the browser's parts."""
-    spent: Counter[str] = Counter()
+    spent: defaultdict[str, float] = defaultdict(float)
     for name, pid in programs.items():
         root = psutil.Process(pid)
         for process in (root, *root.children(recursive=True)):
@@ -98,7 +98,7 @@ def cpu_seconds(programs: dict[str, int]) -> Counter[str]:
 
 
 def measure(page: Any, seconds: float, programs: dict[str, int]) -> tuple[str, ...]:
-    def state() -> tuple[float, int, Counter[str]]:
+    def state() -> tuple[float, int, dict[str, float]]:
         return time.perf_counter(), page.evaluate("window.frames_drawn"), cpu_seconds(programs)
 
     page.wait_for_timeout(1e3 * SETTLE_S)

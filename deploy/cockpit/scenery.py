@@ -56,10 +56,12 @@ class Scenery:
             self._target = _Handle(server, "/target", TARGET_LIFT, env.IS_PLANAR, on_target)
         if on_robot is not None:
             self._start = _Handle(server, "/start", ROBOT_LIFT, env.IS_PLANAR, on_robot)
-        self._obstacles = [
-            _Handle(server, f"/obstacle_{index}", OBSTACLE_LIFT, env.IS_PLANAR, partial(on_obstacle, index))
-            for index in range(len(env.obstacle_positions()) if on_obstacle is not None else 0)
-        ]
+        self._obstacles: list[_Handle] = []
+        if on_obstacle is not None:
+            self._obstacles = [
+                _Handle(server, f"/obstacle_{index}", OBSTACLE_LIFT, env.IS_PLANAR, partial(on_obstacle, index))
+                for index in range(len(env.obstacle_positions()))
+            ]
         self.offer_start(False)
         cells = 4 * int(4 * float(env.model.stat.extent) / (4 * CELL_M))  # whole metres to both sides
         self._floor = server.scene.add_image(
