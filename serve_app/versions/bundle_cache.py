@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.contract.errors import BundleError, UnavailableError
+from rlservo.export.contract.errors import BundleError, UnavailableError, UsageError
 from rlservo.export.contract.regular_files import blocks, open_regular
 from rlservo.serve_app.versions.manifest import Manifest
 
@@ -45,9 +45,12 @@ class Lease:
 
 
 def default_folder() -> Path:
-    """Return where bundles are kept unless a setting says otherwise."""
+    """Return where bundles are kept unless a setting says otherwise. Raises UsageError."""
     root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path("~/.cache").expanduser()) / "rlservo" / "bundles"
+    try:
+        return (Path(root) if root else Path("~/.cache").expanduser()) / "rlservo" / "bundles"
+    except RuntimeError:  # a container's user without a home
+        raise UsageError("this user has no home folder for the cache: name a folder in RLSERVO_CACHE") from None
 
 
 class BundleCache:
@@ -73,7 +76,7 @@ class BundleCache:
             os.utime(entry)
             return Lease(entry, descriptor)
         os.close(descriptor)
-        with self._locked():
+        with self._locked(), contextlib.suppress(OSError):  # what stays is found damaged again
             self._remove_unused(entry)
         return None
 
@@ -87,7 +90,10 @@ class BundleCache:
             raise UnavailableError(
                 f"{place} has {manifest.size:,} bytes: the cache may hold {self._max_bytes:,} (RLSERVO_CACHE_BYTES)"
             )
-        partial, descriptor = self._begin(manifest.digest, place)
+        try:
+            partial, descriptor = self._begin(manifest.digest, place)
+        except OSError as error:
+            raise self._unusable(error) from None
         try:
             lease = self.lease(manifest.digest)  # whoever had the lock before may have fetched it
             if lease is not None:
@@ -109,13 +115,13 @@ class BundleCache:
             shutil.rmtree(partial, ignore_errors=True)
             os.close(descriptor)
             if isinstance(error, OSError) and not isinstance(error, FileNotFoundError):
-                raise UnavailableError(f"{place} cannot be kept in {self._folder}: {error.strerror or error}") from None
+                raise self._unusable(error) from None
             raise
 
     def remember(self, uri: str, document: Any) -> None:
         """Keep what a repository holds, for when it is away."""
         file = self._index(uri)
-        with self._locked():
+        with self._locked(), contextlib.suppress(OSError):  # a full disk, say: then an older list stays
             beside = file.with_suffix(".new")
             beside.write_text(json.dumps(document), encoding="utf-8")
             beside.replace(file)
@@ -189,6 +195,11 @@ class BundleCache:
     def _make(self) -> None:
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
+    def _unusable(self, error: OSError) -> UnavailableError:
+        return UnavailableError(
+            f"the cache {self._folder} cannot be used ({error.strerror or error}): RLSERVO_CACHE names another folder"
+        )
+
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
         """Keep every other process and thread from adding and removing; for moments only."""
@@ -196,9 +207,7 @@ class BundleCache:
             self._make()
             descriptor = os.open(self._folder / ".lock", os.O_RDWR | os.O_CREAT, 0o600)
         except OSError as error:
-            raise UnavailableError(
-                f"the cache {self._folder} cannot be used: {error.strerror}: name a folder of yours in RLSERVO_CACHE"
-            ) from None
+            raise self._unusable(error) from None
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
             yield

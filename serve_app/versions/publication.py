@@ -15,6 +15,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from rlservo.export.contract.bundle import SUMS_FILE, Bundle, load_bundle, sha256
 from rlservo.export.contract.contract import VERSION_PATTERN, version_key
 from rlservo.export.contract.errors import BundleError, ConflictError, UnavailableError, UsageError
@@ -29,7 +31,7 @@ from rlservo.serve_app.versions.object_storage import ObjectStorage, announced, 
 from rlservo.serve_app.versions.plan import now
 
 
-def publish(bundle: Bundle, place: str, *, timeout_s: float = 15.0, progress: Callable[[str], None] = str) -> str:
+def publish(bundle: Bundle, place: str, *, timeout_s: float = 15.0, progress: Callable[[str], object] = str) -> str:
     """Publish a bundle to a folder or URI under its own name and version; return where its manifest is.
 
     `progress` gets a line per file. Raises ConflictError where that version is there, or is being published,
@@ -68,7 +70,13 @@ def _manifest_of(bundle: Bundle) -> Manifest:
     if files[SUMS_FILE].sha256 != bundle.digest:
         raise BundleError(f"{bundle.path} changed while it was read")
     contract = bundle.contract
-    return Manifest(format=1, name=contract.name, version=contract.version, published_at=now(), files=files)
+    name, version = contract.name, contract.version
+    try:
+        manifest = Manifest(format=1, name=name, version=version, published_at=now(), files=files)
+    except ValidationError:
+        strange = ", ".join(sorted(files))
+        raise BundleError(f"{bundle.path} has files whose names cannot be published, of {strange[:300]}") from None
+    return Manifest.parse(manifest.encode(), f"{name}/{version}{SUFFIX}")  # what nobody would fetch is not published
 
 
 def _name_of(manifest: Manifest) -> str:

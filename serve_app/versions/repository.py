@@ -81,9 +81,11 @@ class Repository:
             raise UsageError("no policy to serve: give at least one bundle folder")
         self._paths = [Path(place) for place in given if not is_uri(place)]
         self._limits = limits
-        bundles = BundleCache(Path(cache) if cache is not None else default_folder(), cache_bytes)
         storages = [ObjectStorage(place, timeout_s=storage_timeout_s) for place in given if is_uri(place)]
-        self._remote = [RemoteRepository(storage, bundles, limits) for storage in storages]
+        self._remote: list[RemoteRepository] = []
+        if storages:
+            bundles = BundleCache(Path(cache) if cache is not None else default_folder(), cache_bytes)
+            self._remote = [RemoteRepository(storage, bundles, limits) for storage in storages]
         self.patience_s = 3 * storage_timeout_s * len(storages)
         """[s] by which a look through storages, each call with its time-out, may take longer than one on disk."""
 

@@ -47,6 +47,7 @@ from storages import SECRET, Lie, Storage, late, only
 from stores import MemoryLedger
 
 ALL = ServedConfig()
+AWAY = "(cannot be reached or read|gave no answer)"  # a closed connection is tried again, for as long as may be
 
 
 @pytest.fixture(scope="module")
@@ -88,15 +89,14 @@ def fetch(repository: Repository, version: str = "1") -> Path:
 def test_a_published_version_is_found_fetched_and_proven(made: Path, storage: Storage, cache: Path) -> None:
     put(made, storage.uri, "1", "2")
     held = repository(storage, cache)
-    assert {v: d for v, d in held.available(ALL)["ur5"].items()} == {
-        v: load_bundle(made / "ur5" / v).digest for v in ("1", "2")
-    }
+    assert held.available(ALL) == {"ur5": {v: load_bundle(made / "ur5" / v).digest for v in ("1", "2")}}
+    before = storage.gets("ur5/2/policy.onnx")
     folder = fetch(held, "2")
     with contextlib.closing(Policy.load(folder)) as policy:
         assert (policy.contract.name, policy.contract.version) == ("ur5", "2")
     with contextlib.closing(load_served([storage.uri], ALL, ServerSettings(cache=str(cache)))) as store:
         assert store.default("ur5") == "2"
-    assert storage.gets("ur5/2/policy.onnx") == 2  # read back by who published it, and fetched once
+    assert storage.gets("ur5/2/policy.onnx") == before + 1
 
 
 def test_versions_are_immutable_and_the_next_number_is_found(made: Path, storage: Storage) -> None:
@@ -176,7 +176,7 @@ LIES: dict[str, tuple[Lie, str]] = {
     ),
     "truncated": (only("2/policy.onnx", truncated), r"/policies/ur5/2/policy\.onnx ends after [\d,]+ of [\d,]+ bytes"),
     "503": (only("2/policy.onnx", busy), r"/policies/ur5/2/policy\.onnx cannot be reached or read: .*later"),
-    "late": (only("2/policy.onnx", late(6)), r"/policies/ur5/2/policy\.onnx gave no answer within 2 s"),
+    "late": (only("2/policy.onnx", late(6)), r"/policies/ur5/2/policy\.onnx gave no answer within \d s"),
     "403": (only("2/policy.onnx", echo), r"/policies/ur5/2/policy\.onnx is refused with the credentials .*no: token"),
     "deleted": (
         only("2/policy.onnx", lambda *_: (404, {}, b"<Error><Code>NoSuchKey</Code><Message>gone</Message></Error>")),
@@ -254,12 +254,12 @@ def test_a_server_starts_again_with_its_storage_away(
         await control.configure({"policies": {"ur5": {"versions": ["1"]}}} if not away else {})
         assert control.store is not None and control.store.default("ur5") == "1"
         if away:
-            with pytest.raises(UnavailableError, match=r"policies cannot be reached or read"):
+            with pytest.raises(UnavailableError, match=f"policies {AWAY}"):
                 await control.load("ur5", "2", what="load")
-            with pytest.raises(UnavailableError, match=r"policies cannot be reached or read"):
+            with pytest.raises(UnavailableError, match=f"policies {AWAY}"):
                 await control.load("ur5", None, what="load")
             assert control.store.versions("ur5") == ("1",)
-            with pytest.raises(UnavailableError, match=r"policies cannot be reached or read"):
+            with pytest.raises(UnavailableError, match=f"policies {AWAY}"):
                 await replica(storage.uri, cache=cache).configure({"policies": {"ur5": {"versions": ["2"]}}})
 
     asyncio.run(run(away=False))
@@ -268,7 +268,7 @@ def test_a_server_starts_again_with_its_storage_away(
         asyncio.run(run(away=True))
     assert "the cache serves what was published on 20" in caplog.text
     assert "not in the cache, and left out: ur5 2" in caplog.text
-    with pytest.raises(UnavailableError, match="policies cannot be reached or read"):
+    with pytest.raises(UnavailableError, match=f"policies {AWAY}"):
         repository(storage, cache.parent / "empty").available(ALL)
 
 
@@ -309,12 +309,12 @@ def test_uris_with_secrets_or_tricks_are_refused_without_showing_them(uri: str, 
         place_of(uri)
 
 
-def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
-    monkeypatch.setitem(sys.modules, "s3fs", None)
-    with pytest.raises(UsageError, match=r"s3://b/p cannot be opened here: pip install 'rlservo\[remote\]'"):
-        Repository(["s3://b/p"], cache=cache).find_digest("ur5", None)
-    with pytest.raises(UsageError, match="nowhere://b cannot be opened here"):
-        Repository(["nowhere://b"], cache=cache).find_digest("ur5", None)
+@pytest.mark.parametrize("uri", ["s3://b/p", "gs://b/p", "nowhere://b"])
+def test_a_missing_extra_is_named(uri: str, monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
+    if uri.startswith("s3"):
+        monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(UsageError, match=rf"{uri} cannot be opened here: pip install 'rlservo\[remote\]'"):
+        Repository([uri], cache=cache).find_digest("ur5", None)
 
 
 def test_local_folders_import_nothing_of_it(made: Path) -> None:
@@ -357,7 +357,7 @@ def with_file(name: str, size: Any = 1, sha256: str = "0" * 64) -> dict[str, Any
         (with_file("x.json", size=True), "size"),
         (with_file("contract.json", size=1 << 30), "contract.json has 1,073,741,824 bytes: at most 16,777,216"),
         (with_file("x.json", sha256="0" * 63), "sha256"),
-        ({**GOOD, "files": {f"f{n}.txt": {"size": 1, "sha256": "0" * 64} for n in range(20)}}, "does not list policy.onnx"),
+        ({**GOOD, "files": {"SHA256SUMS": {"size": 1, "sha256": "0" * 64}}}, "does not list policy.onnx"),
         (functools.reduce(lambda d, n: {**d, "files": {**d["files"], f"f{n}.txt": {"size": 1, "sha256": "0" * 64}}},
                           range(20), GOOD), "lists 25 files: at most 17"),
         ({**GOOD, "format": 2}, "is of format 2: this rlservo reads manifests of format 1"),
@@ -440,7 +440,7 @@ def test_replicas_fetch_a_version_once_and_mend_a_damaged_one(made: Path, storag
     storage.go_away()
     (folders[0] / "policy.onnx").unlink()
     digest = load_bundle(made / "ur5" / "1").digest
-    with pytest.raises(UnavailableError, match=r"ur5/1\.json cannot be reached or read"):
+    with pytest.raises(UnavailableError, match=rf"ur5/1\.json {AWAY}"):
         repository(storage, cache).fetch("ur5", "1", digest)
 
 

@@ -1,0 +1,59 @@
+"""`rlservo serve s3://...` on Ray Serve: versions published while it runs, and a restart with the storage away."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from bundles import write_box_policy
+from rlservo.serve_app.ray_serve.processes import free_ports
+from servers import ask, running, wait_until_served
+from storages import SECRET, Storage
+
+pytestmark = [pytest.mark.serve, pytest.mark.slow]
+
+OBS = [round(0.01 * i, 2) for i in range(27)]
+RLSERVO = [sys.executable, "-m", "rlservo.deploy.cli"]
+
+
+def test_published_versions_are_served_also_when_the_storage_is_away(storage: Storage, tmp_path: Path) -> None:
+    from rlservo.export.contract.bundle import load_bundle
+    from rlservo.serve_app.versions.publication import publish
+
+    publish(load_bundle(write_box_policy(tmp_path, version="1", seed=1)), storage.uri)
+    (port,) = free_ports(1)
+    log = tmp_path / "server.jsonl"
+    environment = {**storage.environment, "RLSERVO_CACHE": str(tmp_path / "cache"), "RLSERVO_LOG_FILE": str(log)}
+    command = [*RLSERVO, "serve", storage.uri, "--port", str(port), "--poll", "1"]
+
+    def versions() -> list[str]:
+        (policy,) = ask(port, "GET", "/v1/policies")[1]["policies"]
+        return list(policy["versions"])
+
+    with running(command, port, **environment) as run:
+        wait_until_served(run)
+        status, first = ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})
+        assert status == 200 and first["version"] == "1"
+        publish(load_bundle(write_box_policy(tmp_path, version="2", seed=2)), storage.uri)
+        deadline = time.monotonic() + 120
+        while versions() != ["1", "2"] and time.monotonic() < deadline:
+            time.sleep(0.2)
+        assert versions() == ["1", "2"]
+        again = ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[1]
+        assert (again["version"], again["action"]) == ("1", first["action"])  # loaded, and not in use
+        seen = str(ask(port, "GET", "/v1/policies")[1]) + str(ask(port, "GET", "/metrics")[1])
+        assert run.end(signal.SIGINT) in (0, 130)  # the command may not yet have seen that it is ready
+    storage.go_away()
+    with running([*command, "--alias", "ur5:production=1"], port, **environment) as run:
+        wait_until_served(run)
+        again = ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[1]
+        assert (again["version"], again["action"]) == ("1", first["action"])
+        assert versions() == ["1", "2"]
+        assert run.end(signal.SIGINT) in (0, 130)  # the command may not yet have seen that it is ready
+    written = log.read_text() + seen
+    assert "the cache serves what was published on 20" in written
+    assert SECRET not in written
