@@ -182,9 +182,9 @@ class Cockpit:
     server: Any
     panel: Any
 
-    def pixel(self, point: NDArray[np.float64], browser: int = 0) -> NDArray[np.float64]:
-        """Return where a point of the world is in the scene of a browser, by when it came."""
-        camera = list(self.server.get_clients().values())[browser].camera
+    def pixel(self, point: NDArray[np.float64], camera: Any = None) -> NDArray[np.float64]:
+        """Return where a point of the world is in the scene of a browser, by default the first one's."""
+        camera = camera or next(iter(self.server.get_clients().values())).camera
         ahead = camera.look_at - camera.position
         ahead = ahead / np.linalg.norm(ahead)
         right = np.cross(ahead, camera.up_direction)
