@@ -187,7 +187,6 @@ def nodes_running(case: Case, policies: Path, folder: Path, mark: str, *, namesp
         made.await_head()
         for node in made.nodes[1:NODES]:
             made.start(node)
-        for node in made.nodes[1:NODES]:
             _until(node.has_joined, node)  # else all replicas would go to the head
         yield made
 

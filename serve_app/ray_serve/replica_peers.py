@@ -72,7 +72,7 @@ class ReplicaPeers:
     async def call(self, replica: str, method: str, *arguments: Any) -> Any:
         """Call a method of another replica. Raises ProcessLookupError where it has ended."""
         try:
-            actor = self._actors.get(replica)
+            actor: Any = self._actors.get(replica)
             if actor is None:
                 name = find(REPLICA_ID)(replica, self._deployment).to_full_id_str()
                 actor = await asyncio.to_thread(ray.get_actor, name, "serve")
