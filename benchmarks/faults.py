@@ -501,6 +501,7 @@ def _admin(bench: Bench) -> AdminClient:
 
 def _plans(bench: Bench, replicas: int, *, by_one: bool = False) -> dict[str, Any] | None:
     """Return what is served of ur5, where so many replicas say the same, or what one says; else None."""
+    told: list[dict[str, Any]] = []
     if by_one:
         told = [_versions(bench)]
     else:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import argparse
 import json
 import secrets
+import signal
+import sys
 import tempfile
 import time
 from http.client import HTTPConnection
@@ -29,6 +31,7 @@ def main() -> None:
     parser.add_argument("policy", type=Path)
     parser.add_argument("--steps", type=int, default=2000)
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the server is ended then, too
     bundle = max(path.parent for path in arguments.policy.absolute().rglob("contract.json"))
     case = case_of(bundle, Path())
     obs = case.obs.tolist()
