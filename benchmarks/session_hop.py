@@ -53,7 +53,8 @@ def main() -> None:
 
 def measure(connection: HTTPConnection, path: str, obs: Any, steps: int, *, by_id: bool) -> list[float]:
     """Return what each of so many steps took [s], in turns of several sessions."""
-    taken, states = [], [{} for _ in range(SESSIONS)]
+    taken: list[float] = []
+    states: list[Any] = [{} for _ in range(SESSIONS)]
     for number in range(steps + SESSIONS):
         which = number % SESSIONS
         begins = number < SESSIONS
