@@ -187,7 +187,6 @@ def nodes_running(case: Case, policies: Path, folder: Path, mark: str, *, namesp
         made.await_head()
         for node in made.nodes[1:NODES]:
             made.start(node)
-        for node in made.nodes[1:NODES]:
             _until(node.has_joined, node)  # else all replicas would go to the head
         yield made
 
@@ -204,7 +203,8 @@ def _nodes(case: Case, folder: Path, mark: str, namespaces: bool, cleanup: ExitS
         addresses = [f"{subnet}.{number + 1}" for number in range(NODES + SPARE)]
         names = list(_make_namespaces(subnet, addresses, cleanup))
         dashboard, gcs, redis = 8265, 6379, 6380
-    shared["RAY_REDIS_ADDRESS"] = f"{addresses[0] if not namespaces else subnet + '.254'}:{redis}"
+    outside = addresses[0].rpartition(".")[0] + ".254" if namespaces else addresses[0]
+    shared["RAY_REDIS_ADDRESS"] = f"{outside}:{redis}"
     nodes = []
     for number, (address, name) in enumerate(zip(addresses, names, strict=True)):
         own = home / str(number)

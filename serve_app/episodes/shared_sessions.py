@@ -117,6 +117,7 @@ class SharedSessions:
         """Begin an episode here, and say so to all before anybody is answered."""
         assert request.episode is not None and request.episode.session_id is not None
         name, session_id = request.policy, request.episode.session_id
+        check_deadline(request)
         decision = self._episodes.act(store, request)
         session = self._episodes.sessions.peek(name, session_id)
         if session is not None and not session.token:
@@ -180,9 +181,9 @@ class SharedSessions:
             sent.deadline_ms = request.deadline_ms - (time.perf_counter() - request.received) * 1e3
         try:
             found = await asyncio.wait_for(self._peers.call(record.replica, "act", sent, record.token), HOP_TIMEOUT_S)
-        except ProcessLookupError:
-            return None
         except Exception as error:
+            if isinstance(error, ProcessLookupError) and (headers or request.seq is not None):
+                return None  # if it took the step and handed the episode over, the next owner knows this request
             logger.debug("the replica %s did not answer for a session: %s", record.replica, error)
             if request.seq is not None:
                 raise UnavailableError("the replica that has this session does not answer: try again") from None

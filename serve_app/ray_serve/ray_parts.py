@@ -15,6 +15,7 @@ KNOWN = "2.60"
 
 KEY_VALUE_STORE = "ray.experimental.internal_kv"
 GCS_CLIENT = f"{KEY_VALUE_STORE}:internal_kv_get_gcs_client"
+PICKLE = "ray.cloudpickle:dumps"
 REPLICA_ID = "ray.serve._private.common:ReplicaID"
 REQUEST_METADATA = "ray.serve._private.common:RequestMetadata"
 NEEDED = (

@@ -11,11 +11,10 @@ from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 import ray
-from ray import cloudpickle
 from ray.exceptions import ActorDiedError
 
 from rlservo.serve_app.ray_serve.gcs_ledger import NAMESPACE
-from rlservo.serve_app.ray_serve.ray_parts import GCS_CLIENT, REPLICA_ID, REQUEST_METADATA, find
+from rlservo.serve_app.ray_serve.ray_parts import GCS_CLIENT, PICKLE, REPLICA_ID, REQUEST_METADATA, find
 
 TIMEOUT_S = 2.0  # [s] for the store: a client waits
 
@@ -65,14 +64,14 @@ class ReplicaPeers:
         self._running = running
         self._actors: dict[str, Any] = {}
         metadata = find(REQUEST_METADATA)
-        self._metadata = cloudpickle.dumps(
+        self._metadata = find(PICKLE)(
             metadata(request_id="", internal_request_id="", call_method=method, app_name=deployment.app_name)
         )
 
     async def call(self, replica: str, method: str, *arguments: Any) -> Any:
         """Call a method of another replica. Raises ProcessLookupError where it has ended."""
         try:
-            actor = self._actors.get(replica)
+            actor: Any = self._actors.get(replica)
             if actor is None:
                 name = find(REPLICA_ID)(replica, self._deployment).to_full_id_str()
                 actor = await asyncio.to_thread(ray.get_actor, name, "serve")
