@@ -106,9 +106,12 @@ class LogFile:
             columns.append(_member("final_obs", policy.observations.encode_rows(record.final_obs)))
         if record.commanded is not None:
             columns.append(_member("commanded", policy.actions.encode_rows(record.commanded)))
-        told = {"terminated": record.terminated or None, "truncated": record.truncated or None}
-        told |= {"final_status": record.final_status}
-        self._add_rows("outcome", record, columns, _members(told))
+        ending: dict[str, Any] = {
+            "terminated": record.terminated or None,
+            "truncated": record.truncated or None,
+            "final_status": record.final_status,
+        }
+        self._add_rows("outcome", record, columns, _members(ending))
 
     def add_dropped(self, count: int) -> None:
         """Mark that `count` records are missing before this place."""
