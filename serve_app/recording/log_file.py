@@ -106,7 +106,7 @@ class LogFile:
             columns.append(_member("final_obs", policy.observations.encode_rows(record.final_obs)))
         if record.commanded is not None:
             columns.append(_member("commanded", policy.actions.encode_rows(record.commanded)))
-        ending = {
+        ending: dict[str, Any] = {
             "terminated": record.terminated or None,
             "truncated": record.truncated or None,
             "final_status": record.final_status,
