@@ -374,7 +374,7 @@ def test_an_end_and_a_dead_owner_leave_nothing_behind(world: World, obs: Any) ->
         await owner.act(request("orphan", obs, reset=True))
         world.kill(owner.name)
         with pytest.raises(SessionLostError, match="no replica has the session 'orphan'"):
-            await other.act(request("orphan", obs))
+            await other.act(request("orphan", obs, stamp=b"1"))
         await other.shared.sweep()
         assert key_of(NAME, "orphan") in world.records  # it could be one that is just being begun
         await other.shared.sweep()
