@@ -392,7 +392,7 @@ def test_a_replica_that_ends_hands_its_episodes_over(world: World, obs: Any) -> 
         assert (await owner.act(request("s", obs))).episode.step == 3  # type: ignore[union-attr]
         world.kill(owner.name)
         assert (await other.act(request("s", obs, stamp=b"2"))).is_repeated
-        assert (await other.act(request("s", obs))).episode.step == 4  # type: ignore[union-attr]
+        assert (await other.act(request("s", obs, stamp=b"3"))).episode.step == 4  # type: ignore[union-attr]
 
     asyncio.run(run())
 
