@@ -9,7 +9,14 @@ import pytest
 from xdist.scheduler import LoadScopeScheduling
 
 pytest_plugins = [
-    "checkpoints", "bundles", "clusters", "cockpits", "environments", "servers", "storages", "trainings",
+    "checkpoints",
+    "bundles",
+    "clusters",
+    "cockpits",
+    "environments",
+    "servers",
+    "storages",
+    "trainings",
 ]
 
 # Tests that share what is costly to make, by the beginning of their id. All others share their file's own.

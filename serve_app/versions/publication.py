@@ -84,7 +84,7 @@ def _name_of(manifest: Manifest) -> str:
 
 
 def _publish_to_storage(
-    bundle: Bundle, manifest: Manifest, storage: ObjectStorage, progress: Callable[[str], None]
+    bundle: Bundle, manifest: Manifest, storage: ObjectStorage, progress: Callable[[str], object]
 ) -> None:
     if storage.is_read_only:
         raise UsageError(f"{storage.uri} can only be read: publish to a folder that its server shows, or to s3://")

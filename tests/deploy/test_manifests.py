@@ -253,7 +253,7 @@ def test_dockerfile_runs_as_somebody_without_rights_and_installs_pinned_versions
     assert len(stages) == 2 and all(":" in image and not image.endswith(":latest") for image in stages)
     assert [each[1] for each in words if each[0] == "USER"] == ["1000:1000"]
     assert {"HEALTHCHECK", "LABEL", "CMD"} <= {each[0] for each in words}
-    assert any("-c constraints.txt '.[serve]'" in line for line in lines)
+    assert any("-c constraints.txt '.[serve,remote]'" in line for line in lines)
     constraints = (DEPLOY.parent / "constraints.txt").read_text()
     assert f"ray=={CLUSTER['rayVersion']}\n" in constraints
 

@@ -374,7 +374,7 @@ def test_an_end_and_a_dead_owner_leave_nothing_behind(world: World, obs: Any) ->
         await owner.act(request("orphan", obs, reset=True))
         world.kill(owner.name)
         with pytest.raises(SessionLostError, match="no replica has the session 'orphan'"):
-            await other.act(request("orphan", obs))
+            await other.act(request("orphan", obs, stamp=b"1"))
         await other.shared.sweep()
         assert key_of(NAME, "orphan") in world.records  # it could be one that is just being begun
         await other.shared.sweep()
@@ -392,7 +392,7 @@ def test_a_replica_that_ends_hands_its_episodes_over(world: World, obs: Any) -> 
         assert (await owner.act(request("s", obs))).episode.step == 3  # type: ignore[union-attr]
         world.kill(owner.name)
         assert (await other.act(request("s", obs, stamp=b"2"))).is_repeat
-        assert (await other.act(request("s", obs))).episode.step == 4  # type: ignore[union-attr]
+        assert (await other.act(request("s", obs, stamp=b"3"))).episode.step == 4  # type: ignore[union-attr]
 
     asyncio.run(run())
 
