@@ -25,7 +25,8 @@ from rlservo.serve_app.replay.follower import FollowedEpisode, Follower
 LARGEST = 5_000_000  # numbers in one matrix of episodes by steps
 RESAMPLES = 1000
 CONFIDENCE = 0.95
-FEWEST_EPISODES = 30
+FEWEST_EPISODES = 400  # of 300, an ending of six in a thousand is too often in none (docs/recording.md)
+FEWEST_FITTED = 30
 SMALLEST_SHARE = 0.5  # of effective episodes; below it the intervals miss the truth too often (docs/recording.md)
 
 
@@ -206,8 +207,8 @@ def fitted_estimate(trajectories: list[Trajectory], gamma: float, rng: np.random
     """Return fitted Q evaluation's estimate."""
     fit = fitted_q([(one.rewards, one.obs, one.actions, one.chosen) for one in trajectories], gamma, rng)
     reason = fit.doubt
-    if len(trajectories) < FEWEST_EPISODES:
-        reason = f"{len(trajectories)} episodes are too few: at least {FEWEST_EPISODES} are needed"
+    if len(trajectories) < FEWEST_FITTED:
+        reason = f"{len(trajectories)} episodes are too few: at least {FEWEST_FITTED} are needed"
     return Estimate(
         "fitted Q evaluation (experimental)",
         fit.value,

@@ -137,10 +137,10 @@ def test_fitted_q_claims_nothing_outside_the_data() -> None:
 def test_too_few_episodes_are_said(policies: Path, tmp_path: Path) -> None:
     policy = Policy.load(policies / "gridworld")
     with WithRecording(policy, tmp_path / "run.mcap") as record:
-        walk(policy, 5, np.random.default_rng(0), record)
+        walk(policy, 399, np.random.default_rng(0), record)
     report = estimate(Recording(tmp_path / "run.mcap"), policies / "gridworld", explore=True)
     assert not any(one.supported for one in report.estimates)
-    assert "5 episodes are too few" in report.estimates[0].reason
+    assert "399 episodes are too few: at least 400 are needed" in report.estimates[0].reason
 
 
 def test_exploring_return_needs_recorded_log_probabilities(policies: Path, tmp_path: Path) -> None:
