@@ -8,6 +8,7 @@ serve` comes here through `cluster_process.py`. A replica imports neither torch 
 # No `from __future__ import annotations` here: Serve reads the type of build's argument to know what to make of `args`.
 
 import asyncio
+import gc
 import logging
 from typing import Any, cast
 
@@ -176,6 +177,9 @@ class PolicyServer(InferenceService):
             if self._settings.poll_s is not None:
                 self._poll = asyncio.create_task(self._control.poll_repository(self._settings.poll_s))
             self._sweep = asyncio.create_task(self._sweep_records())
+            # What is there by now stays, and most of it is Ray's: a collection that walks it holds requests up.
+            gc.collect()
+            gc.freeze()
         else:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
 
