@@ -37,6 +37,7 @@ FLAGS = (
 # A few frames a second are enough to see what happens, and each is drawn by the processors that the test shares.
 FEW_FRAMES = """const each = requestAnimationFrame;
 window.requestAnimationFrame = draw => setTimeout(() => each(draw), 300);"""
+TWO_FRAMES = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
 RESOLUTION = 0.5  # of the scene, to the screen's: viser would change it by how long frames take
 # The scene is the largest canvas; the others are plots.
 CORNER_OF_SCENE = """() => {
@@ -79,12 +80,12 @@ class Browser:
         start, end = corner + start, corner + end
         mouse = self.page.mouse
         mouse.move(*start)
-        self.page.wait_for_timeout(500)  # until the handle has seen the mouse: it draws a frame in a while
+        self.page.evaluate(TWO_FRAMES)  # until the handle has seen the mouse
         mouse.down()
         for share in np.linspace(0.0, 1.0, 12)[1:]:
             mouse.move(*(start + share * (end - start)))
             self.page.wait_for_timeout(60)
-        self.page.wait_for_timeout(500)
+        self.page.evaluate(TWO_FRAMES)
         mouse.up()
 
     def click(self, name: str, *, role: str = "button") -> None:
