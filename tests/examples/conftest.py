@@ -170,10 +170,13 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory, one_ray: OneRay) -> It
     )  # fmt: skip
     try:
         deadline = time.monotonic() + 300
-        while len(list(home.glob("runs/*/trial_*/checkpoint_*"))) < 2:
-            assert started.poll() is None
+        checkpoints: list[Path] = []
+        while len(checkpoints) < 2:
+            assert started.poll() is None, started.communicate()
             assert time.monotonic() < deadline
             time.sleep(0.1)
+            with contextlib.suppress(FileNotFoundError):  # Ray's temporary folders come and go meanwhile
+                checkpoints = list(home.glob("runs/*/trial_*/checkpoint_*"))
         os.killpg(started.pid, signal.SIGINT)  # as a terminal sends it: to the script and all it started
         out, err = started.communicate(timeout=100)
         stopped = Ended(started.returncode, out, err)
@@ -184,6 +187,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory, one_ray: OneRay) -> It
     finally:
         if started.poll() is None:
             os.killpg(started.pid, signal.SIGKILL)
+            started.communicate()
 
 
 def in_session(leader: int) -> list[str]:
