@@ -167,6 +167,7 @@ def windows(chromium: Any) -> Windows:
     def make(width: int, height: int) -> Browser:
         context = chromium.new_context(viewport={"width": width, "height": height})
         opened = Browser(context.new_page())
+        opened.page.set_default_timeout(1e3 * PATIENCE_S)
         opened.page.add_init_script(FEW_FRAMES)
         opened.page.on("request", lambda request: opened.requests.append(request.url))
         opened.page.on("websocket", lambda socket: opened.requests.append(socket.url))
