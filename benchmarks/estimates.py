@@ -188,7 +188,7 @@ def candidates_of_the_study() -> list[Candidate]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=400)
+    parser.add_argument("--episodes", type=int, default=600)
     parser.add_argument("--repetitions", type=int, default=100)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument("--importance-only", action="store_true", help="leave out fitted Q evaluation, which is slow")

@@ -89,7 +89,7 @@ def run_episodes(policy: Policy, variant: tuple[float, float], episodes: int, fi
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("bundle", type=Path)
-    parser.add_argument("--episodes", type=int, default=400, help="in each recording")
+    parser.add_argument("--episodes", type=int, default=600, help="in each recording")
     parser.add_argument("--repetitions", type=int, default=100)
     parser.add_argument("--truth", type=int, default=4000, help="episodes for each candidate's true return")
     arguments = parser.parse_args()

@@ -25,7 +25,7 @@ from rlservo.serve_app.replay.follower import FollowedEpisode, Follower
 LARGEST = 5_000_000  # numbers in one matrix of episodes by steps
 RESAMPLES = 1000
 CONFIDENCE = 0.95
-FEWEST_EPISODES = 400  # of 300, an ending of six in a thousand is too often in none (docs/recording.md)
+FEWEST_EPISODES = 600  # of 400, an ending of six in a thousand is too often in none (docs/recording.md)
 FEWEST_FITTED = 30
 SMALLEST_SHARE = 0.5  # of effective episodes; below it the intervals miss the truth too often (docs/recording.md)
 

@@ -42,15 +42,15 @@ def walk(
 def walked(policies: Path, tmp_path: Path) -> Path:
     policy = Policy.load(policies / "gridworld")
     with WithRecording(policy, tmp_path / "run.mcap", wait=True) as record:
-        walk(policy, 400, np.random.default_rng(0), record)
+        walk(policy, 600, np.random.default_rng(0), record)
     return tmp_path / "run.mcap"
 
 
 def test_the_recorded_policy_gets_its_own_return(policies: Path, walked: Path) -> None:
     report = estimate(Recording(walked), policies / "gridworld", explore=True)
-    assert report.episodes == 400 and report.recorded_return is not None
+    assert report.episodes == 600 and report.recorded_return is not None
     for one in report.estimates:
-        assert one.supported and one.effective_samples == pytest.approx(400)
+        assert one.supported and one.effective_samples == pytest.approx(600)
         assert one.value == pytest.approx(report.recorded_return, rel=1e-6)
 
 
@@ -73,7 +73,7 @@ def test_intervals_cover_as_often_as_they_claim(rng_count: int = 60) -> None:
         rng = np.random.default_rng(repetition)
         behaviour, target = 0.5, 0.65
         made = []
-        for _ in range(150):
+        for _ in range(600):
             taken = rng.random(4) < behaviour
             rewards = taken + rng.normal(0, 0.5, 4)
             ratio = np.where(taken, target / behaviour, (1 - target) / (1 - behaviour))
@@ -90,7 +90,7 @@ def test_policy_far_from_the_recorded_one_is_not_claimed() -> None:
     rng = np.random.default_rng(0)
     none = np.zeros((50, 1), np.float32)
     made = [
-        Trajectory(np.ones(50), np.log(np.where(rng.random(50) < 0.5, 1.8, 0.2)), none, none, none) for _ in range(200)
+        Trajectory(np.ones(50), np.log(np.where(rng.random(50) < 0.5, 1.8, 0.2)), none, none, none) for _ in range(600)
     ]
     for one in importance_sampling(made, 1.0, rng):
         assert not one.supported and "acts too differently" in one.reason and one.effective_samples < 20
@@ -137,10 +137,10 @@ def test_fitted_q_claims_nothing_outside_the_data() -> None:
 def test_too_few_episodes_are_said(policies: Path, tmp_path: Path) -> None:
     policy = Policy.load(policies / "gridworld")
     with WithRecording(policy, tmp_path / "run.mcap") as record:
-        walk(policy, 399, np.random.default_rng(0), record)
+        walk(policy, 599, np.random.default_rng(0), record)
     report = estimate(Recording(tmp_path / "run.mcap"), policies / "gridworld", explore=True)
     assert not any(one.supported for one in report.estimates)
-    assert "399 episodes are too few: at least 400 are needed" in report.estimates[0].reason
+    assert "599 episodes are too few: at least 600 are needed" in report.estimates[0].reason
 
 
 def test_exploring_return_needs_recorded_log_probabilities(policies: Path, tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_recorder_and_candidate_may_be_two_versions(box_policy: Callable[..., Pa
     one, two = (box_policy(tmp_path / "policies", version=version) for version in ("1", "2"))
     rng = np.random.default_rng(0)
     with WithRecording(Policy.load(one), tmp_path / "run.mcap", wait=True) as policy:
-        for _ in range(60):
+        for _ in range(600):
             policy.reset()
             for step in range(5):
                 action = policy.act(rng.standard_normal(27).astype(np.float32), explore=True)
