@@ -352,11 +352,11 @@ def test_robot_server_command_serves_and_ends_on_ctrl_c(command: Any) -> None:
     state = get_state(port)
     assert len(state.state_dict) == 34
     process.send_signal(signal.SIGINT)
-    assert process.wait(20) == 0
+    assert process.wait(90) == 0  # a busy machine
     process, port = command("robot-server", "mir100", "--world", "lab_6x8", "--port", "0")
     assert len(get_state(port).state) == 1030
     process.terminate()
-    assert process.wait(20) == 0
+    assert process.wait(90) == 0  # a busy machine
 
 
 HAMMERED = """
