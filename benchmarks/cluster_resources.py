@@ -29,7 +29,7 @@ import psutil
 from ray.util import get_node_ip_address
 
 from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.ray_serve.environment import cluster_environment
+from rlservo.serve_app.ray_serve.environment import cluster_environment, proxy_files, proxy_ports
 from rlservo.serve_app.ray_serve.processes import MARK, end_marked, find_marked, free_ports, remove_folder
 
 NODE = "RLSERVO_BENCHMARK_NODE"  # inherited by all that a node starts
@@ -95,20 +95,12 @@ def measure(policies: Path, folder: Path, mark: str, *, tls: bool, seconds: floa
 def node_environment(folder: Path, mark: str) -> dict[str, str]:
     """Return what both nodes have in their environment, with ports and files of our own."""
     own = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "RLSERVO_"))}
-    stats, metrics, fallback, fallback_grpc, first = free_ports(5)
-    return own | cluster_environment(folder / "haproxy") | {
+    (first,) = free_ports(1)
+    return own | cluster_environment(folder / "haproxy") | proxy_ports() | proxy_files(folder) | {
         MARK: mark,
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
         "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(first),
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(first + 20),
-        "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
-        "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
-        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
-        "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
-        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
-        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "a.sock"),
-        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
-        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
     }  # fmt: skip
 
 

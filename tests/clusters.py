@@ -20,7 +20,7 @@ import pytest
 import yaml
 
 from rlservo.serve_app.client.admin_client import AdminClient
-from rlservo.serve_app.ray_serve.environment import cluster_environment
+from rlservo.serve_app.ray_serve.environment import cluster_environment, proxy_files, proxy_ports
 from rlservo.serve_app.ray_serve.processes import MARK, end_marked, free_ports, remove_folder
 from rlservo.serve_app.server.api_keys import new_key
 
@@ -205,7 +205,7 @@ def serving(*versions: str, production: str = "1", **more: Any) -> dict[str, Any
 @pytest.fixture(scope="session")
 def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     """The cluster, with version 1 of ur5 deployed by `serve deploy`."""
-    port, grpc_port, dashboard, stats, metrics, fallback, fallback_grpc, first, second = free_ports(9)
+    port, grpc_port, dashboard, first, second = free_ports(5)
     folder, mark = Path(tempfile.mkdtemp(prefix="r")), secrets.token_hex(16)
     configuration = yaml.safe_load((ROOT / "deploy" / "serve.yaml").read_text())
     configuration["http_options"]["port"] = port
@@ -215,7 +215,7 @@ def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) 
         "policies": [str(cluster_repository)], "replicas": 2, "settings": settings
     }  # fmt: skip
     own = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "RLSERVO_"))}
-    environment = own | cluster_environment(folder, one_machine=True) | {
+    environment = own | cluster_environment(folder, one_machine=True) | proxy_ports() | proxy_files(folder) | {
         MARK: mark,
         DIFFERENT: ITS_VALUE,
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
@@ -223,14 +223,6 @@ def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) 
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(first + 20),
         "RAY_SERVE_DIRECT_INGRESS_MIN_GRPC_PORT": str(second),
         "RAY_SERVE_DIRECT_INGRESS_MAX_GRPC_PORT": str(second + 20),
-        "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
-        "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
-        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
-        "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
-        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
-        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "a.sock"),
-        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
-        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
     }  # fmt: skip
     plan = json.dumps({"dashboard": dashboard, "folder": str(folder)})
     errors = tmp_path_factory.mktemp("cluster") / "errors.txt"

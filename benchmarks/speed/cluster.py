@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from rlservo.serve_app.ray_serve.environment import cluster_environment
+from rlservo.serve_app.ray_serve.environment import cluster_environment, proxy_files, proxy_ports
 from rlservo.serve_app.ray_serve.processes import free_ports
 from speed.catalogue import Case, asked
 from speed.servers import Server, environment
@@ -76,22 +76,12 @@ class Cluster:
 
 def cluster(case: Case, policies: Path, folder: Path, *, cpus: int = 4) -> Cluster:
     """Return a cluster that is not started yet, and the shipped configuration with these policies in it."""
-    port, grpc_port, dashboard, stats, metrics, fallback, fallback_grpc = free_ports(7)
+    port, grpc_port, dashboard = free_ports(3)
     home = folder / "c"
     home.mkdir()
     plan = {"dashboard": dashboard, "folder": str(home / "r"), "cpus": cpus}
-    variables = cluster_environment(home) | {
-        "RAY_AUTH_TOKEN": secrets.token_hex(32),
-        **replica_ports(),
-        "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
-        "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
-        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
-        "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
-        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(home / "haproxy.cfg"),
-        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(home / "a.sock"),
-        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(home),
-        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(home / "state"),
-    }
+    variables = cluster_environment(home) | replica_ports() | proxy_ports() | proxy_files(home)
+    variables["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
     configuration = yaml.safe_load(SHIPPED.read_text())
     configuration["http_options"]["port"] = port
     configuration["grpc_options"]["port"] = grpc_port

@@ -23,7 +23,7 @@ from typing import Any
 
 import yaml
 
-from rlservo.serve_app.ray_serve.environment import cluster_environment
+from rlservo.serve_app.ray_serve.environment import cluster_environment, proxy_files, proxy_ports
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.server.api_keys import new_key
@@ -209,20 +209,9 @@ def _nodes(case: Case, folder: Path, mark: str, namespaces: bool, cleanup: ExitS
     for number, (address, name) in enumerate(zip(addresses, names, strict=True)):
         own = home / str(number)
         own.mkdir()
-        variables = shared | {
-            "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(own / "haproxy.cfg"),
-            "RAY_SERVE_HAPROXY_SOCKET_PATH": str(own / "a.sock"),
-            "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(own),
-            "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(own / "state"),
-        }
+        variables = shared | proxy_files(own)
         if not namespaces:
-            stats, metrics, fallback, fallback_grpc = free_ports(4)
-            variables |= replica_ports() | {
-                "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
-                "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
-                "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
-                "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
-            }
+            variables |= replica_ports() | proxy_ports()
         nodes.append(Node(number, address, own, variables, name))
     server = asked(case, "three nodes", [], port, grpc_port)
     if namespaces:

@@ -129,12 +129,18 @@ def stop_signals() -> queue.SimpleQueue[int]:
 
 
 def arrives(signals: queue.SimpleQueue[int], timeout_s: float | None = None) -> bool:
-    """Wait for a signal; return whether one has come within the time."""
-    try:
-        signals.get(timeout=timeout_s)
-    except queue.Empty:
-        return False
-    return True
+    """Wait for a signal, for ever without a time; return whether one has come.
+
+    A wait without an end is one of many seconds: what comes a moment before it begins, or to another thread, interrupts
+    nothing, and its handler would not run until something did.
+    """
+    while True:
+        try:
+            signals.get(timeout=WATCH_INTERVAL_S if timeout_s is None else timeout_s)
+            return True
+        except queue.Empty:
+            if timeout_s is not None:
+                return False
 
 
 def serve_robot(settings: Settings, *, on_ready: Callable[[int], None], orphan_s: float | None = None) -> None:

@@ -110,7 +110,6 @@ def ray_environment(
 ) -> dict[str, str]:
     """Return the environment of `rlservo serve`'s own cluster: this process's, without its Ray settings, with ours."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    fallback_http, fallback_grpc, stats, metrics = free_ports(4)
     environment.update(
         {
             MARK: mark,
@@ -120,8 +119,7 @@ def ray_environment(
             "RAY_AUTH_TOKEN": secrets.token_hex(32),
             CHECK_SECRET: secrets.token_hex(16),
             "RAY_SERVE_LOG_TO_STDERR": "0",
-            "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback_http),
-            "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
+            **proxy_ports(),
             "RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(max_message),
             **_replica_ports(port),
             # Requests take microseconds: replicas need not wait half a minute for stragglers when the server stops.
@@ -136,17 +134,28 @@ def ray_environment(
             # One thread carries what one core's replicas can.
             "RAY_SERVE_HAPROXY_NBTHREAD": "1",
             HAPROXY_BINARY: str(install_wrapper(folder, haproxy)),
-            "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
-            "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
-            # Its files live in our folder, which nobody else may enter, under short names (socket paths).
-            "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
-            "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "a.sock"),
-            "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "m.sock"),
-            "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
-            "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
+            **proxy_files(folder),
         }
     )
     return environment
+
+
+def proxy_ports() -> dict[str, str]:
+    """Return free ports for what listens beside a node's proxy, which are the same for every cluster by default."""
+    names = ("HAPROXY_STATS", "HAPROXY_METRICS", "FALLBACK_PROXY_HTTP", "FALLBACK_PROXY_GRPC")
+    ports = free_ports(len(names))
+    return {f"RAY_SERVE_{name}_PORT": str(port) for name, port in zip(names, ports, strict=True)}
+
+
+def proxy_files(folder: Path) -> dict[str, str]:
+    """Return where a node's HAProxy has its files: in a folder of its own, under short names (socket paths)."""
+    return {
+        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
+        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "a.sock"),
+        "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "m.sock"),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
+    }
 
 
 def _replica_ports(port: int) -> dict[str, str]:

@@ -137,7 +137,7 @@ def serve_policies(
             grpc = None if grpc_port is None else f"{_shown_host(host)}:{grpc_port}"
             key_file = admin_key_file if digest else None
             on_ready(RunningServer(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc, key_file))
-        event = events.get()
+        event = _wait_event(events)
         if isinstance(event, Mapping):
             cause = event.get("died") or _cause_of_end(child, folder)
             raise UnavailableError(f"the server ended by itself: {cause}")
@@ -158,6 +158,13 @@ def _wait_ready(child: subprocess.Popen[bytes], folder: Path, events: queue.Simp
         raise UnavailableError(f"the server could not start: {event['error']}")
     if "ready" not in event:
         raise UnavailableError(f"the server ended while it was starting: {_cause_of_end(child, folder)}")
+
+
+def _wait_event(events: queue.SimpleQueue[Any]) -> Any:
+    """Wait in steps: a signal that comes a moment before a wait, or to another thread, does not interrupt it."""
+    while True:
+        with contextlib.suppress(queue.Empty):
+            return events.get(timeout=1.0)
 
 
 def _end_in_order(child: subprocess.Popen[bytes], events: queue.SimpleQueue[Any]) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from rlservo.export.contract.errors import BundleError, UsageError
-from rlservo.serve_app.ray_serve.environment import cluster_environment
+from rlservo.serve_app.ray_serve.environment import cluster_environment, proxy_files, proxy_ports
 from rlservo.serve_app.ray_serve.launcher import serve_policies
 from rlservo.serve_app.ray_serve.processes import free_ports
 from servers import ask, launched, running, wait_until_served
@@ -75,7 +75,7 @@ def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
     import grpc
     import yaml
 
-    (port, stats, metrics, fallback, grpc_port, grpc_fallback) = free_ports(6)
+    port, grpc_port = free_ports(2)
     configuration = yaml.safe_load((ROOT / "deploy" / "serve.yaml").read_text())
     configuration["http_options"]["port"] = port
     configuration["grpc_options"]["port"] = grpc_port
@@ -85,17 +85,11 @@ def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
     ray_folder = Path(tempfile.mkdtemp(prefix="r"))
     environment = {
         **cluster_environment(ray_folder),
+        **proxy_ports(),
+        **proxy_files(ray_folder),
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
         "RAY_TMPDIR": str(ray_folder),
         "RAY_enable_worker_prestart": "0",  # a process for each core, beside those that Serve starts
-        "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
-        "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
-        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
-        "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(grpc_fallback),
-        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(ray_folder / "haproxy.cfg"),
-        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(ray_folder / "a.sock"),
-        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(ray_folder),
-        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(ray_folder / "state"),
     }
     try:
         program = str(Path(sys.executable).with_name("serve"))
