@@ -1,9 +1,10 @@
-"""Coverage of importance sampling's intervals on the UR5: recordings of the shipped policy exploring, candidates near.
+"""Coverage of estimates' intervals on the UR5: recordings of the shipped policy exploring, candidates near.
 
 Candidates move the mean of the shipped policy's actions by a part of their spread, or change the spread. Each one's
 true return is measured by driving the simulated arm with it; the estimates have its weights from recorded episodes.
+`--fitted` counts fitted Q evaluation, of candidates that do not explore.
 Run (half an hour): rlservo export examples/checkpoints/ur5_positioning policies/ur5 --name ur5 &&
-python benchmarks/robot_estimates.py policies/ur5
+python benchmarks/robot_estimates.py policies/ur5; python benchmarks/robot_estimates.py policies/ur5 --fitted --episodes 150
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from estimates import Candidate, linear, report
 from numpy.typing import NDArray
 
 from rlservo.export.contract.log_probability import log_probability
-from rlservo.serve_app.replay.estimate import Trajectory, importance_sampling
+from rlservo.serve_app.replay.estimate import Trajectory, fitted_estimate, importance_sampling
 from rlservo.serve_app.runtime.exploration import draw_action
 from rlservo.serve_app.runtime.policy import Policy
 
@@ -32,15 +33,24 @@ VARIANTS = {  # mean moved by so many standard deviations, log of the standard d
     "spread 2% smaller": (0.0, -0.02),
     "mean moved by 0.3 of the spread": (0.3, 0.0),
 }
+DETERMINISTIC = {  # the spread is e^-20 of what it was
+    "the mode": (0.0, -20.0),
+    "the mode moved by 0.3 of the spread": (0.3, -20.0),
+    "the mode moved by the spread": (1.0, -20.0),
+}
 
 
 @dataclass
 class Recorded:
-    """One episode: rewards, and for each variant how much likelier it makes each action."""
+    """One episode: what happened, and what the variants make of it."""
 
     rewards: list[float] = field(default_factory=list)
     weights: list[NDArray[np.float64]] = field(default_factory=list)
-    """At each step, logarithms `[variants]`."""
+    """At each step, logarithms `[VARIANTS]`."""
+    obs: list[NDArray[np.float32]] = field(default_factory=list)
+    actions: list[NDArray[np.float32]] = field(default_factory=list)
+    chosen: list[NDArray[np.float32]] = field(default_factory=list)
+    """At each step, actions `[DETERMINISTIC, elements]`."""
 
 
 def move(inputs: NDArray[Any], variant: tuple[float, float]) -> NDArray[np.float64]:
@@ -68,11 +78,18 @@ def run_episodes(policy: Policy, variant: tuple[float, float], episodes: int, fi
         ]
         own = log_probability(move(inputs, variant), drawn.own, contract.distribution, contract.action_space)
         ratios = np.stack(moved, axis=1) - own[:, None]
-        still, seen = [], []
+        modes = [
+            draw_action(move(inputs, other), contract.distribution, contract.action_space, rng).action["action"]
+            for other in DETERMINISTIC.values()
+        ]
+        still, following_obs = [], []
         for row, (env, episode, number) in enumerate(arms):
             obs, reward, terminated, truncated, _ = env.step(drawn.action["action"][row])
             episode.rewards.append(float(reward))
             episode.weights.append(ratios[row])
+            episode.obs.append(np.asarray(seen[row], np.float32))
+            episode.actions.append(np.asarray(drawn.action["action"][row], np.float32))
+            episode.chosen.append(np.stack([mode[row] for mode in modes]).astype(np.float32))
             if terminated or truncated:
                 following = next(waiting, None)
                 if following is None:
@@ -81,8 +98,8 @@ def run_episodes(policy: Policy, variant: tuple[float, float], episodes: int, fi
                 number, episode = following
                 obs = env.reset(seed=first_seed + number)[0]
             still.append((env, episode, number))
-            seen.append(obs)
-        arms = still
+            following_obs.append(obs)
+        arms, seen = still, following_obs
     return found
 
 
@@ -92,29 +109,36 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=600, help="in each recording")
     parser.add_argument("--repetitions", type=int, default=100)
     parser.add_argument("--truth", type=int, default=4000, help="episodes for each candidate's true return")
+    parser.add_argument("--fitted", action="store_true", help="fitted Q evaluation, and not importance sampling")
     arguments = parser.parse_args()
-    candidates = [Candidate(name, linear(0.0), False) for name in VARIANTS]
+    variants = DETERMINISTIC if arguments.fitted else VARIANTS
+    candidates = [Candidate(name, linear(0.0), arguments.fitted) for name in variants]
     with Policy.load(arguments.bundle) as policy:
-        for candidate, variant in zip(candidates, VARIANTS.values(), strict=True):
+        for candidate, variant in zip(candidates, variants.values(), strict=True):
             driven = run_episodes(policy, variant, arguments.truth, 10**6)
             candidate.truth = float(np.mean([sum(one.rewards) for one in driven]))
             print(f"{candidate.name}: true return {candidate.truth:.3f}", flush=True)
         recorded = run_episodes(policy, (0.0, 0.0), arguments.episodes * arguments.repetitions, 0)
-        # Ten times as many episodes as above, of which one recording is a hundredth: the better truth.
-        candidates[0].truth = float(np.mean([sum(one.rewards) for one in recorded]))
+        if not arguments.fitted:  # more episodes than above, of which one recording is a hundredth: the better truth
+            candidates[0].truth = float(np.mean([sum(one.rewards) for one in recorded]))
         for repetition in range(arguments.repetitions):
             episodes = recorded[repetition * arguments.episodes :][: arguments.episodes]
             for index, candidate in enumerate(candidates):
-                made = [trajectory_of(one, index) for one in episodes]
-                for estimate in importance_sampling(made, 1.0, np.random.default_rng(repetition)):
+                made = [trajectory_of(one, index, arguments.fitted) for one in episodes]
+                rng = np.random.default_rng(repetition)
+                estimated = (
+                    [fitted_estimate(made, 1.0, rng)] if arguments.fitted else importance_sampling(made, 1.0, rng)
+                )
+                for estimate in estimated:
                     candidate.count(estimate)
     report(candidates, arguments.repetitions, arguments.episodes)
 
 
-def trajectory_of(one: Recorded, variant: int) -> Trajectory:
-    """Return what importance sampling is made of: it looks at neither observations nor actions."""
-    nothing = np.zeros((len(one.rewards), 0), np.float32)
-    return Trajectory(np.array(one.rewards), np.array(one.weights)[:, variant], nothing, nothing, nothing)
+def trajectory_of(one: Recorded, variant: int, fitted: bool) -> Trajectory:
+    """Return what an estimate is made of."""
+    weights = None if fitted else np.array(one.weights)[:, variant]
+    chosen = np.array(one.chosen)[:, variant if fitted else 0]
+    return Trajectory(np.array(one.rewards), weights, np.array(one.obs), np.array(one.actions), chosen)
 
 
 if __name__ == "__main__":

@@ -69,10 +69,10 @@ def fitted_q(episodes: Sequence[Episode], gamma: float, rng: np.random.Generator
         basis = _basis(recorded, rng, products=products)
         phi, other = basis(recorded), basis(chosen)
         model = _Model(phi, other, rewards, first, last, longest - 1 - steps, gamma)
-        fitted, again = model.values(np.ones(len(phi)))
-        values.append(known + fitted - again)
+        ((fitted,), (again,)) = model.values(np.ones((len(phi), 1)))
+        values.append(float(known + fitted - again))
         wider = abs(again - known)  # what the model is known to get wrong
-        resampled = np.array([np.subtract(*model.values(counts[of_episode])) for counts in draws])
+        resampled = np.subtract(*model.values(draws.T[of_episode]))
         resampled += draws @ returns / len(kept)
         samples += [resampled - wider, resampled + wider]
         inside = min(inside, _inside(phi, other))
@@ -103,28 +103,38 @@ class _Model:
     """Steps that can follow a row."""
     gamma: float
 
-    def values(self, weights: NDArray[np.float64]) -> tuple[float, float]:
-        """Return the fitted returns of the bundle and of the recorded policy, of rows that count so often."""
+    def values(self, weights: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the fitted returns of the bundle and of the recorded policy, both `[samples]`.
+
+        In each sample the rows count as often as `weights` `[rows, samples]` says.
+        """
         size = self.phi.shape[1]
-        weighted = self.phi * weights[:, None]
-        gram = weighted.T @ self.phi
-        solve = np.linalg.solve(gram + RIDGE * np.trace(gram) / size * np.eye(size), weighted.T)
+        inverses = np.empty((weights.shape[1], size, size))
+        for inverse, counts in zip(inverses, weights.T, strict=True):
+            gram = (self.phi * counts[:, None]).T @ self.phi
+            inverse[:] = np.linalg.inv(gram + RIDGE * np.trace(gram) / size * np.eye(size))
         # An episode may end at any step and earn nothing from there on.
-        bounds = min(float(self.rewards.min()), 0.0), max(float(self.rewards.max()), 0.0)
-        starts = weights * self.first
+        bounds = [extreme * self.left[:, None] for extreme in (min(self.rewards.min(), 0), max(self.rewards.max(), 0))]
+        starts = weights[self.first] / weights[self.first].sum(axis=0)
         found = []
         for successors in (self.other, self.phi):
-            coefficients = np.zeros(size)
-            value, before = 0.0, np.inf
             following = np.concatenate([successors[1:], np.zeros((1, size))])
+            coefficients = np.zeros((size, weights.shape[1]))
+            values = np.full(weights.shape[1], np.inf)
+            moving = np.arange(weights.shape[1])  # the samples whose values still change
             for _ in range(int(self.left.max()) + 1):
-                to_come = np.clip(following @ coefficients, bounds[0] * self.left, bounds[1] * self.left)
-                coefficients = solve @ (self.rewards + self.gamma * np.where(self.last, 0.0, to_come))
-                value = float(starts @ (successors @ coefficients)) / float(starts.sum())
-                if abs(value - before) <= SETTLED * max(abs(value), 1e-9):
+                to_come = np.clip(following @ coefficients[:, moving], *bounds)
+                targets = self.rewards[:, None] + self.gamma * np.where(self.last[:, None], 0.0, to_come)
+                sums = self.phi.T @ (weights[:, moving] * targets)
+                coefficients[:, moving] = np.matmul(inverses[moving], sums.T[:, :, None])[:, :, 0].T
+                before = values[moving]
+                beginnings = successors[self.first] @ coefficients[:, moving]
+                values[moving] = (starts[:, moving] * beginnings).sum(axis=0)
+                now = values[moving]
+                moving = moving[np.abs(now - before) > SETTLED * np.maximum(np.abs(now), 1e-9)]
+                if not moving.size:
                     break
-                before = value
-            found.append(value)
+            found.append(values)
         return found[0], found[1]
 
 
