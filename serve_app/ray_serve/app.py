@@ -180,6 +180,7 @@ class PolicyServer(InferenceService):
             # What is there by now stays, and most of it is Ray's: a collection that walks it holds requests up.
             gc.collect()
             gc.freeze()
+            gc.set_threshold(700, 10, 10)  # Python's own: `lean_imports.py` raised it, and rare collections are long
         else:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
 

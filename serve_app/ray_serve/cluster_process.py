@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rlservo.serve_app.ray_serve import ray_parts
+from rlservo.serve_app.ray_serve import lean_imports, ray_parts
 from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, remove_folder
 from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, cut_log, error_line
 from rlservo.serve_app.server.admin_key import remove_key
@@ -55,7 +55,7 @@ def main() -> int:
             configure_logging=False,
             _temp_dir=plan["ray_folder"],
             _node_ip_address="127.0.0.1",  # where Ray's ports listen, with the variable that `launcher.py` sets
-            _system_config={"enable_worker_prestart": False},
+            _system_config={"enable_worker_prestart": False, "preload_python_modules": [lean_imports.__name__]},
         )
         app.start(
             plan["policies"],

@@ -56,6 +56,14 @@ def test_a_replica_loads_no_torch_and_nothing_else_it_does_not_need(live_server:
         assert library not in maps, library
 
 
+def test_no_process_of_the_server_loads_pandas(live_server: LiveServer) -> None:
+    """Serve imports it for data frames, in each process."""
+    pythons = [pid for name in ("ray::", "cluster_process") for pid in live_server.run.processes(name)]
+    maps = [Path(f"/proc/{pid}/maps").read_text() for pid in pythons]
+    assert sum("/ray/_raylet.so" in text for text in maps) >= 5  # cluster, controller, two of the proxy, replica
+    assert not any("/pandas/" in text for text in maps)
+
+
 def test_only_the_asked_for_address_serves_http(live_server: LiveServer) -> None:
     """Replicas, statistics and metrics of HAProxy listen on loopback; 0100007F is 127.0.0.1 as /proc writes it."""
     ours = set()
