@@ -3,7 +3,7 @@
 Candidates move the mean of the shipped policy's actions by a part of their spread, or change the spread. Each one's
 true return is measured by driving the simulated arm with it; the estimates have its weights from recorded episodes.
 `--fitted` counts fitted Q evaluation, of candidates that do not explore.
-Run (half an hour): rlservo export examples/checkpoints/ur5_positioning policies/ur5 --name ur5 &&
+Run (half an hour): rlservo export examples/checkpoints/ur5_positioning --out policies --name ur5 &&
 python benchmarks/robot_estimates.py policies/ur5 && python benchmarks/robot_estimates.py policies/ur5 --fitted
 """
 
