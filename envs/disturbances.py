@@ -33,7 +33,7 @@ class HasModelError(Protocol):
     def draw_model_error(self, size: float, rng: np.random.Generator) -> dict[str, Any]:
         """Change masses, inertias, gains, friction and velocity limit by up to `size` (0.05: 5%).
 
-        Return what was drawn. Sizes are relative to the data sheet's figures, whatever was drawn before; 0 restores those.
+        Return what was drawn. Sizes are relative to the data sheet, whatever was drawn before; 0 restores it.
         """
         ...
 

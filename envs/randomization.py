@@ -66,8 +66,8 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
     judged on what really happened.
 
     `reset(seed=...)` seeds the environment and this wrapper; the same seed and actions give the same episode, and one
-    disturbance more does not change what the others draw. What was drawn is in `info["randomization"]` of `reset`. With nothing
-    asked for the wrapper changes nothing. Options given to `reset` go before those of `extreme`.
+    disturbance more does not change what the others draw. What was drawn is in `info["randomization"]` of `reset`.
+    With nothing asked for the wrapper changes nothing. Options given to `reset` go before those of `extreme`.
 
     Raises ValueError for a range that is empty or negative, errors that do not fit the observation, and what the
     environment cannot do.
@@ -255,14 +255,17 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         describe = getattr(self.env.unwrapped, "describe", None)
         return [element["name"] for element in describe()["observation"]] if describe else []
 
+    def _element_count(self, name: str, value: object) -> int:
+        space = self.observation_space
+        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+            raise ValueError(f"{name} is {value!r}: the observation space is {space}, expected a Box of one dimension")
+        return space.shape[0]
+
     def _by_element(self, name: str, value: ByElement) -> Vector | None:
         """Return one number for each element; None where all are zero."""
         if isinstance(value, (int, float)) and value == 0.0:
             return None
-        space = self.observation_space
-        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
-            raise ValueError(f"{name} is {value}: the observation space is {space}, expected a Box of one dimension")
-        size = space.shape[0]
+        size = self._element_count(name, value)
         if isinstance(value, str):
             errors = self._by_name(name, self._real_errors(name, value))
         elif isinstance(value, Mapping):
@@ -300,14 +303,9 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         return {element: scale * float(getattr(error, attribute)) for element, error in errors.items()}
 
     def _stuck_indices(self, sensor: str) -> list[int]:
-        space = self.observation_space
-        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
-            raise ValueError(
-                f"stuck_sensor is {sensor!r}: the observation space is {space}, expected a Box of one axis"
-            )
-        names = self._element_names()
+        count, names = self._element_count("stuck_sensor", sensor), self._element_names()
         if sensor == "any":
-            return list(range(space.shape[0]))
+            return list(range(count))
         if sensor not in names:
             raise ValueError(f"stuck_sensor is {sensor!r}: expected any or one of {', '.join(names) or 'no names'}")
         return [names.index(sensor)]

@@ -1,8 +1,8 @@
 """Errors of the MiR100's sensors, by observed element.
 
 - Pose: bias 5 cm, the MiR100 data sheet's positioning accuracy; noise 1.7 cm, the same taken as 3 sigma.
-- Velocities: noise 0.032 m/s and 0.071 rad/s. The real robot's odometry publishes a standard deviation of 3.2 mm for its
-  position (DFKI-NI/mir_robot, diffdrive_controller.yaml: a variance of 1e-5 m^2), here over a control cycle; for
+- Velocities: noise 0.032 m/s and 0.071 rad/s. The real robot's odometry publishes a standard deviation of 3.2 mm for
+  its position (DFKI-NI/mir_robot, diffdrive_controller.yaml: a variance of 1e-5 m^2), here over a control cycle; for
   turning, of wheels 0.445 m apart. Bias 2% of the largest command: wheels worn by 1.25 of 62.5 mm.
 - Lasers: noise 0.01 m, robo-gym's figure for the SICK S300. It comes on top of the simulator's own 0.01 m: together
   1.4 cm, between the typical 12 and the largest 20 mm of SICK's scanners (SICK's knowledge base, LMS1xx). Bias 0.03 m,
