@@ -41,6 +41,7 @@ from rlservo import Policy, export_checkpoint
 
 assert ray_settings
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
+MODULE = "learner_group/learner/rl_module/default_policy"  # where a checkpoint has its network
 MILESTONE = 0.95  # the success rate whose time is printed
 SUMS = ("episodes", "judged", "return", "length", "success")
 
@@ -165,7 +166,15 @@ def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
         )
 
 
-def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
+def start_from(algorithm: Algorithm, checkpoint: Path) -> None:
+    """Give the algorithm the network of a checkpoint. Its observation filter begins anew: it is of other noise."""
+    algorithm.learner_group.restore_from_path(
+        str((checkpoint / MODULE).resolve()), component=MODULE.removeprefix("learner_group/")
+    )
+    algorithm.env_runner_group.sync_weights(from_worker_or_learner_group=algorithm.learner_group, inference_only=True)
+
+
+def train(settings: dict[str, Any], seed: int, folder: Path, initial: Path | None = None) -> list[Row]:
     """Train until the stop metric or the steps are reached; leave `folder/checkpoint` (the best) and `curve.csv`."""
     stop = settings["stop"]
     validation = Validation(**settings["validation"]) if "validation" in settings else None
@@ -175,6 +184,8 @@ def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
     config = algorithm_config(settings, seed)
     resources.check_room(resources.request_of(config), resources.ray_room("the one process that trains"), config=config)
     algorithm = config.build_algo()
+    if initial is not None:
+        start_from(algorithm, initial)
     try:
         with (folder / "curve.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -263,6 +274,7 @@ def main() -> None:
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
         help="change a setting of training.yaml for this run, say stop.env_steps=20000 or model.use_lstm=false",
     )  # fmt: skip
+    parser.add_argument("--start-from", type=Path, metavar="CHECKPOINT", help="begin with this checkpoint's network")
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for checkpoint and curve")
     parser.add_argument("--install", action="store_true", help="replace the shipped checkpoint and curve by this run's")
     args = parser.parse_args()
@@ -280,7 +292,7 @@ def main() -> None:
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
     torch.set_num_threads(1)
     with ray_session(num_cpus=1):
-        rows = train(settings, seed, folder)
+        rows = train(settings, seed, folder, args.start_from)
     draw(rows, f"{args.name}, {settings['algorithm']}, seed {seed}", folder / "curve.png")
     print(f"best checkpoint: {folder / 'checkpoint'}")
     if args.install:
