@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rlservo.serve_app.rollout.disturbance_table import DisturbanceTable
 
 EPISODES = 100  # of each row, where the caller does not say
+WIDTH = 140  # [characters], of the table at least: narrower its figures fall apart
 
 
 def measure(
@@ -80,7 +81,8 @@ def show(table: DisturbanceTable) -> None:
     """Print the table."""
     from rlservo.serve_app.rollout.disturbance_table import render_table
 
-    terminal.output().print(render_table(table), soft_wrap=True)
+    console = terminal.output()
+    console.print(render_table(table), width=max(console.width, WIDTH), soft_wrap=True)
 
 
 def _without_disturbances(env_config: Mapping[str, Any]) -> dict[str, Any]:

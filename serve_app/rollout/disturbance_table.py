@@ -162,18 +162,19 @@ def plot_table(table: DisturbanceTable, out: str | Path) -> None:
     figure = figures.Figure(figsize=(8, 1.2 + 0.3 * len(rows)), layout="constrained")
     axis = figure.subplots()
     has_success = all(row.success_rate is not None for row in rows)
+    labels = ["\n".join(textwrap.wrap(row.disturbance.replace(",", ", "), WIDEST)) for row in rows]
     for height, row in enumerate(rows):
         centre, interval = (row.success_rate, row.success_interval) if has_success else (row.return_mean, None)
         low, high = interval or row.return_interval or (centre, centre)
         scale = 100.0 if has_success else 1.0
         axis.plot([scale * low, scale * high], [height, height], color="tab:blue", linewidth=2, alpha=0.5)
         axis.plot([scale * centre], [height], "o", color="tab:blue", markersize=4)
-    axis.set_yticks(range(len(rows)), ["\n".join(textwrap.wrap(row.disturbance, WIDEST)) for row in rows], fontsize=7)
+    axis.set_yticks(range(len(rows)), labels, fontsize=7)
     axis.set_xlabel("success [%], 95% interval" if has_success else "mean return, 95% interval")
     if has_success:
         axis.set_xlim(-2, 102)
     axis.grid(axis="x", alpha=0.3)
-    axis.set_title(f"{table.policy} version {table.version}, {table.env_id}, {rows[0].episodes} episodes", fontsize=9)
+    figure.suptitle(f"{table.policy} version {table.version}, {table.env_id}, {rows[0].episodes} episodes", fontsize=9)
     figure.savefig(out, dpi=100)
 
 
