@@ -95,8 +95,9 @@ class NoObstacleNavigationMir100Sim(Mir100Navigation):
     def extreme_options(self, what: Extreme, rng: np.random.Generator) -> dict[str, Any]:
         """Return the options of an episode with the target beyond the boundary, or the start in a corner of it."""
         if what == "target":
-            direction, distance = rng.uniform(-math.pi, math.pi), rng.uniform(1.5, 2.0) * BOUNDARY
-            return {"target_pose": (distance * math.cos(direction), distance * math.sin(direction), 0.0)}
+            # In x: robo-gym's boundary is open at y below -10 m.
+            x, y = rng.choice((-1.0, 1.0)) * rng.uniform(1.5, 2.0) * BOUNDARY, rng.uniform(-0.5, 0.5) * BOUNDARY
+            return {"target_pose": (x, y, 0.0)}
         x, y = (rng.choice((-1.0, 1.0), 2) * rng.uniform(0.85, 0.95, 2) * BOUNDARY).tolist()
         return {"start_pose": (x, y, rng.uniform(-math.pi, math.pi))}
 
