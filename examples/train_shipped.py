@@ -168,6 +168,7 @@ def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
 
 def start_from(algorithm: Algorithm, checkpoint: Path) -> None:
     """Give the algorithm the network of a checkpoint. Its observation filter begins anew: it is of other noise."""
+    assert algorithm.learner_group is not None and algorithm.env_runner_group is not None
     algorithm.learner_group.restore_from_path(
         str((checkpoint / MODULE).resolve()), component=MODULE.removeprefix("learner_group/")
     )

@@ -130,7 +130,10 @@ def _errors(kind: str, text: str) -> float | str:
         if star:
             _number(kind, factor, math.inf)
         return text
-    return _number(kind, text, math.inf)
+    try:
+        return _number(kind, text, math.inf)
+    except UsageError as error:
+        raise UsageError(f"disturbance '{kind}={text}': expected real, 2*real or a number, 0 or more") from error
 
 
 def _word(meaning: dict[str, str]) -> Callable[[str, str], str]:

@@ -33,6 +33,7 @@ EVERYTHING = (
 )  # fmt: skip
 OUT_OF_DEPTH = ("target=outside", "start=corner", "stuck=any")
 
+COLUMNS = ("disturbance", "success", "return", "endings", "step, largest / mean")
 PROGRESS_EVERY_S = 5.0
 WIDEST = 44  # [characters], of a column
 Z_95 = 1.96
@@ -137,12 +138,6 @@ def render_table(table: DisturbanceTable) -> Table:
     return shown
 
 
-def markdown_table(table: DisturbanceTable) -> str:
-    """Return the table for a document."""
-    lines = [f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}"]
-    return "\n".join([*lines, *(f"| {' | '.join(_cells(row))} |" for row in table.rows)])
-
-
 def check_plot(out: Path) -> None:
     """Raise UsageError where `plot_table` would after minutes of episodes: no such folder, no matplotlib."""
     if not out.parent.is_dir():
@@ -164,11 +159,14 @@ def plot_table(table: DisturbanceTable, out: str | Path) -> None:
     has_success = all(row.success_rate is not None for row in rows)
     labels = ["\n".join(textwrap.wrap(row.disturbance.replace(",", ", "), WIDEST)) for row in rows]
     for height, row in enumerate(rows):
-        centre, interval = (row.success_rate, row.success_interval) if has_success else (row.return_mean, None)
-        low, high = interval or row.return_interval or (centre, centre)
-        scale = 100.0 if has_success else 1.0
-        axis.plot([scale * low, scale * high], [height, height], color="tab:blue", linewidth=2, alpha=0.5)
-        axis.plot([scale * centre], [height], "o", color="tab:blue", markersize=4)
+        if row.success_rate is not None and row.success_interval is not None and has_success:
+            centre = 100.0 * row.success_rate
+            low, high = (100.0 * share for share in row.success_interval)
+        else:
+            centre = row.return_mean
+            low, high = row.return_interval or (centre, centre)
+        axis.plot([low, high], [height, height], color="tab:blue", linewidth=2, alpha=0.5)
+        axis.plot([centre], [height], "o", color="tab:blue", markersize=4)
     axis.set_yticks(range(len(rows)), labels, fontsize=7)
     axis.set_xlabel("success [%], 95% interval" if has_success else "mean return, 95% interval")
     if has_success:
@@ -176,9 +174,6 @@ def plot_table(table: DisturbanceTable, out: str | Path) -> None:
     axis.grid(axis="x", alpha=0.3)
     figure.suptitle(f"{table.policy} version {table.version}, {table.env_id}, {rows[0].episodes} episodes", fontsize=9)
     figure.savefig(out, dpi=100)
-
-
-COLUMNS = ("disturbance", "success", "return", "endings", "step, largest / mean")
 
 
 def _cells(row: DisturbedRow) -> tuple[str, ...]:
