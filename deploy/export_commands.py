@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from rlservo.deploy import terminal
+from rlservo.deploy import disturbance_commands, terminal
+from rlservo.deploy.serve_commands import parse_env_arguments
 from rlservo.deploy.terminal import Json, needs_extra, note, print_json
 from rlservo.export.contract.errors import UsageError
 
@@ -140,17 +141,74 @@ def inspect(
 
 def verify(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
-    checkpoint: Annotated[str, typer.Option(help="The RLlib checkpoint to compare with; a folder or a URI.")],
+    disturbances: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[KIND=SIZE]...",
+            help="With --disturb, the rows of the table, such as latency=3 or noise=real,payload=2; the standard ones "
+            "by default. Kinds: latency, observation_latency, late [cycles], drop [share], noise, bias (real, 2*real), "
+            "stuck (any or an element), payload [kg], model [share], base [m], target=outside, start=corner.",
+        ),
+    ] = None,
+    checkpoint: Annotated[
+        str | None, typer.Option(help="The RLlib checkpoint to compare with; a folder or a URI.")
+    ] = None,
     env: Annotated[str | None, typer.Option(help="Environment id for a closed-loop comparison.")] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes of the closed loop.")] = 20,
+    disturb: Annotated[
+        bool, typer.Option("--disturb", help="Drive --env under disturbances: noise, latency, payload and others.")
+    ] = False,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Episodes of the closed loop (20), of each row under --disturb (100).")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.")] = 0,
+    env_arg: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="With --disturb, environment constructor argument (JSON value)."),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="With --disturb, draw the table into this file.")] = None,
+    write: Annotated[
+        bool, typer.Option("--write", help="With --disturb, write the rows into the contract as evaluations.")
+    ] = False,
     app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
     as_json: Json = False,
 ) -> None:
     """Prove a bundle against its checkpoint again. With --env also in closed loop, written into the contract.
 
-    Example: `rlservo verify policies/ur5 --checkpoint runs/best --env rlservo/EndEffectorPositioningURSim-v0`
+    With --disturb it is driven as a real robot would have it, with no checkpoint needed: success, return and endings
+    under each disturbance, over the same seeds.
+
+    Examples: `rlservo verify policies/ur5 --checkpoint runs/best --env rlservo/EndEffectorPositioningURSim-v0`,
+    `rlservo verify policies/ur5 --env rlservo/EndEffectorPositioningURSim-v0 --disturb`
     """
+    if not disturb and (disturbances or plot or write or env_arg):
+        raise UsageError("disturbances, --plot, --write and --env-arg go with --disturb")
+    if checkpoint is None and not disturb:
+        raise UsageError("give --checkpoint to compare the bundle with, or --disturb with --env, or both")
+    document: dict[str, Any] = {}
+    if checkpoint is not None:
+        document |= _verify_against(checkpoint, bundle, env, episodes or 20, seed, app_dir, as_json)
+    if disturb:
+        table = disturbance_commands.measure(
+            bundle,
+            env,
+            disturbances or [],
+            episodes=episodes,
+            seed=seed,
+            env_arguments=parse_env_arguments(env_arg or []),
+            plot=plot,
+            write=write,
+        )
+        document["disturbances"] = table.as_dict()
+        if not as_json:
+            disturbance_commands.show(table)
+    if as_json:
+        print_json(document)
+
+
+def _verify_against(
+    checkpoint: str, bundle: Path, env: str | None, episodes: int, seed: int, app_dir: Path, as_json: bool
+) -> dict[str, Any]:
+    """Compare a bundle with its checkpoint; return the document for programs, and print it for people otherwise."""
     with needs_extra("train"):
         from rlservo.export.commands.report import verification_report
         from rlservo.export.commands.verify import verify_bundle
@@ -166,13 +224,10 @@ def verify(
             notify=note,
             progress=status.update,
         )
-    if as_json:
-        print_json(
-            {
-                "parity": result.parity.model_dump(mode="json"),
-                "evaluation": result.evaluation.model_dump(mode="json") if result.evaluation else None,
-                "same_checkpoint": result.same_checkpoint,
-            }
-        )
-    else:
+    if not as_json:
         terminal.output().print(verification_report(result.parity, result.evaluation))
+    return {
+        "parity": result.parity.model_dump(mode="json"),
+        "evaluation": result.evaluation.model_dump(mode="json") if result.evaluation else None,
+        "same_checkpoint": result.same_checkpoint,
+    }

@@ -164,6 +164,13 @@ def rollout(
     record: Annotated[
         Path | None, typer.Option(help="Record every decision, with rewards and ends: a new .mcap file, or a folder.")
     ] = None,
+    disturb: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND=SIZE,...",
+            help="Drive under disturbances, such as latency=3,noise=real,payload=3; `rlservo verify -h` has the kinds.",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Drive an environment with a policy. Success, return, latency and deadline misses are reported.
@@ -191,6 +198,7 @@ def rollout(
             env_kwargs=parse_env_arguments(env_arg or []),
             video=video,
             record=record,
+            disturb=disturb,
         )
     if as_json:
         print_json(report.as_dict())

@@ -27,6 +27,7 @@ from typing import Any, cast
 
 import shared.ray_settings as ray_settings  # before Ray  # isort: skip
 import evaluate_shipped
+import gymnasium
 import shared.resources as resources
 import torch
 import yaml
@@ -34,6 +35,7 @@ from ray import cloudpickle
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
+from ray.rllib.utils.filter import RunningStat
 from ray.tune.registry import get_trainable_cls
 from shared.training_run import main_with_sentences, ray_session
 
@@ -41,6 +43,8 @@ from rlservo import Policy, export_checkpoint
 
 assert ray_settings
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
+FILTER = "env_to_module_connector"
+MODULE = "learner_group/learner/rl_module/default_policy"  # where a checkpoint has its network
 MILESTONE = 0.95  # the success rate whose time is printed
 SUMS = ("episodes", "judged", "return", "length", "success")
 
@@ -165,7 +169,62 @@ def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
         )
 
 
-def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
+@dataclass(frozen=True)
+class Beginning:
+    """The network that training begins with, and the observed elements that it shall not know yet."""
+
+    checkpoint: Path
+    forgotten: tuple[str, ...] = ()
+
+    def apply(self, algorithm: Algorithm, settings: dict[str, Any]) -> None:
+        """Load the network and its observation filter.
+
+        An element that never moved in the first training (a fixed joint's velocity) was divided by next to nothing:
+        the network's weights on it mean nothing, and shake it as soon as the element moves. A forgotten one begins
+        with weights of 0 and a spread of 1. Raises ValueError for an element that the environment does not have.
+        """
+        learners, runners, runner = algorithm.learner_group, algorithm.env_runner_group, algorithm.env_runner
+        assert learners is not None and runners is not None and runner is not None
+        root = self.checkpoint.resolve()
+        learners.restore_from_path(str(root / MODULE), component=MODULE.removeprefix("learner_group/"))
+        runner.restore_from_path(str(root / "env_runner" / FILTER), component=FILTER)
+        if self.forgotten:
+            columns, count = _columns(settings, self.forgotten)
+            learners.foreach_learner(lambda learner, *_: _forget(learner, columns, count))
+            for connector in runner._env_to_module:  # RLlib has no public way to the pipeline of a runner
+                if isinstance(connector, MeanStdFilter):
+                    connector.set_state(_with_spread_of_one(connector.get_state(), columns))
+        runners.sync_weights(from_worker_or_learner_group=learners, inference_only=True)
+
+
+def _with_spread_of_one(state: dict[str, Any], columns: list[int]) -> dict[str, Any]:
+    for agent in state.values():
+        stats = [RunningStat.from_state(one) for one in agent["running_stats"]]
+        for one in stats:
+            one.mean_array[columns] = 0.0
+            one.sum_sq_diff_array[columns] = one.num_pushes
+        agent["running_stats"] = [one.to_state() for one in stats]
+    return state
+
+
+def _columns(settings: dict[str, Any], names: tuple[str, ...]) -> tuple[list[int], int]:
+    env: Any = gymnasium.make(settings["env"], disable_env_checker=True, **settings.get("env_config", {}))
+    known = [element["name"] for element in env.unwrapped.describe()["observation"]]
+    env.close()
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(f"--forget {unknown[0]}: expected some of {', '.join(known)}")
+    return [known.index(name) for name in names], len(known)
+
+
+def _forget(learner: Any, columns: list[int], count: int) -> None:
+    with torch.no_grad():
+        for name, weight in learner.module["default_policy"].named_parameters():
+            if name.endswith("mlp.0.weight") and weight.ndim == 2 and weight.shape[1] == count:
+                weight[:, columns] = 0.0
+
+
+def train(settings: dict[str, Any], seed: int, folder: Path, beginning: Beginning | None = None) -> list[Row]:
     """Train until the stop metric or the steps are reached; leave `folder/checkpoint` (the best) and `curve.csv`."""
     stop = settings["stop"]
     validation = Validation(**settings["validation"]) if "validation" in settings else None
@@ -175,6 +234,8 @@ def train(settings: dict[str, Any], seed: int, folder: Path) -> list[Row]:
     config = algorithm_config(settings, seed)
     resources.check_room(resources.request_of(config), resources.ray_room("the one process that trains"), config=config)
     algorithm = config.build_algo()
+    if beginning is not None:
+        beginning.apply(algorithm, settings)
     try:
         with (folder / "curve.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -263,6 +324,11 @@ def main() -> None:
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
         help="change a setting of training.yaml for this run, say stop.env_steps=20000 or model.use_lstm=false",
     )  # fmt: skip
+    parser.add_argument("--start-from", type=Path, metavar="CHECKPOINT", help="begin with this checkpoint's network")
+    parser.add_argument(
+        "--forget", action="append", default=[], metavar="ELEMENT",
+        help="with --start-from: let the network begin without this observed element, which never moved before",
+    )  # fmt: skip
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for checkpoint and curve")
     parser.add_argument("--install", action="store_true", help="replace the shipped checkpoint and curve by this run's")
     args = parser.parse_args()
@@ -272,6 +338,9 @@ def main() -> None:
             change_setting(settings, change)
         except ValueError as error:
             parser.error(f"--set {change}: {error}")
+    if args.forget and args.start_from is None:
+        parser.error("--forget goes with --start-from")
+    beginning = None if args.start_from is None else Beginning(args.start_from, tuple(args.forget))
     seed = settings["seed"] if args.seed is None else args.seed
     folder = args.storage / args.name
     folder.mkdir(parents=True, exist_ok=True)
@@ -280,7 +349,7 @@ def main() -> None:
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
     torch.set_num_threads(1)
     with ray_session(num_cpus=1):
-        rows = train(settings, seed, folder)
+        rows = train(settings, seed, folder, beginning)
     draw(rows, f"{args.name}, {settings['algorithm']}, seed {seed}", folder / "curve.png")
     print(f"best checkpoint: {folder / 'checkpoint'}")
     if args.install:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.checks import ElementInfo, EnvDescription, as_vector, check_action, check_option_names
+from rlservo.envs.disturbances import SensorError
 from rlservo.envs.mir100.lasers import pick_beams
 from rlservo.envs.mir100.parameters import (
     CYCLE_S,
@@ -24,6 +25,7 @@ from rlservo.envs.mir100.parameters import (
     MAX_ANGULAR_VELOCITY,
     MAX_LINEAR_VELOCITY,
 )
+from rlservo.envs.mir100.sensor_errors import sensor_errors
 from rlservo.envs.mir100.simulation import Mir100Simulation, wrap_angle
 from rlservo.envs.mir100.worlds import Pose
 from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv, Start
@@ -92,6 +94,7 @@ class Mir100Navigation(RenderedEnv):
         self._shown_readings: NDArray[np.floating[Any]] | None = None  # of an observation that is looked at
         self._previous_distance: float | None = None
         self._steps = 0
+        self._base_offset = (0.0, 0.0)  # [m]
 
     @classmethod
     def describe(cls, **_constructor_arguments: Any) -> EnvDescription:
@@ -124,7 +127,7 @@ class Mir100Navigation(RenderedEnv):
         self._steps = 0
         self._previous_distance = None
         self._refresh_window()
-        return self._observation(*self._target_polar()), {}
+        return self._observation(*self._told_target_polar()), {}
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Command velocities, let 0.1 s pass, and judge the outcome."""
@@ -150,7 +153,25 @@ class Mir100Navigation(RenderedEnv):
             status = "max_steps_exceeded"
         info = {} if status is None else {"final_status": status, "is_success": status == "success"}
         self._refresh_window()
+        if any(self._base_offset):
+            distance, bearing = self._told_target_polar()
         return self._observation(distance, bearing), reward, terminated, truncated, info
+
+    # -- for disturbances
+
+    def set_base_offset(self, offset: tuple[float, float]) -> None:
+        """Tell the target wrong by `offset` (x, y) [m] on the map: the localisation is off."""
+        self._base_offset = offset
+
+    def sensor_errors(self) -> dict[str, SensorError]:
+        """Return what the real robot's localisation, odometry and scanners add."""
+        return sensor_errors(self.LASER_COUNT, LINEAR_SCALE, ANGULAR_SCALE)
+
+    @property
+    def commanded_velocity(self) -> dict[str, Vector]:
+        """What the robot is commanded now, by unit."""
+        linear, angular = self.simulation.commanded_velocity
+        return {"m/s": np.array([linear]), "rad/s": np.array([angular])}
 
     # -- for viewers
 
@@ -236,8 +257,16 @@ class Mir100Navigation(RenderedEnv):
 
     def _target_polar(self) -> tuple[float, float]:
         """Return distance [m] and direction [rad, -pi .. pi] of the target, seen from the robot."""
-        x, y, yaw = self.simulation.pose
         target_x, target_y, _ = self.simulation.target
+        return self._polar(target_x, target_y)
+
+    def _told_target_polar(self) -> tuple[float, float]:
+        """Return the same as the policy is told: where the robot believes to be, the target is elsewhere."""
+        (target_x, target_y, _), (dx, dy) = self.simulation.target, self._base_offset
+        return self._polar(target_x + dx, target_y + dy)
+
+    def _polar(self, target_x: float, target_y: float) -> tuple[float, float]:
+        x, y, yaw = self.simulation.pose
         dx, dy = target_x - x, target_y - y
         return math.hypot(dx, dy), wrap_angle(math.atan2(dy, dx) - yaw)
 

@@ -6,6 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import numpy as np
+
+from rlservo.envs.disturbances import Extreme
 from rlservo.envs.mir100.navigation import Mir100Navigation
 from rlservo.envs.mir100.worlds import EMPTY, Pose
 
@@ -88,6 +91,15 @@ class NoObstacleNavigationMir100Sim(Mir100Navigation):
 
     def _place(self, start: Sequence[float], target: Sequence[float], options: Mapping[str, Any]) -> None:  # noqa: ARG002
         self.simulation.place(start, target=target)
+
+    def extreme_options(self, what: Extreme, rng: np.random.Generator) -> dict[str, Any]:
+        """Return the options of an episode with the target beyond the boundary, or the start in a corner of it."""
+        if what == "target":
+            # In x: robo-gym's boundary is open at y below -10 m.
+            x, y = rng.choice((-1.0, 1.0)) * rng.uniform(1.5, 2.0) * BOUNDARY, rng.uniform(-0.5, 0.5) * BOUNDARY
+            return {"target_pose": (x, y, 0.0)}
+        x, y = (rng.choice((-1.0, 1.0), 2) * rng.uniform(0.85, 0.95, 2) * BOUNDARY).tolist()
+        return {"start_pose": (x, y, rng.uniform(-math.pi, math.pi))}
 
     def _failure(self) -> str | None:
         x, y, _ = self.simulation.pose

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rlservo.envs.checks import InvalidResetError, as_vector
+from rlservo.envs.disturbances import Extreme
 from rlservo.envs.mir100.navigation import Mir100Navigation
 from rlservo.envs.mir100.parameters import LENGTH, WIDTH
 from rlservo.envs.mir100.simulation import ROOM_VIEW
@@ -130,6 +131,15 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
             f"{'wherever the cubes stand' if cubes is None else 'with these cubes'}; expected a pose inside the room, "
             f"clear of the walls"
         )
+
+    def extreme_options(self, what: Extreme, rng: np.random.Generator) -> dict[str, Any]:
+        """Return the options of an episode with the target behind a wall, or the robot in a corner, facing it."""
+        if what == "target":
+            return {"target_pose": (rng.uniform(-2.0, 2.0), rng.choice((-1.0, 1.0)) * rng.uniform(4.5, 5.5), 0.0)}
+        side_x, side_y = rng.choice((-1.0, 1.0), 2).tolist()
+        x, y = side_x * rng.uniform(1.9, 2.1), side_y * rng.uniform(3.0, 3.15)
+        facing = math.atan2(side_y, side_x) + rng.uniform(-0.4, 0.4)
+        return {"start_pose": (x, y, facing)}
 
     def _failure(self) -> str | None:
         is_failure = (

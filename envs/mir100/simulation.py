@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rlservo.envs.disturbances import MAX_MODEL_ERROR
 from rlservo.envs.mir100.lasers import LaserScanners
 from rlservo.envs.mir100.model import TIMESTEP, build_model
 from rlservo.envs.mir100.parameters import (
@@ -21,14 +22,17 @@ from rlservo.envs.mir100.parameters import (
     COMMAND_TIMEOUT_S,
     CYCLE_S,
     LASER_NOISE,
+    MASS,
     MAX_ANGULAR_ACCELERATION,
     MAX_ANGULAR_VELOCITY,
     MAX_LINEAR_ACCELERATION,
     MAX_LINEAR_VELOCITY,
     SAFETY_DISTANCE,
+    WHEEL_SEPARATION,
 )
 from rlservo.envs.mir100.worlds import Pose, find_world
 
+GRAVITY = 9.81  # [m/s^2]
 SUBSTEPS = round(CYCLE_S / TIMESTEP)
 TIMEOUT_SUBSTEPS = round(COMMAND_TIMEOUT_S / TIMESTEP)
 LINEAR_INCREMENT = MAX_LINEAR_ACCELERATION * TIMESTEP  # [m/s] a substep
@@ -67,6 +71,14 @@ class Mir100Simulation:
         self._command = (0.0, 0.0)  # [m/s], [rad/s], the last one, within the velocity limits
         self._command_age = 0  # substeps
         self._setpoint = (0.0, 0.0)  # [m/s], [rad/s], what the wheels are told: follows within the acceleration limits
+        self._velocity_factors = (1.0, 1.0)  # what the wheels make of a command, ahead and turning
+        self._body = self.model.body("base_link").id
+        self._data_sheet = (
+            float(self.model.body_mass[self._body]),
+            self.model.body_inertia[self._body].copy(),
+            self.model.actuator_gainprm.copy(),
+            self.model.actuator_biasprm.copy(),
+        )
         self.place((0.0, 0.0, 0.0))
 
     # -- placing
@@ -113,6 +125,35 @@ class Mir100Simulation:
         mujoco.mj_kinematics(self.model, self.data)
         self._scan_is_fresh = False
 
+    def draw_model_error(self, size: float, rng: np.random.Generator) -> dict[str, Any]:
+        """Let the robot differ from its data sheet by up to `size` (0.05: 5%) and return what was drawn.
+
+        Factors of mass, inertia and of the drive's gains are uniform in 1 +- size, and so are those of the velocities
+        that the wheels make of a command (worn wheels; the limits with them), ahead and turning. Friction of the
+        floor [N] is uniform from 0 to size times the weight, for turning [Nm] at half the wheels' separation.
+        """
+        if not 0.0 <= size <= MAX_MODEL_ERROR:
+            raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's figures")
+        model, (mass, inertia, gains, biases) = self.model, self._data_sheet
+        mass_factor, inertia_factor = rng.uniform(1.0 - size, 1.0 + size, 2).tolist()
+        gain_factors = rng.uniform(1.0 - size, 1.0 + size, len(gains))
+        velocities = rng.uniform(1.0 - size, 1.0 + size, 2).tolist()
+        drag = float(rng.uniform(0.0, size)) * MASS * GRAVITY
+        model.body_mass[self._body] = mass * mass_factor
+        model.body_inertia[self._body] = inertia * inertia_factor
+        model.actuator_gainprm[:] = gains * gain_factors[:, None]
+        model.actuator_biasprm[:] = biases * gain_factors[:, None]
+        model.dof_frictionloss[:] = drag, drag, drag * WHEEL_SEPARATION / 2
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        self._velocity_factors = (velocities[0], velocities[1])
+        return {
+            "mass": mass_factor,
+            "inertia": inertia_factor,
+            "gains": gain_factors.tolist(),
+            "friction": drag,
+            "velocities": velocities,
+        }
+
     # -- moving
 
     def command(self, linear: float, angular: float) -> bool:
@@ -139,12 +180,13 @@ class Mir100Simulation:
         model, data, step = self.model, self.data, mujoco.mj_step
         ctrl = data.ctrl
         linear, angular = self._setpoint
+        linear_factor, angular_factor = self._velocity_factors
         in_contact = False
         for _ in range(SUBSTEPS):
             if self._command_age >= TIMEOUT_SUBSTEPS:
                 self._command = (0.0, 0.0)
             self._command_age += 1
-            target_linear, target_angular = self._command
+            target_linear, target_angular = self._command[0] * linear_factor, self._command[1] * angular_factor
             linear += max(-LINEAR_INCREMENT, min(LINEAR_INCREMENT, target_linear - linear))
             angular += max(-ANGULAR_INCREMENT, min(ANGULAR_INCREMENT, target_angular - angular))
             ctrl[0] = linear
@@ -161,6 +203,11 @@ class Mir100Simulation:
         self._scan_is_fresh = False
 
     # -- state
+
+    @property
+    def commanded_velocity(self) -> tuple[float, float]:
+        """What the robot is asked for now [m/s], [rad/s]."""
+        return self._command
 
     @property
     def pose(self) -> Pose:

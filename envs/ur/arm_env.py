@@ -103,6 +103,7 @@ class URArmEnv(RenderedEnv):
         self._camera = Camera(self.simulation.model, self.simulation.data, **VIEW)
         self._start: Vector = np.array(self.START_JOINTS)
         self._steps = 0
+        self._base_offset: Vector = np.zeros(3)  # [m]
 
     @classmethod
     def describe(cls, *, action_cycle_rate: float | None = None, **arguments: Any) -> EnvDescription:
@@ -150,6 +151,17 @@ class URArmEnv(RenderedEnv):
             info["rs_state"] = self.simulation.state(self.RS_MODE)
         self._refresh_window()
         return observation, reward, terminated, truncated, info
+
+    # -- for disturbances
+
+    def set_base_offset(self, offset: tuple[float, float]) -> None:
+        """Tell positions of objects wrong by `offset` (x, y) [m]: the base stands elsewhere than it was measured."""
+        self._base_offset = np.array([*offset, 0.0])
+
+    @property
+    def commanded_velocity(self) -> dict[str, Vector]:
+        """What the joints are commanded now, by unit."""
+        return {"rad/s": self.simulation.commanded_velocity}
 
     # -- for viewers
 

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.checks import InvalidResetError, as_vector
+from rlservo.envs.disturbances import SensorError
 from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
 from rlservo.envs.ur.object_paths import object_path
 from rlservo.envs.ur.parameters import JOINTS
+from rlservo.envs.ur.sensor_errors import joint_errors, polar_errors
 
 OBJECT_X, OBJECT_Y = 0.12, 0.34  # [m]
 Z_AMPLITUDE_RANGE, Z_OFFSET_RANGE, Z_FREQUENCY = (0.09, 0.35), (0.2, 0.6), 0.125  # [m], [m], [Hz]
@@ -114,6 +116,14 @@ class BasicAvoidanceURSim(URArmEnv):
         high = np.concatenate([np.full(3, np.inf), np.full(12, POSITION_BOUND), elbow])
         return -high, high
 
+    # -- for disturbances
+
+    def sensor_errors(self) -> dict[str, SensorError]:
+        """Return what a real arm's sensors and a camera add."""
+        joints = joint_errors("position_normalized") | joint_errors("offset_normalized")
+        elbow = polar_errors("object_to_elbow") if self._include_polar_to_elbow else {}
+        return polar_errors("object") | joints | elbow
+
     # -- for viewers
 
     def target_position(self) -> Vector:
@@ -182,7 +192,7 @@ class BasicAvoidanceURSim(URArmEnv):
 
     def _observation(self) -> Observation:
         sim = self.simulation
-        ball = sim.object_position(0)
+        ball = sim.object_position(0) + self._base_offset
         joints = sim.joint_positions / LIMITS
         observation = np.zeros(18, dtype=np.float32)
         observation[0:3] = polar((ball - sim.tool_position) @ sim.tool_rotation)

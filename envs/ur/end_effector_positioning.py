@@ -10,15 +10,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.checks import InvalidResetError, as_vector
+from rlservo.envs.disturbances import Extreme, SensorError
 from rlservo.envs.rendering import Start
 from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
 from rlservo.envs.ur.parameters import JOINTS
+from rlservo.envs.ur.sensor_errors import joint_errors, polar_errors, position_errors, velocity_errors
 
 START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
 START_RANGE = (1.5, 0.25, 0.5, 1.0, 0.4, 3.14)  # [rad], +-, with randomize_start
 WRIST_1_RANGE = (-3.48, 0.31)  # [rad], with restrict_wrist_1
 SUCCESS_DISTANCE = 0.1  # [m]
 REDRAWS = 1000  # of a random start that collides; about one in ten does
+# A start in a corner: any joints in this range [rad] that bring the tool near the base's axis or the table.
+CORNER_LOW = (-math.pi, -math.pi, -2.8, -math.pi, -math.pi, 0.0)
+CORNER_HIGH = (math.pi, 0.0, 2.8, math.pi, math.pi, 0.0)
+CORNER_RADIUS, CORNER_HEIGHT = 0.25, 0.15  # [m]
 
 
 class EndEffectorPositioningURSim(URArmEnv):
@@ -122,6 +128,36 @@ class EndEffectorPositioningURSim(URArmEnv):
         high = np.concatenate([infinite[:3], np.full(6, POSITION_BOUND), infinite, infinite, np.full(6, 1.01)])
         return -high, high
 
+    # -- for disturbances
+
+    def sensor_errors(self) -> dict[str, SensorError]:
+        """Return what a real arm's sensors add; the previous actions are known exactly."""
+        joints = joint_errors("position_normalized") | velocity_errors()
+        return polar_errors("target") | joints | position_errors()
+
+    def extreme_options(self, what: Extreme, rng: np.random.Generator) -> dict[str, Any]:
+        """Return the options of an episode whose target is beyond the arm's reach, or that starts in a corner.
+
+        In a corner the arm is folded, the tool within 0.25 m of the base's axis or within 0.15 m of the table.
+        """
+        arm = self.simulation.parameters
+        if what == "target":
+            # Further than the stretched arm and the success distance, whatever the direction.
+            reach = arm.d1 + abs(arm.a2) + abs(arm.a3) + arm.d4 + arm.d5 + arm.d6
+            radius, phi = (reach + SUCCESS_DISTANCE) * rng.uniform(1.1, 1.6), rng.uniform(-math.pi, math.pi)
+            height = rng.uniform(0.0, 0.7)
+            horizontal = math.sqrt(1.0 - height * height)
+            position = radius * np.array([horizontal * math.cos(phi), horizontal * math.sin(phi), height])
+            return {"ee_target_pose": [*position.tolist(), 0.0, 0.0, 0.0]}
+        for _ in range(REDRAWS):
+            joints: Vector = rng.uniform(CORNER_LOW, CORNER_HIGH)
+            if self.simulation.place(joints):
+                continue
+            x, y, z = self.simulation.tool_position.tolist()
+            if math.hypot(x, y) < CORNER_RADIUS or z < CORNER_HEIGHT:
+                return {"joint_positions": joints.tolist(), "randomize_start": False}
+        raise InvalidResetError(f"{REDRAWS} random poses were none in a corner")
+
     # -- for viewers
 
     def target_position(self) -> Vector:
@@ -202,11 +238,12 @@ class EndEffectorPositioningURSim(URArmEnv):
     def _observation(self) -> Observation:
         sim = self.simulation
         tool = sim.tool_position
+        target = self._target + self._base_offset
         observation = np.empty(27, dtype=np.float32)
-        observation[0:3] = polar((self._target - tool) @ sim.tool_rotation)  # in the tool0 frame
+        observation[0:3] = polar((target - tool) @ sim.tool_rotation)  # in the tool0 frame
         observation[3:9] = sim.joint_positions / LIMITS
         observation[9:15] = sim.joint_velocities
-        observation[15:18] = self._target
+        observation[15:18] = target
         observation[18:21] = tool
         observation[21:27] = self._previous_action
         return observation
@@ -214,6 +251,8 @@ class EndEffectorPositioningURSim(URArmEnv):
     def _judge(self, observation: Observation, command: Vector) -> tuple[float, str | None]:
         self._previous_action = command  # after the observation: robo-gym's order, see the data sheet
         distance = float(observation[0])
+        if self._base_offset.any():  # what is told is not where it is
+            distance = math.dist(self._target, self.simulation.tool_position)
         if self.simulation.in_collision:
             return -1.0, "collision"
         if distance <= SUCCESS_DISTANCE:

@@ -8,12 +8,13 @@ objects stand or move along paths. The Gymnasium environments and the robot serv
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rlservo.envs.disturbances import MAX_MODEL_ERROR
 from rlservo.envs.ur.model import BASE_HEIGHT, TIMESTEP, build_model
 from rlservo.envs.ur.object_paths import UPDATE_RATE_HZ, Path
 from rlservo.envs.ur.parameters import JOINTS, ur_parameters
@@ -31,9 +32,20 @@ REACH_STEPS = 60
 REACH_STEP = 0.05  # [m], of tool0 at once
 REACH_DAMPING = 0.05  # [m], which keeps the joints calm where the arm is stretched
 
+LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")  # what moves
 MAX_PAYLOAD = 20.0  # [kg], more than the largest arm carries (ur16e: 16 kg)
 
 Vector = NDArray[np.float64]
+
+
+class _DataSheet(NamedTuple):
+    """The model's figures as built, from which a model error is drawn."""
+
+    max_velocity: Vector  # [rad/s], (6,)
+    masses: Vector  # [kg], LINKS
+    inertias: Vector  # [kg m^2], (6, 3)
+    gains: Vector  # of the actuators, by MuJoCo's parameters
+    biases: Vector
 
 
 class URSimulation:
@@ -76,6 +88,14 @@ class URSimulation:
         self._moving: dict[int, Path] = {}  # by mocap index, in the world
         self._tick = 0  # substeps since the objects' paths began
         self._payload = self.model.body("payload").id
+        self._links = np.array([self.model.body(name).id for name in LINKS])
+        self._data_sheet = _DataSheet(
+            self.max_velocity.copy(),
+            self.model.body_mass[self._links].copy(),
+            self.model.body_inertia[self._links].copy(),
+            self.model.actuator_gainprm.copy(),
+            self.model.actuator_biasprm.copy(),
+        )
         self._velocity: Vector = np.zeros(6)  # [rad/s], of the trajectory that is being executed
         self._remaining = 0  # substeps until that trajectory arrives
         self.in_collision = False
@@ -126,6 +146,38 @@ class URSimulation:
             raise ValueError(f"the payload is {mass:g} kg: expected 0 to {MAX_PAYLOAD:g} kg")
         self.model.body_mass[self._payload] = mass
         mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+
+    def draw_model_error(self, size: float, rng: np.random.Generator) -> dict[str, Any]:
+        """Let the arm differ from its data sheet by up to `size` (0.05: 5%) and return what was drawn.
+
+        Factors of each link's mass and inertia and of each joint's servo gains, and one of the velocity limits, are
+        uniform in 1 +- size. Friction is that of a joint without motion [Nm], uniform from 0 to size times its effort
+        limit: 5% are 7.5 Nm at a UR5's base, of the order that is identified for these drives. The arm compensates
+        for the gravity of the masses in the data sheet.
+        """
+        if not 0.0 <= size <= MAX_MODEL_ERROR:
+            raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's figures")
+        model, sheet = self.model, self._data_sheet
+        masses, inertias = rng.uniform(1.0 - size, 1.0 + size, (2, len(LINKS)))
+        gains = rng.uniform(1.0 - size, 1.0 + size, 6)
+        friction = rng.uniform(0.0, size, 6) * self.parameters.effort_limits
+        speed = float(rng.uniform(1.0 - size, 1.0 + size))
+        model.body_mass[self._links] = sheet.masses * masses
+        model.body_gravcomp[self._links] = 1.0 / masses
+        model.body_inertia[self._links] = sheet.inertias * inertias[:, None]
+        for actuators in (self._servo, self._feed_forward):
+            model.actuator_gainprm[actuators] = sheet.gains[actuators] * gains[:, None]
+            model.actuator_biasprm[actuators] = sheet.biases[actuators] * gains[:, None]
+        model.dof_frictionloss[:] = friction
+        self.max_velocity = sheet.max_velocity * speed
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        return {
+            "masses": masses.tolist(),
+            "inertias": inertias.tolist(),
+            "gains": gains.tolist(),
+            "friction": friction.tolist(),
+            "velocity_limit": speed,
+        }
 
     # -- moving
 
@@ -181,6 +233,11 @@ class URSimulation:
                 self.data.mocap_pos[mocap] = path[update % len(path)]
 
     # -- reading
+
+    @property
+    def commanded_velocity(self) -> Vector:
+        """Joint velocities [rad/s] (6,) of the trajectory that is being executed; zero once it has arrived."""
+        return self._velocity.copy() if self._remaining else np.zeros(6)
 
     @property
     def joint_positions(self) -> Vector:

@@ -241,13 +241,14 @@ def _proof(parity: Parity) -> RenderableType:
 def _evaluation_table(evaluations: Sequence[Evaluation]) -> RenderableType:
     right = ("episodes", "first seed", "return", "success")
     title = "Closed loop on the same seeds: bundle / checkpoint"
-    table, shown = _table(title, "environment", *right, right=right, fold=("environment",))
+    table, shown = _table(title, "environment", "disturbance", *right, right=right, fold=("environment", "disturbance"))
     for one in evaluations:
         table.add_row(
             one.env_id,
+            one.disturbance or "-",
             str(one.episodes),
             str(one.first_seed),
-            f"{one.return_bundle:.4g} / {one.return_checkpoint:.4g}",
+            f"{one.return_bundle:.4g} / {'-' if one.return_checkpoint is None else f'{one.return_checkpoint:.4g}'}",
             f"{_rate(one.success_rate_bundle)} / {_rate(one.success_rate_checkpoint)}",
         )
     return shown

@@ -115,15 +115,21 @@ class Parity(FrozenModel):
 
 
 class Evaluation(FrozenModel):
-    """One closed-loop run of exported policy and checkpoint on the same seeds."""
+    """One closed-loop run of the exported policy: beside its checkpoint on the same seeds, or under a disturbance."""
 
     env_id: str
     episodes: Size
     first_seed: int
     return_bundle: float
-    return_checkpoint: float
+    return_checkpoint: float | None = None
+    return_interval: tuple[float, float] | None = Field(default=None, description="95%, of the mean, normal")
     success_rate_bundle: float | None
-    success_rate_checkpoint: float | None
+    success_rate_checkpoint: float | None = None
+    success_interval: tuple[float, float] | None = Field(default=None, description="95%, Wilson")
+    disturbance: str | None = Field(
+        default=None, description="As `rlservo verify --disturb` takes it; 'none' in its first row"
+    )
+    endings: dict[str, int] = Field(default_factory=dict, description="How many episodes ended in which way")
     evaluated_at: str
 
 

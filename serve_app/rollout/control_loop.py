@@ -19,10 +19,12 @@ from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.interface import ActingPolicy, Observation
 from rlservo.serve_app.recording.start import record_policy
+from rlservo.serve_app.rollout.disturbance import disturb_env, parse_disturbance
 from rlservo.serve_app.rollout.environment import check_fit, control_rate_of, make_env
 from rlservo.serve_app.rollout.episode import Episode, EpisodeEnv, run_episode
 from rlservo.serve_app.rollout.fallback import LinkCounts, StoppedError, WithFallback
 from rlservo.serve_app.rollout.report import EpisodeRow, Link, Rate, RolloutReport, latency_of, wilson_interval
+from rlservo.serve_app.rollout.smoothness import MeasuredEnv
 from rlservo.serve_app.rollout.video import FilmedEnv, VideoFile
 
 if TYPE_CHECKING:
@@ -45,6 +47,7 @@ def rollout(
     video_episodes: int = 1,
     record: str | Path | Recorder | None = None,
     on_episode: OnEpisode | None = None,
+    disturb: str | None = None,
 ) -> RolloutReport:
     """Run `episodes` episodes of `env_id` with `policy` and return what came of it.
 
@@ -53,6 +56,7 @@ def rollout(
     period that is missed is counted and skipped, never caught up in a burst. `video` receives the frames of the first
     `video_episodes` episodes at the control rate; drawing happens inside the loop, so it counts as its time.
     `record` receives every decision with its reward and end: a new .mcap file, a folder, or a Recorder.
+    `disturb` disturbs environment and robot (`latency=3,noise=real`; `disturbance.py` has the kinds).
     `on_episode` is called after each episode. Ctrl-C returns what was finished, with `interrupted` set; so does a
     fallback (`WithFallback`) that is to stop, with `stopped`.
 
@@ -67,6 +71,7 @@ def rollout(
         raise UsageError(f"rate {rate!r} does not exist: expected 'max' or 'real'")
     if video is not None and video_episodes < 1:
         raise UsageError(f"video_episodes must be 1 or more, got {video_episodes}")
+    disturbance = None if disturb is None else parse_disturbance(disturb)
     arguments = dict(env_kwargs or {})
     contract = policy.contract
     with ExitStack() as cleanup:
@@ -89,15 +94,18 @@ def rollout(
             recording = record_policy(policy, record, wait=rate == "max")
             cleanup.callback(recording.end)
         paced = _PacedPolicy(recording or policy, pacer)
+        acted = env if disturbance is None else disturb_env(env, disturbance)
+        measured = MeasuredEnv(acted, env.unwrapped)
         rows: list[EpisodeRow] = []
         interrupted, stopped = False, None
         began = time.perf_counter()
         try:
             for index in range(episodes):
                 first = len(paced.latencies_s)
-                loop_env: EpisodeEnv = env
+                measured.env = acted
                 if video_file is not None and index < video_episodes:
-                    loop_env = FilmedEnv(env, video_file.add)
+                    measured.env = FilmedEnv(acted, video_file.add)
+                loop_env: EpisodeEnv = measured
                 if recording is not None:
                     loop_env = _RecordedEnv(loop_env, recording)
                 episode = run_episode(
@@ -147,6 +155,8 @@ def rollout(
         video=str(video_file.path) if video_file is not None and video_file.frames else None,
         link=_link_of(policy),
         stopped=stopped,
+        disturbance=disturb,
+        step_sizes=measured.sizes(),
     )
 
 

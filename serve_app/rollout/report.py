@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from rich.table import Table
 
 from rlservo.serve_app.rollout.episode import Episode
+from rlservo.serve_app.rollout.smoothness import ACTION, StepSize
 
 Rate = Literal["max", "real"]
 
@@ -76,6 +77,8 @@ class RolloutReport:
     video: str | None
     link: Link | None = None  # None: nothing was between the loop and its policy
     stopped: str | None = None  # why the loop ended before its episodes did: the fallback is 'stop'
+    disturbance: str | None = None  # what was laid around the environment, as it was written
+    step_sizes: dict[str, StepSize] = field(default_factory=dict)  # of "action", and of velocities by unit
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types."""
@@ -101,6 +104,14 @@ def latency_of(latencies_s: Sequence[float]) -> Latency | None:
     return Latency(1e3 * p50, 1e3 * p95, 1e3 * p99, 1e3 * max(latencies_s))
 
 
+def render_steps(step_sizes: Mapping[str, StepSize], which: Literal["mean", "largest"]) -> str:
+    """Return the sizes of steps in words: of the action, and of commanded velocities in their units."""
+    return ", ".join(
+        f"action {getattr(size, which):.3g}" if what == ACTION else f"velocity {getattr(size, which):.3g} {what}"
+        for what, size in step_sizes.items()
+    )
+
+
 def render_report(report: RolloutReport) -> Table:
     """Return the report as a rich table of two columns."""
     version = f"{report.policy} version {report.version}"
@@ -109,6 +120,8 @@ def render_report(report: RolloutReport) -> Table:
     table.add_column()
     finished = len(report.episodes)
     note = "  (interrupted)" if report.interrupted else ""
+    if report.disturbance is not None:
+        table.add_row("disturbance", report.disturbance)
     table.add_row("episodes", f"{finished} of {report.requested_episodes}{note}")
     if report.success_rate is not None and report.success_interval is not None:
         low, high = report.success_interval
@@ -121,6 +134,9 @@ def render_report(report: RolloutReport) -> Table:
         table.add_row("episode length", f"{report.length_mean:.1f} steps")
     if report.final_status:
         table.add_row("endings", ", ".join(f"{status}: {count}" for status, count in report.final_status.items()))
+    if report.step_sizes:
+        table.add_row("largest step", render_steps(report.step_sizes, "largest"))
+        table.add_row("mean step", render_steps(report.step_sizes, "mean"))
     if report.latency_ms is not None:
         latency = report.latency_ms
         table.add_row(

@@ -20,7 +20,9 @@ import pytest
 
 from rlservo.deploy import cli, terminal
 from rlservo.deploy.serve_commands import parse_env_arguments
+from rlservo.export.contract.bundle import load_bundle
 from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.runtime.policy import Policy
 
 ROOT = Path(__file__).resolve().parents[2]
 UR5 = ROOT / "examples" / "checkpoints" / "ur5_positioning"
@@ -134,6 +136,42 @@ def test_verify_proves_the_bundle_again(policies: Path) -> None:
 def test_verify_refuses_another_policys_checkpoint(policies: Path) -> None:
     done = rlservo_here("verify", policies, "--checkpoint", UR5.parent / "mir100_navigation")
     refused(done, 2, "shape (27,), the checkpoint's have (4,): they do not belong together")
+
+
+def test_verify_measures_disturbances_and_writes_them_into_the_contract(bundle: Path, tmp_path: Path) -> None:
+    plot = tmp_path / "table.png"
+    words = ("verify", bundle, "--env", "rlservo/EndEffectorPositioningURSim-v0", "--disturb")
+    done = rlservo_here(
+        *words, "latency=2", "noise=real,payload=1", "--episodes", 2, "--json", "--write", "--plot", plot
+    )
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)["disturbances"]["rows"]
+    assert [row["disturbance"] for row in rows] == ["none", "latency=2", "noise=real,payload=1"]
+    assert rows[0]["step_sizes"]["rad/s"]["largest"] > 0 and plot.stat().st_size > 2000
+    assert "latency=2 (2 of 3): " in done.stderr
+    evaluations = load_bundle(bundle).contract.evaluations  # the hashes fit the new contract
+    assert [one.disturbance for one in evaluations] == ["none", "latency=2", "noise=real,payload=1"]
+    assert rlservo_here("inspect", bundle).returncode == 0
+    with Policy.load(bundle) as policy:  # a server's check of the copy inside the graph
+        assert policy.contract.evaluations == evaluations
+
+
+@pytest.mark.parametrize(
+    ("words", "fragment"),
+    [
+        ((), "give --checkpoint to compare the bundle with, or --disturb with --env, or both"),
+        (("--disturb",), "--disturb needs --env"),
+        (("latency=2", "--env", "CartPole-v1"), "go with --disturb"),
+        (("--disturb", "wind=3", "--env", "CartPole-v1"), "'wind=3': expected KIND=SIZE"),
+        (
+            ("--disturb", "payload=3", "--env", "rlservo/NoObstacleNavigationMir100Sim-v0", "--env-arg", "ur_model=0"),
+            "cannot be made",
+        ),
+        (("--disturb", "--plot", "nowhere/x.png", "--env", "CartPole-v1"), "'nowhere' does not exist"),
+    ],
+)
+def test_wrong_use_of_disturb_exits_with_2(policies: Path, words: tuple[str, ...], fragment: str) -> None:
+    refused(rlservo_here("verify", policies, *words), 2, fragment)
 
 
 def test_rollout_in_process_reports_success_as_json(policies: Path) -> None:
