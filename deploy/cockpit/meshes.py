@@ -62,6 +62,7 @@ def floor_lines(extent: float) -> bytes:
     corners = np.stack([along, across, np.zeros_like(along)], axis=2)
     rows = np.stack([corners[:, :-1], corners[:, 1:]], axis=2).reshape(-1, 3)
     ends = np.vstack([rows, rows[:, [1, 0, 2]]])
-    lines = [trimesh.path.entities.Line(pair) for pair in np.arange(len(ends)).reshape(-1, 2)]
-    path = trimesh.path.Path3D(lines, ends, colors=np.tile((*LINE_COLOUR, 255), (len(lines), 1)), process=False)
-    return bytes(trimesh.Scene(path).export(file_type="glb"))
+    untyped: Any = trimesh
+    lines = [untyped.path.entities.Line(pair) for pair in np.arange(len(ends)).reshape(-1, 2)]
+    path = untyped.path.Path3D(lines, ends, colors=np.tile((*LINE_COLOUR, 255), (len(lines), 1)), process=False)
+    return bytes(untyped.Scene(path).export(file_type="glb"))
