@@ -74,7 +74,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
         "deploy/cockpit/page.py", "serve_app/client/websocket_connection.py", "serve_app/ray_serve/http_connections.py",
     ),
     "viser": ("deploy/cockpit/",),
-    "trimesh": ("deploy/cockpit/scenery.py",),
+    "trimesh": ("deploy/cockpit/meshes.py", "deploy/cockpit/scenery.py"),
     "pickle": ("export/checkpoints/unpickle.py",),
     "onnxruntime": ("export/contract/ort_session.py", "serve_app/runtime/"),
     "asyncio": (

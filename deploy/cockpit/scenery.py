@@ -5,24 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 import trimesh
 import viser
-import viser.transforms
-from numpy.typing import NDArray
 
+from rlservo.deploy.cockpit.meshes import beam_mesh, floor_lines, shape_mesh
 from rlservo.deploy.cockpit.stage import Scene, Stage, Vector
 from rlservo.envs.shapes import Poses, Shape, body_poses, moving_bodies, visible_shapes
 
 SHOWN_BEAMS = 128  # of a thousand
-PATH_LENGTH = 400  # control cycles
+PATH_POINTS = 600
+PATH_SPACING, PLANAR_PATH_SPACING = 0.008, 0.02  # [m], and as wide are the points
+PUT_ELSEWHERE = 0.5  # [m] in a frame: no path
 BEAM_COLOUR, PATH_COLOUR, GHOST_COLOUR = (220, 60, 50), (40, 120, 220), (60, 130, 240)
 GHOST_OPACITY = 0.35
 TARGET_LIFT, ROBOT_LIFT, OBSTACLE_LIFT = 0.1, 0.45, 0.55  # [m], of handles on the floor: above what they move
-CELL_M, FLOOR_PIXELS = 0.5, 2048
-FLOOR_COLOUR, LINE_COLOUR = (225, 229, 233), (190, 194, 198)
 HELD_S = 1.0  # after the last movement
 HANDLE_SIZE, PLANAR_HANDLE_SIZE = 0.3, 1.0  # [m]
 
@@ -47,9 +45,22 @@ class Scenery:
         env = stage.env
         self._robot = _Bodies(server, "/robot", stage, ghost=False)
         self._ghost = _Bodies(server, "/ghost", stage, ghost=True)
-        self._beams = server.scene.add_line_segments("/beams", _no_lines(), BEAM_COLOUR, thickness=0.004)
-        self._path = server.scene.add_line_segments("/path", _no_lines(), PATH_COLOUR, thickness=0.008)
-        self._points: list[Vector] = []
+        # Neither is made of viser's lines: without a graphics card each segment costs as much as a whole mesh.
+        vertices, faces = beam_mesh(np.zeros((1, 2, 3)))
+        self._beams = server.scene.add_mesh_simple(
+            "/beams", vertices, faces, color=BEAM_COLOUR, side="double", visible=False
+        )
+        self._spacing = PLANAR_PATH_SPACING if env.IS_PLANAR else PATH_SPACING
+        self._path = server.scene.add_point_cloud(
+            "/path",
+            np.zeros((1, 3)),
+            PATH_COLOUR,
+            point_size=self._spacing,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+        )
+        self._points = np.zeros((0, 3))
         self._drawn_beams: Vector | None = None
         self._target, self._start = None, None
         if on_target is not None and env.target_position() is not None:
@@ -63,16 +74,8 @@ class Scenery:
                 for index in range(len(env.obstacle_positions()))
             ]
         self.offer_start(False)
-        cells = 4 * int(4 * float(env.model.stat.extent) / (4 * CELL_M))  # whole metres to both sides
-        self._floor = server.scene.add_image(
-            "/floor",
-            _floor_picture(cells),
-            cells * CELL_M,
-            cells * CELL_M,
-            format="png",
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        floor = floor_lines(float(env.model.stat.extent))
+        self._floor = server.scene.add_glb("/floor", floor, cast_shadow=False, receive_shadow=False)
 
     def offer_start(self, offered: bool) -> None:
         """Show the robot's handle or the target's: where the robot has arrived, both would be in one place."""
@@ -112,20 +115,22 @@ class Scenery:
         shown = beams[:: max(1, len(beams) // SHOWN_BEAMS)]
         self._beams.visible = len(shown) > 0
         if len(shown):
-            self._beams.points = shown.astype(np.float32)
+            vertices, faces = beam_mesh(shown)
+            if len(faces) != len(self._beams.faces):
+                self._beams.faces = faces
+            self._beams.vertices = vertices
 
     def _draw_path(self, position: Vector) -> None:
-        last = self._points[-1] if self._points else None
-        moved = None if last is None else float(np.linalg.norm(position - last))
-        if moved is not None and moved < 0.01:
+        last = self._points[-1] if len(self._points) else position
+        distance = float(np.linalg.norm(position - last))
+        if distance > PUT_ELSEWHERE or not len(self._points):
+            self._points = position[np.newaxis]
+        elif distance < self._spacing:
             return
-        if moved is not None and moved > 0.5:  # put somewhere else
-            self._points.clear()
-        self._points = [*self._points[-PATH_LENGTH:], position]
-        if len(self._points) > 1:
-            points = np.array(self._points, np.float32)
-            self._path.points = np.stack([points[:-1], points[1:]], axis=1)
-        self._path.visible = len(self._points) > 1
+        else:
+            shares = np.arange(1, int(distance / self._spacing) + 1) * self._spacing / distance
+            self._points = np.vstack([self._points, last + np.outer(shares, position - last)])[-PATH_POINTS:]
+        self._path.points = self._points.astype(np.float32)
 
 
 class _Bodies:
@@ -147,7 +152,7 @@ class _Bodies:
             if body in moving:
                 self._frames[moving.index(body)] = frame
             for index, (rgba, alike) in enumerate(_by_colour(shapes).items()):
-                mesh = trimesh.util.concatenate([_mesh(shape) for shape in alike])
+                mesh = trimesh.util.concatenate([shape_mesh(shape) for shape in alike])
                 red, green, blue, alpha = rgba
                 colour = GHOST_COLOUR if ghost else (int(255 * red), int(255 * green), int(255 * blue))
                 opacity = GHOST_OPACITY if ghost else alpha if alpha < 1.0 else None
@@ -218,36 +223,3 @@ def _by_colour(shapes: list[Shape]) -> dict[tuple[float, float, float, float], l
     for shape in shapes:
         found.setdefault(shape.rgba, []).append(shape)
     return found
-
-
-def _mesh(shape: Shape) -> Any:
-    """Return a shape as a mesh in its body's frame."""
-    x, y, z = shape.size
-    if shape.kind == "sphere":
-        mesh = trimesh.creation.icosphere(radius=x, subdivisions=3)
-    elif shape.kind == "capsule":
-        mesh = trimesh.creation.capsule(radius=x, height=2 * y, count=(24, 24))
-    elif shape.kind == "cylinder":
-        mesh = trimesh.creation.cylinder(radius=x, height=2 * y, sections=32)
-    elif shape.kind == "box":
-        mesh = trimesh.creation.box(extents=(2 * x, 2 * y, 2 * z))
-    else:
-        mesh = trimesh.Trimesh(shape.vertices, shape.faces)
-    turn = viser.transforms.SO3(shape.wxyz)
-    mesh.apply_transform(viser.transforms.SE3.from_rotation_and_translation(turn, shape.position).as_matrix())
-    if shape.kind not in ("sphere", "capsule"):
-        mesh.unmerge_vertices()  # edges are drawn as edges
-    return mesh
-
-
-def _floor_picture(cells: int) -> NDArray[np.uint8]:
-    """Return a picture of a grid: without a graphics card, a shader that computes one costs a third of a frame."""
-    pixels = max(8, FLOOR_PIXELS // cells)
-    picture = np.full((cells * pixels, cells * pixels, 3), FLOOR_COLOUR, np.uint8)
-    for axis in (picture, picture.swapaxes(0, 1)):
-        axis[::pixels] = LINE_COLOUR
-    return picture
-
-
-def _no_lines() -> NDArray[np.float32]:
-    return np.zeros((1, 2, 3), np.float32)

@@ -34,6 +34,24 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::DeprecationW
 
 ENV = "rlservo/EndEffectorPositioningURSim-v0"
 ARROW_M = 0.19  # from the target to where its handle's arrow is taken
+# The most that a frame is made of: meshes (an instance counts as one), and corners of what is drawn once.
+WORK_OF_A_FRAME = """async () => {
+  const gl = WebGL2RenderingContext.prototype, own = {}, frames = [];
+  const replace = (name, count) => {
+    own[name] = gl[name];
+    gl[name] = function (...given) { count(given); return own[name].apply(this, given); };
+  };
+  const add = (meshes, corners) => frames.length && (frames.at(-1)[0] += meshes, frames.at(-1)[1] += corners);
+  replace("clear", () => frames.push([0, 0]));
+  replace("drawElements", given => add(1, given[1]));
+  replace("drawArrays", given => add(1, given[2]));
+  replace("drawElementsInstanced", given => add(given[4], given[1]));
+  replace("drawArraysInstanced", given => add(given[3], given[2]));
+  while (frames.length < 4) await new Promise(done => setTimeout(done, 50));
+  Object.assign(gl, own);
+  const whole = frames.slice(0, -1);
+  return [0, 1].map(index => Math.max(...whole.map(frame => frame[index])));
+}"""
 # Where the README's picture goes: RLSERVO_PICTURES=examples pytest tests/deploy/cockpit/test_page.py -k picture
 PICTURES = os.environ.get("RLSERVO_PICTURES")
 
@@ -208,7 +226,9 @@ def test_the_ghost_appears_and_the_difference_is_plotted(drive: Drive, window: B
     window.click("Play")
 
 
-def test_a_second_browser_may_watch_on_a_phone_and_go(cockpit: Cockpit, window: Browser, windows: Windows) -> None:
+def test_a_second_browser_may_watch_on_a_phone_and_go(
+    cockpit: Cockpit, drive: Drive, window: Browser, windows: Windows
+) -> None:
     phone = windows(390, 844)
     phone.open(cockpit.address)
     assert phone.page.evaluate("document.documentElement.scrollWidth") <= 390
@@ -216,6 +236,11 @@ def test_a_second_browser_may_watch_on_a_phone_and_go(cockpit: Cockpit, window: 
     # The sheet with the panels covers three fifths of the screen: what the camera looks at is above it.
     sheet = phone.page.get_by_text("frames/s").first.bounding_box()
     assert sheet is not None and sheet["y"] > 0.4 * 844
+    camera = cockpit.server.get_clients()[max(cockpit.server.get_clients())].camera
+    view = drive.view
+    for point in (view.stage.env.viewpoint()[1], view.after.robot, view.after.target):
+        x, y = cockpit.pixel(point, camera)
+        assert 0 < x < 390 and 0 < y < sheet["y"], f"{point} is drawn at {x:.0f}, {y:.0f}"
     phone.close()
     wait_for(lambda: len(cockpit.server.get_clients()) == 1, "the phone is gone")
     first = window.text()
@@ -257,6 +282,13 @@ def test_out_of_distribution_is_coloured_and_said(drive: Drive, window: Browser)
 def test_nothing_was_asked_of_another_machine(window: Browser) -> None:
     hosts = {urlsplit(address.removeprefix("blob:")).hostname for address in window.requests}
     assert hosts == {"127.0.0.1"} and len(window.requests) >= 2
+
+
+def test_a_frame_is_few_meshes_and_few_triangles(drive: Drive, window: Browser) -> None:
+    """Software draws an instance as slowly as a mesh of its own: no path, beam or floor is made of many."""
+    meshes, corners = window.page.evaluate(WORK_OF_A_FRAME)
+    assert len(drive.history) > 100  # there is a path
+    assert 10 < meshes < 60 and 5_000 < corners < 30_000
 
 
 def test_a_frame_takes_far_less_than_a_twentieth_of_a_second(cockpit: Cockpit) -> None:
