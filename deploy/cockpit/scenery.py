@@ -16,7 +16,8 @@ from rlservo.envs.shapes import Poses, Shape, body_poses, moving_bodies, visible
 
 SHOWN_BEAMS = 128  # of a thousand
 PATH_POINTS = 600
-PATH_SPACING, PLANAR_PATH_SPACING = 0.008, 0.02  # [m], and as wide are the points
+PATH_SPACING, PLANAR_PATH_SPACING = 0.008, 0.02  # [m]
+PATH_WIDTH = 0.6  # of the spacing: a point is drawn about twice as wide as its size
 PUT_ELSEWHERE = 0.5  # [m] in a frame: no path
 BEAM_COLOUR, PATH_COLOUR, GHOST_COLOUR = (220, 60, 50), (40, 120, 220), (60, 130, 240)
 GHOST_OPACITY = 0.35
@@ -55,7 +56,7 @@ class Scenery:
             "/path",
             np.zeros((1, 3)),
             PATH_COLOUR,
-            point_size=self._spacing,
+            point_size=PATH_WIDTH * self._spacing,
             point_shape="circle",
             point_shading="flat",
             precision="float32",
