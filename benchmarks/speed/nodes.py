@@ -136,8 +136,10 @@ class Nodes(Cluster):
             "--num-gpus=0",
             f"--object-store-memory={80 << 20}",
         ]
-        if node.namespace is None:
-            words.append("--dashboard-agent-listen-port=0")
+        # Agents' ports are given: a raylet aborts where agents have not chosen theirs 15 s after its start.
+        ports = free_ports(4) if node.namespace is None else range(52365, 52369)
+        agents = ("dashboard-agent-listen", "dashboard-agent-grpc", "runtime-env-agent", "metrics-export")
+        words += [f"--{agent}-port={port}" for agent, port in zip(agents, ports, strict=True)]
         if node is self.head:
             # Ray takes other nodes' processes, which name this address, for a head that runs here already.
             (self.folder / "r" / "ray_current_cluster").unlink(missing_ok=True)

@@ -24,11 +24,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from clusters import KEY, PATIENCE_S, Cluster, serving
 from rlservo.export.contract.errors import ConflictError, RefusedError, UnauthenticatedError
 from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.runtime.policy import Policy
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow, pytest.mark.random_order(disabled=True)]
 
@@ -45,6 +48,7 @@ class Load:
     versions: Counter[str] = field(default_factory=Counter)
     first_failures: list[str] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # also after one retry
+    actions: set[tuple[str, tuple[float, ...]]] = field(default_factory=set)  # each that came, with its version
     longest_s: float = 0.0
 
     @property
@@ -60,6 +64,7 @@ def loaded(cluster: Cluster, path: str = "/v1/policies/ur5/act") -> Iterator[Loa
     headers = {"content-type": "application/json", "authorization": f"Bearer {KEY}"}
 
     def once(connection: http.client.HTTPConnection) -> tuple[str, str]:
+        """Return (version, failure)."""
         try:
             connection.request("POST", path, body, headers)
             reply = connection.getresponse()
@@ -69,7 +74,10 @@ def loaded(cluster: Cluster, path: str = "/v1/policies/ur5/act") -> Iterator[Loa
             return "", f"{type(error).__name__}: {error}"
         if reply.status != 200:
             return "", f"{reply.status} {content[:200]!r}"
-        return json.loads(content)["version"], ""
+        document = json.loads(content)
+        with lock:
+            load.actions.add((document["version"], tuple(document["action"])))
+        return document["version"], ""
 
     def client() -> None:
         connection = http.client.HTTPConnection("127.0.0.1", cluster.port, timeout=60)
@@ -395,3 +403,67 @@ def test_a_promotion_stops_when_somebody_else_moves_the_alias(cluster: Cluster, 
         code, said = outcome_of(process)
     assert code == 4 and "'production' leads to 3 and no longer to 2" in said, said
     assert arranged(cluster) == {("3", None)}
+
+
+@contextlib.contextmanager
+def joined(cluster: Cluster, log: Path) -> Iterator[psutil.Process]:
+    """Another node of the cluster: the process whose descendants are all of it."""
+    agents = ("dashboard-agent-listen", "dashboard-agent-grpc", "runtime-env-agent", "metrics-export")
+    ports = [f"--{agent}-port={port}" for agent, port in zip(agents, free_ports(len(agents)), strict=True)]
+    command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--node-ip-address=127.0.0.1"]
+    with log.open("w") as output:
+        process = subprocess.Popen(
+            [*command, f"--address={cluster.address}", "--num-cpus=2", f"--object-store-memory={80 << 20}", *ports],
+            env=cluster.environment, stdout=output, stderr=output,
+        )  # fmt: skip
+    try:
+        deadline = time.monotonic() + PATIENCE_S
+        while "Ray runtime started." not in log.read_text():
+            assert process.poll() is None and time.monotonic() < deadline, log.read_text()[-3000:]
+            time.sleep(0.2)
+        yield psutil.Process(process.pid)
+    finally:
+        with contextlib.suppress(psutil.Error):
+            kill_all(psutil.Process(process.pid))
+        process.wait()
+
+
+def kill_all(node: psutil.Process) -> None:
+    """SIGKILL to all of a node at once, as when its power goes."""
+    for each in [*node.children(recursive=True), node]:
+        with contextlib.suppress(psutil.Error):
+            each.kill()
+
+
+def replicas_of(node: psutil.Process) -> list[int]:
+    found = []
+    for each in node.children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            found += [each.pid] if "ServeReplica" in "".join(each.cmdline()[:1]) else []
+    return found
+
+
+def test_a_lost_node_costs_a_client_that_retries_once_nothing(cluster: Cluster, tmp_path: Path) -> None:
+    (deployment,) = cluster.application["deployments"]
+    arguments = cluster.application["args"]
+    with joined(cluster, tmp_path / "node.log") as node:
+        deployment["max_replicas_per_node"], arguments["replicas"] = 2, 3
+        try:
+            cluster.deploy()
+            cluster.wait_for(lambda seen: len(seen) == 3)
+            assert len(replicas_of(node)) == 1
+            with loaded(cluster) as load:
+                before = load.answered
+                kill_all(node)
+                cluster.wait_for(lambda seen: len(seen) == 2)
+                after = load.answered
+        finally:
+            del deployment["max_replicas_per_node"]
+            arguments["replicas"] = 2
+            cluster.deploy()
+    assert load.failures == [] and after - before > 20
+    for version in load.versions:
+        with Policy.load(cluster.repository / "ur5" / version) as policy:
+            expected = tuple(policy.act(np.array(OBS, np.float32)).tolist())
+        assert {action for each, action in load.actions if each == version} == {expected}
+    cluster.wait_for_status("RUNNING")
