@@ -43,7 +43,7 @@ from speed.catalogue import Case, case_of, rlservo
 from speed.machine import PROXY, REPLICA, cpu_by_role, pss_mb, rss_mb
 from speed.servers import Server, running
 
-KINDS = ("json", "oip binary", "grpc", "websocket")
+KINDS = ("json", "oip json", "grpc", "websocket")  # one observation each
 SESSIONS, STREAMS = 5000, 200
 ROBOTS, RATE_HZ, POLICIES, VERSIONS = 10_000, 20.0, 1000, 100
 BUSY = 0.6  # of a core that a replica may be busy: what `autoscaling.py` aims at, with room for bursts

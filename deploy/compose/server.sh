@@ -10,12 +10,10 @@ export RAY_REDIS_ADDRESS="${RLSERVO_REDIS:?HOST:PORT of Redis}"
 environment="$(rlservo cluster env --one-machine --haproxy-folder "$HOME/haproxy" --max-connections-per-address 0)"
 eval "$environment"
 dashboard="${RLSERVO_DASHBOARD_PORT:-8265}"
-# The ports of Ray's agents are given: a raylet waits 15 s for agents to write down ports of their own choice, and aborts
-# where their start takes longer, as on a busy machine.
-ray start --head --block --node-ip-address 127.0.0.1 --dashboard-host 127.0.0.1 --dashboard-port "$dashboard" \
-  --object-store-memory 80000000 --disable-usage-stats \
-  --dashboard-agent-grpc-port "${RLSERVO_AGENT_PORT:-52366}" --runtime-env-agent-port \
-  "${RLSERVO_RUNTIME_ENV_PORT:-52367}" --metrics-export-port "${RLSERVO_RAY_METRICS_PORT:-52368}" \
+# A raylet waits 15 s for agents to choose ports, and aborts, as on a busy machine: here one agent is left out, and the
+# other one is given its port.
+python -m rlservo.serve_app.ray_serve.ray_node start --head --block --node-ip-address 127.0.0.1 --dashboard-host 127.0.0.1 --dashboard-port "$dashboard" \
+  --object-store-memory 80000000 --disable-usage-stats --runtime-env-agent-port "${RLSERVO_AGENT_PORT:-52367}" \
   --redis-password "$(cat "${RLSERVO_REDIS_PASSWORD_FILE:?the file of its password}")" "$@" &
 ray="$!"
 trap 'kill -TERM "$ray" 2>/dev/null || true; wait "$ray" || true' TERM INT EXIT

@@ -210,15 +210,20 @@ class RemotePolicy(ActingPolicy):
 
     def _meet(self, contract: Contract) -> None:
         """Take this contract for that of the version that answers from now on. Raises UnavailableError."""
+        self._learn(contract)
         if self._contract is not None and contract is not self._contract:
             check_successor(contract, self._contract)
-            if contract.control_rate_hz != self._contract.control_rate_hz and contract.version not in self._contracts:
-                logger.warning(
-                    "policy '%s' is answered by version %s now, which is made for %s Hz, version %s for %s Hz",
-                    contract.name, contract.version, contract.control_rate_hz, self._contract.version,
-                    self._contract.control_rate_hz,
-                )  # fmt: skip
-        self._contract = self._contracts[contract.version] = contract
+        self._contract = contract
+
+    def _learn(self, contract: Contract) -> None:
+        """Keep the contract of a version; say where it is made for another control rate."""
+        known = self._contract
+        if contract.version not in self._contracts and known and known.control_rate_hz != contract.control_rate_hz:
+            logger.warning(
+                "version %s of policy '%s' is made for %s Hz, and version %s for %s Hz",
+                contract.version, contract.name, contract.control_rate_hz, known.version, known.control_rate_hz,
+            )  # fmt: skip
+        self._contracts.setdefault(contract.version, contract)
 
     def _answering_contract(self, reply: Any, number: int, deadline: float) -> Contract:
         """Return the contract of the version that answered request `number`.
@@ -246,6 +251,7 @@ class RemotePolicy(ActingPolicy):
                     f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' and has no contract "
                     "of it: the action was dropped"
                 )
+            self._learn(known)  # also one that is refused next: it is not fetched again
         self._meet(known)
         return known
 

@@ -209,7 +209,7 @@ class StreamClient(RemotePolicy):
         except BaseException:
             connection.close()
             raise
-        self._contracts.setdefault(contract.version, contract)
+        self._learn(contract)
         self._socket = connection
         self._connections += 1
         self._episode.reconnect()

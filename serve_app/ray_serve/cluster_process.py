@@ -103,6 +103,12 @@ def _leave_out_extras() -> None:
     services = ray_parts.find("ray._private.services")
     if ray_parts.is_there("ray._private.services:start_api_server"):
         services.start_api_server = lambda *_, **__: ("", None)  # address and process of none
+    leave_out_agent()
+
+
+def leave_out_agent() -> None:
+    """Let raylets that this process starts have no dashboard's agent. Raises RuntimeError as `without_agent` does."""
+    services = ray_parts.find("ray._private.services")
     start: Any = services.start_ray_process
 
     def start_ray_process(command: list[str], process_type: str, *arguments: Any, **more: Any) -> Any:

@@ -56,9 +56,9 @@ def test_aliases_outlive_the_container_when_all_in_it_is_killed(
 ) -> None:
     key, line = new_key("operator", admin=True)
     folder, mark = Path(tempfile.mkdtemp(prefix="r")), secrets.token_hex(16)  # sockets need a short path
-    ports = free_ports(14)
-    port, grpc_port, gcs, dashboard, first, second, fallback, fallback_grpc = ports[:8]
-    agent, agent_grpc, runtime_env, metrics, stats, proxy_metrics = ports[8:]
+    port, grpc_port, gcs, dashboard, agent, stats, proxy_metrics, fallback, fallback_grpc, first, second = free_ports(
+        11
+    )
     configuration = yaml.safe_load((COMPOSE / "serve.yaml").read_text())
     configuration["http_options"] = {"host": "127.0.0.1", "port": port}
     configuration["grpc_options"]["port"] = grpc_port
@@ -78,9 +78,7 @@ def test_aliases_outlive_the_container_when_all_in_it_is_killed(
         "RLSERVO_REDIS": f"127.0.0.1:{redis[0]}",
         "RLSERVO_REDIS_PASSWORD_FILE": str(folder / "password"),
         "RLSERVO_DASHBOARD_PORT": str(dashboard),
-        "RLSERVO_AGENT_PORT": str(agent_grpc),
-        "RLSERVO_RUNTIME_ENV_PORT": str(runtime_env),
-        "RLSERVO_RAY_METRICS_PORT": str(metrics),
+        "RLSERVO_AGENT_PORT": str(agent),
         # In a container these are its own; here other servers run beside.
         "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(first),
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(first + 20),
@@ -97,7 +95,7 @@ def test_aliases_outlive_the_container_when_all_in_it_is_killed(
     }
     command = [
         str(COMPOSE / "server.sh"), str(folder / "serve.yaml"), "--port", str(gcs), "--temp-dir", str(folder / "ray"),
-        "--dashboard-agent-listen-port", str(agent), "--num-cpus", "2",
+        "--num-cpus", "2",
     ]  # fmt: skip
     log = tmp_path / "server.log"
 

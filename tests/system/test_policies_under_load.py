@@ -405,27 +405,42 @@ def test_a_promotion_stops_when_somebody_else_moves_the_alias(cluster: Cluster, 
     assert arranged(cluster) == {("3", None)}
 
 
+# Another node of the cluster, as `ray.cluster_utils` makes one: `ray start` refuses a second one on this address.
+NODE = """
+import sys
+from ray._private.node import Node
+from ray._private.parameter import RayParams
+from rlservo.serve_app.ray_serve.cluster_process import leave_out_agent
+leave_out_agent()
+node = Node(
+    RayParams(gcs_address=sys.argv[1], node_ip_address="127.0.0.1", num_cpus=2, num_gpus=0, min_worker_port=0,
+              max_worker_port=0, object_store_memory=80 << 20, runtime_env_agent_port=int(sys.argv[2])),
+    head=False, shutdown_at_exit=True, spawn_reaper=False)
+print("joined", flush=True)
+sys.stdin.read()
+"""
+
+
 @contextlib.contextmanager
-def joined(cluster: Cluster, log: Path) -> Iterator[psutil.Process]:
+def joined(cluster: Cluster) -> Iterator[psutil.Process]:
     """Another node of the cluster: the process whose descendants are all of it."""
-    agents = ("dashboard-agent-listen", "dashboard-agent-grpc", "runtime-env-agent", "metrics-export")
-    ports = [f"--{agent}-port={port}" for agent, port in zip(agents, free_ports(len(agents)), strict=True)]
-    command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--node-ip-address=127.0.0.1"]
-    with log.open("w") as output:
-        process = subprocess.Popen(
-            [*command, f"--address={cluster.address}", "--num-cpus=2", f"--object-store-memory={80 << 20}", *ports],
-            env=cluster.environment, stdout=output, stderr=output,
-        )  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-c", NODE, cluster.address, str(free_ports(1)[0])],
+        env=cluster.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None and process.stdin is not None
     try:
-        deadline = time.monotonic() + PATIENCE_S
-        while "Ray runtime started." not in log.read_text():
-            assert process.poll() is None and time.monotonic() < deadline, log.read_text()[-3000:]
-            time.sleep(0.2)
+        said = ""
+        while not said.startswith("joined"):  # Ray may say something first
+            said = process.stdout.readline()
+            assert said, "the node did not start"
         yield psutil.Process(process.pid)
     finally:
         with contextlib.suppress(psutil.Error):
             kill_all(psutil.Process(process.pid))
         process.wait()
+        process.stdin.close()
+        process.stdout.close()
 
 
 def kill_all(node: psutil.Process) -> None:
@@ -443,16 +458,25 @@ def replicas_of(node: psutil.Process) -> list[int]:
     return found
 
 
-def test_a_lost_node_costs_a_client_that_retries_once_nothing(cluster: Cluster, tmp_path: Path) -> None:
+def latencies_of(reply: dict[str, Any]) -> list[int]:
+    """Return a replica's histogram of all it has answered."""
+    return [count for version in reply["counts"].values() for count in version["latency"]]
+
+
+def test_a_lost_node_costs_a_client_that_retries_once_nothing(cluster: Cluster) -> None:
     (deployment,) = cluster.application["deployments"]
     arguments = cluster.application["args"]
-    with joined(cluster, tmp_path / "node.log") as node:
+    with joined(cluster) as node, cluster.admin() as admin:
         deployment["max_replicas_per_node"], arguments["replicas"] = 2, 3
         try:
             cluster.deploy()
             cluster.wait_for(lambda seen: len(seen) == 3)
             assert len(replicas_of(node)) == 1
             with loaded(cluster) as load:
+                deadline = time.monotonic() + PATIENCE_S
+                while not all(any(latencies_of(reply)) for reply in admin.counts("ur5")):
+                    assert time.monotonic() < deadline, "a replica was asked nothing"
+                    time.sleep(0.2)
                 before = load.answered
                 kill_all(node)
                 cluster.wait_for(lambda seen: len(seen) == 2)
