@@ -137,8 +137,6 @@ class Nodes(Cluster):
             "--num-gpus=0",
             f"--object-store-memory={80 << 20}",
         ]
-        (agent,) = free_ports(1) if node.namespace is None else (52367,)
-        words.append(f"--runtime-env-agent-port={agent}")  # else the raylet aborts where that takes 15 s to choose one
         if node is self.head:
             # Ray takes other nodes' processes, which name this address, for a head that runs here already.
             (self.folder / "r" / "ray_current_cluster").unlink(missing_ok=True)

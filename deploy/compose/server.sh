@@ -10,10 +10,9 @@ export RAY_REDIS_ADDRESS="${RLSERVO_REDIS:?HOST:PORT of Redis}"
 environment="$(rlservo cluster env --one-machine --haproxy-folder "$HOME/haproxy" --max-connections-per-address 0)"
 eval "$environment"
 dashboard="${RLSERVO_DASHBOARD_PORT:-8265}"
-# A raylet waits 15 s for agents to choose ports, and aborts, as on a busy machine: here one agent is left out, and the
-# other one is given its port.
+# Not `ray start`, whose raylet waits too short for its agents on a busy machine, and aborts.
 python -m rlservo.serve_app.ray_serve.ray_node start --head --block --node-ip-address 127.0.0.1 --dashboard-host 127.0.0.1 --dashboard-port "$dashboard" \
-  --object-store-memory 80000000 --disable-usage-stats --runtime-env-agent-port "${RLSERVO_AGENT_PORT:-52367}" \
+  --object-store-memory 80000000 --disable-usage-stats \
   --redis-password "$(cat "${RLSERVO_REDIS_PASSWORD_FILE:?the file of its password}")" "$@" &
 ray="$!"
 trap 'kill -TERM "$ray" 2>/dev/null || true; wait "$ray" || true' TERM INT EXIT

@@ -1,9 +1,9 @@
 """`ray start` without the dashboard's agent: python -m rlservo.serve_app.ray_serve.ray_node start --head --block ...
 
 A raylet of Ray 2.60 waits 15 s for each of its agents to write down its ports, and aborts; on a busy machine their
-imports take longer, and `ray start` tells after 30 s that the node timed out. The other agent needs no wait where it is
-given its port (--runtime-env-agent-port); for the dashboard's no option helps. Serve does not need it: what is missing
-are the dashboard's figures of the node, its logs, and Ray's own metrics.
+imports take longer, and `ray start` tells after 30 s that the node timed out. Its options do not end all of these
+waits. Serve does not need the dashboard's agent: what is missing are the dashboard's figures of the node, its logs, and
+Ray's own metrics.
 """
 
 from __future__ import annotations

@@ -56,9 +56,7 @@ def test_aliases_outlive_the_container_when_all_in_it_is_killed(
 ) -> None:
     key, line = new_key("operator", admin=True)
     folder, mark = Path(tempfile.mkdtemp(prefix="r")), secrets.token_hex(16)  # sockets need a short path
-    port, grpc_port, gcs, dashboard, agent, stats, proxy_metrics, fallback, fallback_grpc, first, second = free_ports(
-        11
-    )
+    port, grpc_port, gcs, dashboard, stats, proxy_metrics, fallback, fallback_grpc, first, second = free_ports(10)
     configuration = yaml.safe_load((COMPOSE / "serve.yaml").read_text())
     configuration["http_options"] = {"host": "127.0.0.1", "port": port}
     configuration["grpc_options"]["port"] = grpc_port
@@ -78,7 +76,6 @@ def test_aliases_outlive_the_container_when_all_in_it_is_killed(
         "RLSERVO_REDIS": f"127.0.0.1:{redis[0]}",
         "RLSERVO_REDIS_PASSWORD_FILE": str(folder / "password"),
         "RLSERVO_DASHBOARD_PORT": str(dashboard),
-        "RLSERVO_AGENT_PORT": str(agent),
         # In a container these are its own; here other servers run beside.
         "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(first),
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(first + 20),

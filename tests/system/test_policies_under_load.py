@@ -30,7 +30,6 @@ import pytest
 from clusters import KEY, PATIENCE_S, Cluster, serving
 from rlservo.export.contract.errors import ConflictError, RefusedError, UnauthenticatedError
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.runtime.policy import Policy
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow, pytest.mark.random_order(disabled=True)]
@@ -414,7 +413,7 @@ from rlservo.serve_app.ray_serve.cluster_process import leave_out_agent
 leave_out_agent()
 node = Node(
     RayParams(gcs_address=sys.argv[1], node_ip_address="127.0.0.1", num_cpus=2, num_gpus=0, min_worker_port=0,
-              max_worker_port=0, object_store_memory=80 << 20, runtime_env_agent_port=int(sys.argv[2])),
+              max_worker_port=0, object_store_memory=80 << 20),
     head=False, shutdown_at_exit=True, spawn_reaper=False)
 print("joined", flush=True)
 sys.stdin.read()
@@ -425,7 +424,7 @@ sys.stdin.read()
 def joined(cluster: Cluster) -> Iterator[psutil.Process]:
     """Another node of the cluster: the process whose descendants are all of it."""
     process = subprocess.Popen(
-        [sys.executable, "-c", NODE, cluster.address, str(free_ports(1)[0])],
+        [sys.executable, "-c", NODE, cluster.address],
         env=cluster.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stdout is not None and process.stdin is not None
