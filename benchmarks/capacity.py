@@ -108,7 +108,9 @@ def copy_policy(bundle: Path, folder: Path, count: int) -> None:
 def load(folder: Path, count: int) -> str:
     """Load all policies of a folder as a replica does."""
     before, began, cpu = rss_mb(os.getpid()), time.perf_counter(), time.process_time()
-    store = load_served([folder], ServedConfig(), ServerSettings(load_timeout_s=600.0, scan_timeout_s=600.0))
+    store = load_served(
+        [folder], ServedConfig(), ServerSettings.from_environment({"load_timeout_s": 600.0, "scan_timeout_s": 600.0})
+    )
     taken, used, grown = time.perf_counter() - began, time.process_time() - cpu, rss_mb(os.getpid()) - before
     found = len(store.names)
     assert found == count, f"{found} of {count} policies were loaded"
