@@ -10,7 +10,8 @@ export RAY_REDIS_ADDRESS="${RLSERVO_REDIS:?HOST:PORT of Redis}"
 environment="$(rlservo cluster env --one-machine --haproxy-folder "$HOME/haproxy" --max-connections-per-address 0)"
 eval "$environment"
 dashboard="${RLSERVO_DASHBOARD_PORT:-8265}"
-ray start --head --block --node-ip-address 127.0.0.1 --dashboard-host 127.0.0.1 --dashboard-port "$dashboard" \
+# Not `ray start`, whose raylet waits too short for its agents on a busy machine, and aborts.
+python -m rlservo.serve_app.ray_serve.ray_node start --head --block --node-ip-address 127.0.0.1 --dashboard-host 127.0.0.1 --dashboard-port "$dashboard" \
   --object-store-memory 80000000 --disable-usage-stats \
   --redis-password "$(cat "${RLSERVO_REDIS_PASSWORD_FILE:?the file of its password}")" "$@" &
 ray="$!"

@@ -42,6 +42,10 @@ class EpisodeState:
         """Return whether requests carry a `state`."""
         return not self.is_on_server(contract) and (bool(contract.state) or self._is_limited)
 
+    def is_bound(self, contract: Contract) -> bool:
+        """Return whether what the episode remembers is of this policy's version."""
+        return bool(contract.state) and self._steps > 0
+
     def carry(self) -> None:
         """Send a `state` from now on: the server has refused a request without one."""
         self._is_limited = True
@@ -78,6 +82,24 @@ class EpisodeState:
             fields["last_action"] = self._last_action
         self._is_last_action_known = False
         return fields
+
+    def end_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any] | None:
+        """Return what the request that tells the episode's end says of it; None where there is nothing to end.
+
+        Raises SessionLostError.
+        """
+        if self._steps == 0:
+            return None
+        fields = self.request_fields(contract, batch)
+        if self._session_id is not None:
+            fields["end"] = True
+        return fields
+
+    def end(self) -> None:
+        """Take note that the server knows of the episode's end: the next one has a session of its own."""
+        self.reset()
+        if self._session_id is not None:
+            self._session_id = uuid.uuid4().hex
 
     def advance(self, reply: Mapping[str, Any], action: Any, contract: Contract) -> None:
         """Go on to the next step after a reply; `action` is the reply's, in the form in which it would be sent.

@@ -18,7 +18,7 @@ from rlservo.export.contract.errors import StateNeededError, UnavailableError, U
 from rlservo.serve_app.client.episode_state import EpisodeState
 from rlservo.serve_app.client.http_transport import Transport, encode
 from rlservo.serve_app.client.remote_policy import RemotePolicy
-from rlservo.serve_app.client.replies import check_sender, decode_action
+from rlservo.serve_app.client.replies import answering_version, decode_action
 from rlservo.serve_app.interface import Observation
 
 if TYPE_CHECKING:
@@ -33,8 +33,10 @@ class PolicyClient(RemotePolicy):
         action = policy.act(obs)
     ```
 
-    The version is settled at the first contact (the server's default, unless `version` names one) and stays: what
-    `production` is moved to meanwhile does not change a running loop.
+    Without `version` each request gets what the server has in use: where `production` is moved, or a canary begins or
+    is ended, a running loop follows, if observations and actions are the same (else the answer is refused). From
+    `reset` to `reset` a canary's share is drawn once, and an episode with a recurrent state ends with the version that
+    began it. With `version` the loop stays with that one; an alias is looked up at the first contact.
 
     Thread-safe for stateless policies: threads share the connections and each gets the answer to its own request.
     A recurrent policy's state is kept here and sent along, and so is the last action where the server limits the step
@@ -62,7 +64,8 @@ class PolicyClient(RemotePolicy):
         `policy` may be None where the server has exactly one. `timeout_s` bounds one call, its retries included, and
         `deadline_ms` instead of it each `act`; `retries` counts further attempts after a failed connection or a 503,
         nothing else is ever sent twice. `record` keeps every decision: a new .mcap file, a folder, or a Recorder.
-        `label` names this loop: in the server's own recording, what it asks from `reset` to `reset` is one episode.
+        `label` names this loop: in the server's own recording, what it asks from `reset` to `reset` is one episode,
+        with a random name where there is no label. Threads that share a client share its episode.
         """
         if label is not None and not (label and label.isascii() and label.isprintable() and len(label) <= 100):
             raise UsageError(f"label must be 1 to 100 printable ASCII characters, got {label[:100]!r}")
@@ -90,41 +93,46 @@ class PolicyClient(RemotePolicy):
         self._begin_label()
 
     def _begin_label(self) -> None:
-        if self._label is not None:
-            self._transport.label = f"{self._label}.{secrets.token_hex(4)}"
+        number = secrets.token_hex(8 if self._label is None else 4)
+        self._transport.label = number if self._label is None else f"{self._label}.{number}"
 
     def _act(self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None = None) -> Any:
         contract = self.contract
         deadline = time.monotonic() + self._deadline_ms / 1e3
         request, batch = self._encode_request(obs, explore=explore, seed=seed, reward=reward)
+        request["seq"] = number = next(self._numbers)
         try:
-            reply = self._post(
-                {**request, **self._episode.request_fields(contract, batch)}, contract, self._deadline_ms
-            )
+            reply = self._post({**request, **self._episode.request_fields(contract, batch)}, self._deadline_ms)
         except StateNeededError:
             if self._episode.is_carried(contract) or self._episode.is_on_server(contract):
                 raise
             # Nothing in the contract says that the server limits the step from one action to the next.
             self._episode.carry()
+            request["seq"] = number = next(self._numbers)
             fields = self._episode.request_fields(contract, batch)
-            reply = self._post({**request, **fields}, contract, 1e3 * (deadline - time.monotonic()))
+            reply = self._post({**request, **fields}, 1e3 * (deadline - time.monotonic()))
+        contract = self._answering_contract(reply, number, deadline)
         action = decode_action(reply.get("action"), batch, contract)
         self._episode.advance(reply, reply["action"], contract)
-        self.last_reply = reply
+        self.last_reply, self._reward = reply, None
         return action
+
+    def _tell_end(self, request: dict[str, Any]) -> None:
+        number = next(self._numbers)
+        answering_version(self.url, self._post({**request, "seq": number}, self._deadline_ms), number, self.contract)
 
     def _close(self) -> None:
         self._transport.close()
 
-    def _post(self, request: dict[str, Any], contract: Contract, deadline_ms: float) -> Any:
-        """Send a request under a number of its own and return the reply to it."""
-        number = next(self._numbers)
+    def _post(self, request: dict[str, Any], deadline_ms: float) -> Any:
+        """Send a request for an action and return the reply."""
+        contract = self.contract
         # The server drops what it could not answer in time, instead of working through a queue of abandoned questions.
-        body = encode({**request, "seq": number, "deadline_ms": deadline_ms})
-        path = ("v1", "policies", contract.name, "versions", contract.version, "act")
-        reply = self._transport.post(*path, body=body, timeout_s=deadline_ms / 1e3)
-        check_sender(self.url, reply, number, contract)
-        return reply
+        body = encode({**request, "deadline_ms": deadline_ms})
+        version = () if self._version is None else ("versions", contract.version)
+        return self._transport.post(
+            "v1", "policies", contract.name, *version, "act", body=body, timeout_s=deadline_ms / 1e3
+        )
 
     def _fetch_contract(self, timeout_s: float | None) -> Contract:
         retries = None if timeout_s is None else 0
@@ -134,6 +142,11 @@ class PolicyClient(RemotePolicy):
         version = () if self._version is None else ("versions", self._version)
         document = self._transport.get("v1", "policies", name, *version, timeout_s=timeout_s, retries=retries)
         return self._parse_contract(document)
+
+    def _fetch_version(self, version: str, deadline: float) -> Contract:
+        path = ("v1", "policies", self.contract.name, "versions", version)
+        timeout_s = max(deadline - time.monotonic(), 0.001)
+        return self._parse_contract(self._transport.get(*path, timeout_s=timeout_s, retries=0))
 
 
 def _only_policy(listing: Any) -> str:

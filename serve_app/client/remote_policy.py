@@ -1,8 +1,14 @@
-"""Base of the HTTP and the WebSocket client of a policy: contract, episode, recording, arguments of a request."""
+"""Base of the HTTP and the WebSocket client of a policy: contract, episode, recording, arguments of a request.
+
+A client that was given no version asks by the policy's name and follows what the server answers with: the alias
+`production`, and a canary's share, as everybody does. What remembers an episode stays with the version that began it
+(the server sees to that), and an answer of a version with other spaces is never used.
+"""
 
 from __future__ import annotations
 
 import itertools
+import logging
 import time
 from abc import abstractmethod
 from pathlib import Path
@@ -13,21 +19,31 @@ from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
 from rlservo.export.contract.contract import Contract, first_fault
-from rlservo.export.contract.errors import DeadlineError, UnavailableError, UsageError
+from rlservo.export.contract.errors import (
+    DeadlineError,
+    RlservoError,
+    UnavailableError,
+    UnknownVersionError,
+    UsageError,
+)
 from rlservo.serve_app.client.episode_state import EpisodeState
 from rlservo.serve_app.client.observations import encode_observation
+from rlservo.serve_app.client.replies import answering_version, check_successor
 from rlservo.serve_app.interface import ActingPolicy, Observation
 from rlservo.serve_app.recording.start import record_policy
 
 if TYPE_CHECKING:
     from rlservo.serve_app.recording.recorder import Recorder
 
+logger = logging.getLogger(__name__)
+
+LONGEST_STATUS = 64  # that a server takes
 POLL_S = 0.1  # between two looks at a server that is starting
 LONGEST_TRY_S = 5.0  # of one such look
 
 
 class RemotePolicy(ActingPolicy):
-    """A policy on a server. A transport adds `_act`, `_close` and `_fetch_contract`."""
+    """A policy on a server. A transport adds `_act`, `_tell_end`, `_close`, `_fetch_contract`, `_fetch_version`."""
 
     url: str
 
@@ -56,6 +72,10 @@ class RemotePolicy(ActingPolicy):
         self._deadline_ms = 1e3 * timeout_s if deadline_ms is None else deadline_ms
         self._episode = episode
         self._contract: Contract | None = None
+        self._contracts: dict[str, Contract] = {}
+        """Of every version that was met."""
+        self._reward: float | None = None
+        """What the last action brought, for the next request."""
         self._numbers = itertools.count(1)  # next() is atomic: no two requests share a number
         self.last_reply: dict[str, Any] = {}
         """The server's reply to the last request that got an action."""
@@ -63,13 +83,14 @@ class RemotePolicy(ActingPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The policy's contract, fetched once.
+        """The contract of the version that answered last; before the first answer, of the server's default.
 
         Raises UnavailableError, DeadlineError, UnknownPolicyError, or UsageError when no policy was named and the
         server has several.
         """
         if self._contract is None:
-            self._contract = self._fetch_contract(None)
+            self._meet(self._fetch_contract(None))
+            assert self._contract is not None
         return self._contract
 
     def act(
@@ -94,11 +115,32 @@ class RemotePolicy(ActingPolicy):
         final_status: str | None = None,
         final_obs: Observation | None = None,
     ) -> None:
-        """Record what the last action brought (`WithRecording.outcome`). Nothing to do where nothing is recorded."""
+        """Tell the server, and the client's recording, what the last action brought and how the episode ended.
+
+        A reward is sent with the next request, an episode's end by itself, where `final_obs`, the observation after the
+        last action, is given: a server that records keeps them, and `rlservo policy promote` counts what ended in
+        `success`. A server that does not take it is logged, and no reason to stop. Nothing to do before the first
+        action.
+        """
         if self._recording is not None:
-            self._recording.outcome(
+            self._recording.record_outcome(
                 reward, terminated=terminated, truncated=truncated, final_status=final_status, final_obs=final_obs
             )
+        self._reward = None if reward is None else float(reward)
+        is_over = terminated or truncated or final_status is not None
+        if not is_over or final_obs is None or self._contract is None:
+            return
+        word = "truncated" if truncated else "terminated"
+        end = {"final_status": (final_status or word)[:LONGEST_STATUS], "truncated": truncated and not terminated}
+        try:
+            request, batch = self._encode_request(final_obs, explore=False, seed=None, reward=None)
+            fields = self._episode.end_fields(self._contract, batch)
+            if fields is not None:
+                self._tell_end({**request, **fields, **end})
+        except RlservoError as error:
+            logger.warning("%s does not know how the episode ended: %s", self.url, error.message)
+        self._reward = None
+        self._episode.end()
 
     def set_last_action(self, action: Any) -> None:
         """Take note of what the robot was commanded instead of an answer that did not come. Sends nothing.
@@ -113,6 +155,7 @@ class RemotePolicy(ActingPolicy):
     def reset(self) -> None:
         """Start an episode: the next request says so. Sends nothing."""
         self._episode.reset()
+        self._reward = None
         if self._recording is not None:
             self._recording.begin()
 
@@ -132,7 +175,7 @@ class RemotePolicy(ActingPolicy):
         while self._contract is None:
             remaining = deadline - time.monotonic()
             try:
-                self._contract = self._fetch_contract(max(min(remaining, LONGEST_TRY_S), 0.01))
+                self._meet(self._fetch_contract(max(min(remaining, LONGEST_TRY_S), 0.01)))
             except (UnavailableError, DeadlineError) as error:
                 if time.monotonic() + POLL_S >= deadline:
                     raise UnavailableError(
@@ -146,6 +189,11 @@ class RemotePolicy(ActingPolicy):
         ...
 
     @abstractmethod
+    def _tell_end(self, request: dict[str, Any]) -> None:
+        """Send a request whose action is for nobody."""
+        ...
+
+    @abstractmethod
     def _close(self) -> None:
         """Close what is open to the server; harmless when repeated."""
         ...
@@ -154,6 +202,58 @@ class RemotePolicy(ActingPolicy):
     def _fetch_contract(self, timeout_s: float | None) -> Contract:
         """Ask the server for the contract: with a time-out once, else as often as the client asks anything."""
         ...
+
+    @abstractmethod
+    def _fetch_version(self, version: str, deadline: float) -> Contract:
+        """Ask the server for the contract of a version, by `deadline` (`time.monotonic`)."""
+        ...
+
+    def _meet(self, contract: Contract) -> None:
+        """Take this contract for that of the version that answers from now on. Raises UnavailableError."""
+        self._learn(contract)
+        if self._contract is not None and contract is not self._contract:
+            check_successor(contract, self._contract)
+        self._contract = contract
+
+    def _learn(self, contract: Contract) -> None:
+        """Keep the contract of a version; say where it is made for another control rate."""
+        known = self._contract
+        if contract.version not in self._contracts and known and known.control_rate_hz != contract.control_rate_hz:
+            logger.warning(
+                "version %s of policy '%s' is made for %s Hz, and version %s for %s Hz",
+                contract.version, contract.name, contract.control_rate_hz, known.version, known.control_rate_hz,
+            )  # fmt: skip
+        self._contracts.setdefault(contract.version, contract)
+
+    def _answering_contract(self, reply: Any, number: int, deadline: float) -> Contract:
+        """Return the contract of the version that answered request `number`.
+
+        Raises UnavailableError where it is the answer to another request, or of a version that this client was not made
+        for, and DeadlineError.
+        """
+        contract = self.contract
+        version = answering_version(self.url, reply, number, contract)
+        if version == contract.version:
+            return contract
+        if self._version is not None:
+            raise UnavailableError(
+                f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}', expected "
+                f"{contract.version!r}: the action was dropped"
+            )
+        known = self._contracts.get(version)
+        if known is None:
+            try:
+                known = self._fetch_version(version, deadline)
+            except UnknownVersionError as error:
+                raise UnavailableError(f"{error.message}: the action was dropped", error.details) from error
+            if (known.name, known.version) != (contract.name, version):
+                raise UnavailableError(
+                    f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' and has no contract "
+                    "of it: the action was dropped"
+                )
+            self._learn(known)  # also one that is refused next: it is not fetched again
+        self._meet(known)
+        return known
 
     def _encode_request(
         self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None
@@ -167,6 +267,8 @@ class RemotePolicy(ActingPolicy):
             request["seed"] = seed
         if reward is not None:
             request["reward"] = np.asarray(reward)
+        elif self._reward is not None:
+            request["reward"] = self._reward
         return request, batch
 
     def _parse_contract(self, document: Any) -> Contract:

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.contract import REWARD, Contract
 from rlservo.export.contract.errors import ActionError, SessionLostError, UnavailableError
 from rlservo.export.contract.nested import build_action
 from rlservo.export.contract.spaces import LeafSpec, leaf_specs
 from rlservo.serve_app.wire.state_names import MARK
 
 
-def check_sender(url: str, reply: Any, number: int, contract: Contract) -> None:
-    """Refuse an answer to another request or from another policy: it must not move this robot."""
+def answering_version(url: str, reply: Any, number: int, contract: Contract) -> str:
+    """Return which version answered; refuse an answer to another request or from another policy."""
     if not isinstance(reply, dict):
         raise UnavailableError(f"{url} answered with {type(reply).__name__}, expected an object")
     if reply.get("seq") != number:
@@ -24,11 +24,35 @@ def check_sender(url: str, reply: Any, number: int, contract: Contract) -> None:
             f"{url} answered request {reply.get('seq')!r}, expected {number}: the action was dropped",
             {"expected": number, "actual": reply.get("seq")},
         )
-    sender = (reply.get("policy"), reply.get("version"))
-    if sender != (contract.name, contract.version):
+    name, version = reply.get("policy"), reply.get("version")
+    if name != contract.name or type(version) is not str:
         raise UnavailableError(
-            f"{url} answered for policy {sender[0]!r} version {sender[1]!r}, expected "
-            f"{contract.name!r} version {contract.version!r}: the action was dropped"
+            f"{url} answered for policy {name!r} version {version!r}, expected {contract.name!r}: the action was "
+            "dropped"
+        )
+    return version
+
+
+def check_successor(contract: Contract, known: Contract) -> None:
+    """Refuse a version that another observation goes into, or another action comes out of, than of the known one."""
+    for word, key in (("observation", "obs"), ("action", "action")):
+        theirs, ours = (leaf_specs(getattr(each, f"{word}_space"), key) for each in (contract, known))
+        if theirs != ours or getattr(contract, f"{word}_space") != getattr(known, f"{word}_space"):
+            differing = sorted(name for name in theirs.keys() | ours.keys() if theirs.get(name) != ours.get(name))
+            raise UnavailableError(
+                f"version {contract.version} of policy '{contract.name}' answers now, whose {word} space is another "
+                f"than that of version {known.version}, which this client knows ({', '.join(differing) or word}): the "
+                "action was dropped; make a new client, or one with version=",
+                {"version": contract.version, "known": known.version, "differing": differing},
+            )
+    has_reward, had_reward = (any(tensor.name == REWARD for tensor in each.inputs) for each in (contract, known))
+    if has_reward != had_reward:
+        sees = ("is not given", "is given")
+        raise UnavailableError(
+            f"version {contract.version} of policy '{contract.name}' answers now, which {sees[has_reward]} the "
+            f"reward, and version {known.version}, which this client knows, {sees[had_reward]} it: the action was "
+            "dropped; make a new client, or one with version=",
+            {"version": contract.version, "known": known.version, "differing": [REWARD]},
         )
 
 

@@ -7,6 +7,7 @@ by its number and never used.
 from __future__ import annotations
 
 import json
+import secrets
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from rlservo.export.contract.errors import (
     DeadlineError,
     RequestError,
     RlservoError,
+    StateNeededError,
     UnavailableError,
     UsageError,
 )
@@ -28,7 +30,7 @@ from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.serve_app.client.episode_state import EpisodeState
 from rlservo.serve_app.client.error_replies import decode_error, error_of
 from rlservo.serve_app.client.remote_policy import RemotePolicy
-from rlservo.serve_app.client.replies import check_sender, decode_action
+from rlservo.serve_app.client.replies import decode_action
 from rlservo.serve_app.client.server_address import parse_address
 from rlservo.serve_app.client.websocket_connection import BrokenError, HandshakeError, WebSocket
 from rlservo.serve_app.interface import Observation
@@ -50,9 +52,10 @@ class StreamClient(RemotePolicy):
         action = policy.act(obs)
     ```
 
-    The version is settled at the first contact and stays. A recurrent policy's state is kept here and sent along, or
-    with `server_state` left with the connection: when that breaks in the middle of an episode the state is gone, and
-    `act` raises SessionLostError until `reset`. It belongs to one loop, and is not thread-safe.
+    Which version answers is as with `PolicyClient`; a canary's share is drawn once for the client. A recurrent policy's
+    state is kept here and sent along, or with `server_state` left with the connection: when that breaks in the middle
+    of an episode the state is gone, and `act` raises SessionLostError until `reset`. It belongs to one loop, and is not
+    thread-safe.
     """
 
     def __init__(
@@ -84,6 +87,7 @@ class StreamClient(RemotePolicy):
         )
         self._api_key = api_key
         self._socket: WebSocket | None = None
+        self._label = secrets.token_hex(8)
         self._is_closed = False
         self._connections = 0
         self.stale = 0
@@ -95,12 +99,13 @@ class StreamClient(RemotePolicy):
         return max(0, self._connections - 1)
 
     def _act(self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None = None) -> Any:
-        contract = self.contract
+        _ = self.contract
         deadline = time.monotonic() + self._deadline_ms / 1e3
         request, batch = self._encode_request(obs, explore=explore, seed=seed, reward=reward)
         request["seq"] = number = next(self._numbers)
         while True:
             connection = self._connected(deadline)
+            contract = self.contract
             fields = self._episode.request_fields(contract, batch)
             fields["deadline_ms"] = max(0.0, 1e3 * (deadline - time.monotonic()))
             try:
@@ -111,6 +116,13 @@ class StreamClient(RemotePolicy):
                 if time.monotonic() + WAIT_S >= deadline:
                     raise
                 continue  # asking twice does no harm: no memory of ours has survived on the other side
+            except StateNeededError:
+                self._disconnect()  # of another version than the connection began with: the next one tells its contract
+                version = contract.version
+                self._connected(deadline)
+                if self.contract.version == version:
+                    raise
+                continue
             except DeadlineError:
                 silent_s = time.monotonic() - connection.last_receive_at
                 if silent_s > max(SILENT_S, SILENT_FACTOR * self._deadline_ms / 1e3):
@@ -118,17 +130,30 @@ class StreamClient(RemotePolicy):
                 raise DeadlineError(
                     f"{self.url} did not answer within {self._deadline_ms:g} ms", {"deadline_ms": self._deadline_ms}
                 ) from None
-            is_other = (reply.get("policy"), reply.get("version")) != (contract.name, contract.version)
-            if is_other and not self._episode.is_on_server(contract):
-                self._disconnect()  # the default has moved: the next connection names its version
-                if self._connections == 1 and time.monotonic() + WAIT_S < deadline:
-                    continue
-            check_sender(self.url, reply, number, contract)
+            try:
+                contract = self._answering_contract(reply, number, deadline)
+            except _UnmetVersionError:
+                self._disconnect()  # the next connection begins with its contract
+                if time.monotonic() + WAIT_S >= deadline:
+                    raise
+                continue
             first = _first_of_chunk(reply.get("actions"), contract, batch)
             action = decode_action(first, batch, contract)
             self._episode.advance(reply, first, contract)
-            self.last_reply = reply
+            self.last_reply, self._reward = reply, None
             return action
+
+    def _tell_end(self, request: dict[str, Any]) -> None:
+        if self._socket is None:
+            raise UnavailableError("the connection broke")
+        deadline = time.monotonic() + self._deadline_ms / 1e3
+        number = next(self._numbers)
+        try:
+            self._socket.send(pack({**request, "seq": number, "deadline_ms": self._deadline_ms}), deadline)
+            self._receive_reply(self._socket, number, deadline)
+        except (BrokenError, DeadlineError):
+            self._disconnect()
+            raise
 
     def _close(self) -> None:
         self._disconnect()
@@ -155,7 +180,9 @@ class StreamClient(RemotePolicy):
     def _connected(self, deadline: float) -> WebSocket:
         while self._socket is None:
             try:
-                self._connect(deadline)
+                contract = self._connect(deadline)
+                if self._version is None and self._contract is not None and not self._episode.is_bound(self._contract):
+                    self._meet(contract)
             except BrokenError:
                 if time.monotonic() + WAIT_S >= deadline:
                     raise
@@ -167,12 +194,14 @@ class StreamClient(RemotePolicy):
         if self._is_closed:
             raise UsageError("the client is closed: make a new one")
         name, version = self._name, self._version
-        if self._contract is not None:  # settled
-            name, version = self._contract.name, self._contract.version
+        if self._contract is not None:
+            name, version = self._contract.name, None if version is None else self._contract.version
         path = "/" if name is None else f"/v1/policies/{quote(name, safe='')}"
         path += f"/versions/{quote(version, safe='')}/stream" if version else "/stream" if name else ""
         try:
-            connection = WebSocket(f"{self.url}{path}?errors=keep", api_key=self._api_key, deadline=deadline)
+            connection = WebSocket(
+                f"{self.url}{path}?errors=keep", api_key=self._api_key, deadline=deadline, label=self._label
+            )
         except HandshakeError as error:
             raise decode_error(self.url, error.status, error.body) from None
         try:
@@ -180,6 +209,7 @@ class StreamClient(RemotePolicy):
         except BaseException:
             connection.close()
             raise
+        self._learn(contract)
         self._socket = connection
         self._connections += 1
         self._episode.reconnect()
@@ -187,6 +217,9 @@ class StreamClient(RemotePolicy):
 
     def _fetch_contract(self, timeout_s: float | None) -> Contract:
         return self._connect(time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s))
+
+    def _fetch_version(self, version: str, deadline: float) -> Contract:  # noqa: ARG002
+        raise _UnmetVersionError(f"{self.url} answered for version {version[:32]!r}: the action was dropped")
 
     def _receive_contract(self, connection: WebSocket, deadline: float) -> Contract:
         """Return the contract in the metadata, the first thing a server sends."""
@@ -203,6 +236,10 @@ class StreamClient(RemotePolicy):
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+class _UnmetVersionError(UnavailableError):
+    """A version answered whose contract did not come on any connection yet."""
 
 
 def _first_of_chunk(chunks: Any, contract: Contract, batch: tuple[int, ...]) -> Any:

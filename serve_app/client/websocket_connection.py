@@ -28,8 +28,10 @@ RECEIVE_BYTES = 65536
 class WebSocket:
     """An open connection; any failure closes it and raises BrokenError."""
 
-    def __init__(self, url: str, *, api_key: str | None, deadline: float) -> None:
+    def __init__(self, url: str, *, api_key: str | None, deadline: float, label: str) -> None:
         """Connect and shake hands by `deadline` (`time.monotonic`).
+
+        `label` says whose connection it is: where a canary runs, all of a label get the same version.
 
         Raises BrokenError, or HandshakeError when the server answers with an HTTP error.
         """
@@ -48,6 +50,7 @@ class WebSocket:
                 self._socket = ssl.create_default_context().wrap_socket(self._socket, server_hostname=uri.host)
             request = self._protocol.connect()
             request.headers["User-Agent"] = "rlservo-client"
+            request.headers["x-session-id"] = label
             if api_key is not None:
                 request.headers["Authorization"] = f"Api-Key {api_key}"
             self._protocol.send_request(request)

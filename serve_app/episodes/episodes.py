@@ -92,7 +92,7 @@ class Episodes:
             policy = _owner(store, name, version, carried.policy_identity)
         else:
             policy = _choose(store, request)
-            if stream is not None and store.has(stream.policy) and version is None:
+            if stream is not None and not carried.is_empty and store.has(stream.policy) and version is None:
                 policy = stream.policy
             if carried.arrays and policy.contract.state and not store.is_certain(name, version):
                 raise RequestError(
@@ -120,12 +120,10 @@ class Episodes:
     def _act_on_stream(self, store: PolicyStore, request: Request, episode: Episode, stream: Session) -> Decision:
         """Act from the state that the connection keeps."""
         policy, begins = stream.policy, episode.reset
-        try:
+        if begins:
+            policy = _choose(store, request)
+        else:
             self._check_version(store, request, stream)
-        except SessionError:
-            if not begins:
-                raise
-            policy = _choose(store, request)  # an episode begins: with what is there now
         decision, step = _take_step(policy, request, episode, session=Session(policy) if begins else stream)
         rows = step.rows if policy.is_stateful else 0
         if rows != stream.rows:

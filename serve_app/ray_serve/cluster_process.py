@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -20,13 +21,14 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.serve_app.ray_serve import lean_imports, ray_parts
-from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, free_ports, remove_folder
 from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, cut_log, error_line
 from rlservo.serve_app.server.admin_key import remove_key
 
 CHECK_PERIOD_S = 0.5  # between checks of whether Ray's own processes live
 ORDERLY_END_S = 25.0  # [s] less than the launcher waits
 LOG_CHECK_PERIOD_S = 60.0
+AGENT_PORT = re.compile(r"(--runtime[-_]env[-_]agent[-_]port)=0\b")
 OBJECT_STORE_BYTES = 80 << 20  # Ray's least is 75 MiB; requests do not go through it
 
 
@@ -103,6 +105,12 @@ def _leave_out_extras() -> None:
     services = ray_parts.find("ray._private.services")
     if ray_parts.is_there("ray._private.services:start_api_server"):
         services.start_api_server = lambda *_, **__: ("", None)  # address and process of none
+    leave_out_agent()
+
+
+def leave_out_agent() -> None:
+    """Let raylets that this process starts have no dashboard's agent. Raises RuntimeError as `without_agent` does."""
+    services = ray_parts.find("ray._private.services")
     start: Any = services.start_ray_process
 
     def start_ray_process(command: list[str], process_type: str, *arguments: Any, **more: Any) -> Any:
@@ -114,18 +122,23 @@ def _leave_out_extras() -> None:
 
 
 def without_agent(raylet: list[str]) -> list[str]:
-    """Return the raylet's command with an idle process as the dashboard's agent, and no wait for the agent's ports.
+    """Return the raylet's command with an idle process as the dashboard's agent, and no wait for agents' ports.
+
+    A raylet waits 15 s for each agent to write down the port that it chose, and aborts: on a busy or slow computer the
+    imports alone take longer. So the runtime environments' agent gets a port here, in all that the raylet starts.
 
     Raises RuntimeError where the command is another than that of Ray 2.60.
     """
     import ray
 
+    (port,) = free_ports(1)
+    raylet = [AGENT_PORT.sub(rf"\1={port}", word) for word in raylet]
     changed = {
         "--dashboard_agent_command": shlex.join([shutil.which("sleep") or "sleep", "infinity"]),
         "--metrics-agent-port": "-1",
         "--metrics_export_port": "-1",
     }
-    for option in changed:
+    for option in (*changed, "--runtime_env_agent_port"):
         if (count := sum(word.startswith(f"{option}=") for word in raylet)) != 1:
             raise RuntimeError(f"Ray {ray.__version__} starts its raylet with {count} of {option}: 2.60 has one")
     kept = [word for word in raylet if word.partition("=")[0] not in changed]

@@ -51,6 +51,7 @@ class WithRecording(ActingPolicy):
         self._recorder = record if isinstance(record, Recorder) else self._own
         self._source = _innermost(policy)
         self._format: PolicyFormat | None = None
+        self._format_contract: Contract | None = None
         self._episode = ""
         self._step = 0
         self.begin()
@@ -106,10 +107,28 @@ class WithRecording(ActingPolicy):
         final_status: str | None = None,
         final_obs: Observation | None = None,
     ) -> None:
-        """Record what the last action brought and whether the episode ended with it.
+        """Record what the last action brought and whether the episode ended with it, and pass it on to a client.
 
         `final_obs` is the observation after an episode's last action. Nothing to do before the first action.
         """
+        brought: dict[str, Any] = {
+            "terminated": terminated, "truncated": truncated, "final_status": final_status, "final_obs": final_obs
+        }  # fmt: skip
+        self.record_outcome(reward, **brought)
+        pass_on = getattr(self._policy, "outcome", None)
+        if pass_on is not None:
+            pass_on(reward, **brought)
+
+    def record_outcome(
+        self,
+        reward: float | None,
+        *,
+        terminated: bool,
+        truncated: bool,
+        final_status: str | None,
+        final_obs: Observation | None,
+    ) -> None:
+        """Record what the last action brought, and tell nobody."""
         self._add_outcome(
             reward=None if reward is None else float(reward),
             terminated=bool(terminated),
@@ -150,10 +169,11 @@ class WithRecording(ActingPolicy):
 
     def _known_format(self, has_acted: bool) -> PolicyFormat | None:
         """Return the policy's format; None before a server has told its contract."""
-        if self._format is None and has_acted:
+        if has_acted and (self._format is None or self._policy.contract is not self._format_contract):
+            self._format_contract = self._policy.contract  # of a client's, another version may answer by now
             options = getattr(self._source, "options", None)
             self._format = self.recorder.policy(
-                self._policy.contract,
+                self._format_contract,
                 graph_hash=getattr(self._source, "graph_hash", ""),
                 options=None if options is None else options.model_dump(mode="json", exclude_defaults=True),
             )

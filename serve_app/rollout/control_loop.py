@@ -21,14 +21,13 @@ from rlservo.serve_app.interface import ActingPolicy, Observation
 from rlservo.serve_app.recording.start import record_policy
 from rlservo.serve_app.rollout.disturbance import disturb_env, parse_disturbance
 from rlservo.serve_app.rollout.environment import check_fit, control_rate_of, make_env
-from rlservo.serve_app.rollout.episode import Episode, EpisodeEnv, run_episode
+from rlservo.serve_app.rollout.episode import Episode, EpisodeEnv, run_episode, success_of
 from rlservo.serve_app.rollout.fallback import LinkCounts, StoppedError, WithFallback
 from rlservo.serve_app.rollout.report import EpisodeRow, Link, Rate, RolloutReport, latency_of, wilson_interval
 from rlservo.serve_app.rollout.smoothness import MeasuredEnv
 from rlservo.serve_app.rollout.video import FilmedEnv, VideoFile
 
 if TYPE_CHECKING:
-    from rlservo.serve_app.recording.recorded_policy import WithRecording
     from rlservo.serve_app.recording.recorder import Recorder
 
 OnEpisode = Callable[[EpisodeRow], None]
@@ -55,7 +54,8 @@ def rollout(
     from the same number. With rate 'real' the loop keeps the control rate on an absolute schedule, as on a robot: a
     period that is missed is counted and skipped, never caught up in a burst. `video` receives the frames of the first
     `video_episodes` episodes at the control rate; drawing happens inside the loop, so it counts as its time.
-    `record` receives every decision with its reward and end: a new .mcap file, a folder, or a Recorder.
+    A policy behind a URL is told rewards and ends, for a server that records or promotes by success. `record` receives
+    every decision with its reward and end: a new .mcap file, a folder, or a Recorder.
     `disturb` disturbs environment and robot (`latency=3,noise=real`; `disturbance.py` has the kinds).
     `on_episode` is called after each episode. Ctrl-C returns what was finished, with `interrupted` set; so does a
     fallback (`WithFallback`) that is to stop, with `stopped`.
@@ -96,7 +96,9 @@ def rollout(
         paced = _PacedPolicy(recording or policy, pacer)
         acted = env if disturbance is None else disturb_env(env, disturbance)
         measured = MeasuredEnv(acted, env.unwrapped)
+        report_outcome: Callable[..., None] | None = getattr(paced.policy, "outcome", None)
         rows: list[EpisodeRow] = []
+        versions = [contract.version]
         interrupted, stopped = False, None
         began = time.perf_counter()
         try:
@@ -106,8 +108,8 @@ def rollout(
                 if video_file is not None and index < video_episodes:
                     measured.env = FilmedEnv(acted, video_file.add)
                 loop_env: EpisodeEnv = measured
-                if recording is not None:
-                    loop_env = _RecordedEnv(loop_env, recording)
+                if report_outcome is not None:
+                    loop_env = _ReportedEnv(loop_env, report_outcome)
                 episode = run_episode(
                     loop_env,
                     paced,
@@ -117,6 +119,7 @@ def rollout(
                 )
                 row = _row(episode, paced.latencies_s[first:])
                 rows.append(row)
+                versions.append(policy.contract.version)
                 if on_episode is not None:
                     on_episode(row)
         except KeyboardInterrupt:
@@ -131,7 +134,7 @@ def rollout(
     return RolloutReport(
         env_id=env_id,
         policy=contract.name,
-        version=contract.version,
+        version=", ".join(dict.fromkeys(versions[1:] or versions)),
         rate=rate,
         seed=seed,
         requested_episodes=episodes,
@@ -235,11 +238,11 @@ class _PacedPolicy:
 
 
 @dataclass
-class _RecordedEnv:
-    """An environment whose rewards and ends are recorded as what the last action brought."""
+class _ReportedEnv:
+    """An environment whose rewards and ends are reported as what the last action brought."""
 
     env: EpisodeEnv
-    recording: WithRecording
+    report_outcome: Callable[..., None]
 
     def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
         return self.env.reset(seed=seed)
@@ -249,10 +252,12 @@ class _RecordedEnv:
         obs, reward, terminated, truncated, info = result
         is_over = bool(terminated or truncated)
         status = info.get("final_status") if is_over else None
-        self.recording.outcome(
-            reward,
-            terminated=terminated,
-            truncated=truncated,
+        if status is None and is_over and success_of(info):
+            status = "success"
+        self.report_outcome(
+            float(reward),
+            terminated=bool(terminated),
+            truncated=bool(truncated),
             final_status=None if status is None else str(status),
             final_obs=obs if is_over else None,
         )

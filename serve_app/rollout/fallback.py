@@ -134,6 +134,12 @@ class WithFallback(ActingPolicy):
         self._last = None
         self._policy.reset()
 
+    def outcome(self, reward: float | None = None, **brought: Any) -> None:
+        """Pass on what the last action brought to a policy that takes it (`RemotePolicy.outcome`)."""
+        pass_on = getattr(self._policy, "outcome", None)
+        if pass_on is not None:
+            pass_on(reward, **brought)
+
     def close(self) -> None:
         """Close the wrapped policy."""
         self._policy.close()

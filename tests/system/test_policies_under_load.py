@@ -24,11 +24,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from clusters import KEY, PATIENCE_S, Cluster, serving
 from rlservo.export.contract.errors import ConflictError, RefusedError, UnauthenticatedError
 from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.runtime.policy import Policy
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow, pytest.mark.random_order(disabled=True)]
 
@@ -45,6 +47,7 @@ class Load:
     versions: Counter[str] = field(default_factory=Counter)
     first_failures: list[str] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # also after one retry
+    actions: set[tuple[str, tuple[float, ...]]] = field(default_factory=set)  # each that came, with its version
     longest_s: float = 0.0
 
     @property
@@ -60,6 +63,7 @@ def loaded(cluster: Cluster, path: str = "/v1/policies/ur5/act") -> Iterator[Loa
     headers = {"content-type": "application/json", "authorization": f"Bearer {KEY}"}
 
     def once(connection: http.client.HTTPConnection) -> tuple[str, str]:
+        """Return (version, failure)."""
         try:
             connection.request("POST", path, body, headers)
             reply = connection.getresponse()
@@ -69,7 +73,10 @@ def loaded(cluster: Cluster, path: str = "/v1/policies/ur5/act") -> Iterator[Loa
             return "", f"{type(error).__name__}: {error}"
         if reply.status != 200:
             return "", f"{reply.status} {content[:200]!r}"
-        return json.loads(content)["version"], ""
+        document = json.loads(content)
+        with lock:
+            load.actions.add((document["version"], tuple(document["action"])))
+        return document["version"], ""
 
     def client() -> None:
         connection = http.client.HTTPConnection("127.0.0.1", cluster.port, timeout=60)
@@ -395,3 +402,94 @@ def test_a_promotion_stops_when_somebody_else_moves_the_alias(cluster: Cluster, 
         code, said = outcome_of(process)
     assert code == 4 and "'production' leads to 3 and no longer to 2" in said, said
     assert arranged(cluster) == {("3", None)}
+
+
+# Another node of the cluster, as `ray.cluster_utils` makes one: `ray start` refuses a second one on this address.
+NODE = """
+import sys
+from ray._private.node import Node
+from ray._private.parameter import RayParams
+from rlservo.serve_app.ray_serve.cluster_process import leave_out_agent
+leave_out_agent()
+node = Node(
+    RayParams(gcs_address=sys.argv[1], node_ip_address="127.0.0.1", num_cpus=2, num_gpus=0, min_worker_port=0,
+              max_worker_port=0, object_store_memory=80 << 20),
+    head=False, shutdown_at_exit=True, spawn_reaper=False)
+print("joined", flush=True)
+sys.stdin.read()
+"""
+
+
+@contextlib.contextmanager
+def joined(cluster: Cluster) -> Iterator[psutil.Process]:
+    """Another node of the cluster: the process whose descendants are all of it."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", NODE, cluster.address],
+        env=cluster.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None and process.stdin is not None
+    try:
+        said = ""
+        while not said.startswith("joined"):  # Ray may say something first
+            said = process.stdout.readline()
+            assert said, "the node did not start"
+        yield psutil.Process(process.pid)
+    finally:
+        with contextlib.suppress(psutil.Error):
+            kill_all(psutil.Process(process.pid))
+        process.wait()
+        process.stdin.close()
+        process.stdout.close()
+
+
+def kill_all(node: psutil.Process) -> None:
+    """SIGKILL to all of a node at once, as when its power goes."""
+    for each in [*node.children(recursive=True), node]:
+        with contextlib.suppress(psutil.Error):
+            each.kill()
+
+
+def replicas_of(node: psutil.Process) -> list[int]:
+    found = []
+    for each in node.children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            found += [each.pid] if "ServeReplica" in "".join(each.cmdline()[:1]) else []
+    return found
+
+
+def latencies_of(reply: dict[str, Any]) -> list[int]:
+    """Return a replica's histogram of all it has answered."""
+    return [count for version in reply["counts"].values() for count in version["latency"]]
+
+
+def test_a_lost_node_costs_a_client_that_retries_once_nothing(cluster: Cluster) -> None:
+    (deployment,) = cluster.application["deployments"]
+    with joined(cluster) as node, cluster.admin() as admin:
+        # New replicas, one for each node: those that are there know of no such limit.
+        deployment["max_replicas_per_node"] = 1
+        cluster.application["runtime_env"] = {"env_vars": {"PLACED": "apart"}}
+        try:
+            cluster.deploy()
+            deadline = time.monotonic() + 2 * PATIENCE_S
+            while not (len(replicas_of(node)) == 1 and len(cluster.replica_pids()) == 2):  # of both nodes
+                assert time.monotonic() < deadline, "the replicas are not apart"
+                time.sleep(0.2)
+            with loaded(cluster) as load:
+                while not all(any(latencies_of(reply)) for reply in admin.counts("ur5")):
+                    assert time.monotonic() < deadline, "a replica was asked nothing"
+                    time.sleep(0.2)
+                before = load.answered
+                kill_all(node)
+                cluster.wait_for(lambda seen: len(seen) == 1)
+                after = load.answered
+        finally:
+            del deployment["max_replicas_per_node"], cluster.application["runtime_env"]
+            cluster.deploy()
+    assert load.failures == [] and after - before > 20
+    for version in load.versions:
+        with Policy.load(cluster.repository / "ur5" / version) as policy:
+            expected = policy.act(np.array(OBS, np.float32))
+        for action in (action for each, action in load.actions if each == version):
+            assert np.array_equal(np.array(action, np.float32), expected)
+    cluster.wait_for(lambda seen: len(seen) == 2)
+    cluster.wait_for_status("RUNNING")

@@ -154,10 +154,10 @@ def test_the_newest_version_is_the_default_and_another_can_be_named(served: Serv
         assert not np.array_equal(second.act(obs), newest.act(obs))
 
 
-def test_a_newer_version_loaded_meanwhile_does_not_change_a_running_loop(policies: Path) -> None:
+def test_a_newer_version_loaded_meanwhile_does_not_change_a_loop_with_a_version(policies: Path) -> None:
     obs = observations(1)[0]
     old = load_store(policies / "ur5" / "1", policies / "ur5" / "2")
-    with Served(old) as server, PolicyClient(server.url, "ur5") as client:
+    with Served(old) as server, PolicyClient(server.url, "ur5", version="2") as client:
         before = client.act(obs)
         server.store = load_store(policies)
         assert np.array_equal(client.act(obs), before)

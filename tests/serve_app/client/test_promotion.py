@@ -12,10 +12,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
+from gymnasium.envs.registration import register, registry
 
 from rlservo.export.contract.errors import UnavailableError, UsageError
 from rlservo.serve_app.client.admin_client import AdminClient
+from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.promotion import (
     INTERRUPTED,
     PROMOTED,
@@ -30,6 +34,7 @@ from rlservo.serve_app.client.promotion_conditions import parse_conditions
 from rlservo.serve_app.client.promotion_counts import Counts
 from rlservo.serve_app.client.promotion_log import PromotionLog
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.core import Core
@@ -220,19 +225,38 @@ def test_a_shadow_that_ran_before_goes_on_and_another_one_is_in_the_way(run: Any
     assert server.plan.canary is None
 
 
-def test_success_is_compared_by_the_ends_that_clients_tell(run: Any, server: Server) -> None:
-    def episodes() -> None:
-        for number in range(150):
-            chosen = server.control.store.choose("ur5", None, f"robot-{number}").contract.version  # type: ignore[union-attr]
-            status = "success" if chosen == "1" or number % 2 else "collision"
-            connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
-            headers = {"content-type": "application/json", "x-session-id": f"robot-{number}"}
-            document = json.dumps({"obs": OBS, "final_status": status})
-            connection.request("POST", "/v1/policies/ur5/act", document, headers)
-            assert connection.getresponse().status == 200
-            connection.close()
+class Reach(gym.Env[Any, Any]):
+    """One step, which succeeds if it is version 1's."""
 
-    outcome = run(unless="success_drop>2%")(episodes)
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (27,), np.float32)
+    high = np.array([1, 1, 1, 2, 1, 1], np.float32)
+    action_space = gym.spaces.Box(-high, high)
+
+    def __init__(self, wanted: Any) -> None:
+        self.wanted = wanted
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return np.array(OBS, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        is_there = bool(np.allclose(action, self.wanted))
+        return np.array(OBS, np.float32), 1.0, True, False, {"final_status": "success" if is_there else "collision"}
+
+
+def test_success_is_compared_by_the_ends_that_rollouts_tell(run: Any, server: Server) -> None:
+    assert server.control.store is not None
+    wanted = server.control.store.get("ur5", "1").act(np.array(OBS, np.float32))
+    register("Promoted-v0", lambda: Reach(wanted))
+
+    def episodes() -> None:
+        with PolicyClient(f"http://127.0.0.1:{server.port}", "ur5") as client:
+            rollout(client, "Promoted-v0", episodes=150)
+
+    try:
+        outcome = run("4", "success_drop>2%")(episodes)
+    finally:
+        del registry["Promoted-v0"]
     assert outcome.outcome == ROLLED_BACK and "episodes succeeded" in outcome.why, outcome
     assert (server.plan.default, server.plan.canary) == ("1", None)
 

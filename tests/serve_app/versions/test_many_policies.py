@@ -1,0 +1,42 @@
+"""A repository of many policies: what loading one of them costs does not grow with their number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rlservo.export.contract.bundle import read_contract
+from rlservo.serve_app.versions import repository
+from rlservo.serve_app.versions.plan import ServedConfig
+from stores import load_store
+
+
+def test_each_contract_is_read_by_one_look_and_its_own_load(
+    discrete_policy: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = 12
+    for number in range(count):
+        discrete_policy(tmp_path, name=f"grid-{number}")
+    reads = 0
+
+    def counted(*given: object) -> object:
+        nonlocal reads
+        reads += 1
+        return read_contract(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(repository, "read_contract", counted)
+    store = load_store(tmp_path)
+    assert len(store.names) == count and reads <= 2 * count
+    store.close()
+
+
+def test_bundle_that_has_moved_since_the_look_is_found(discrete_policy: Callable[..., Path], tmp_path: Path) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    discrete_policy(here, name="grid")
+    discrete_policy(there, name="other")
+    places = repository.Repository([here, there])
+    digest = places.available(ServedConfig())["grid"]["1"]
+    (here / "grid").rename(there / "grid")
+    assert places.fetch("grid", "1", digest).folder == there / "grid" / "1"
