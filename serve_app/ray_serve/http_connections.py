@@ -7,6 +7,8 @@ uvicorn (0.54) bounds one phase of a connection, the idle time after a reply. Fo
 - for a client that does not read its reply, also after the connection has been closed;
 - for nothing: `Upgrade: websocket` with a body is handed to the WebSocket protocol without that body.
 
+And it takes a head of any size.
+
 Of a WebSocket it takes whatever comes: 16 KB that unpack to 16 MB, again and again; as many frames at once as fit a
 read, which the application then answers one after the other while the event loop stands still; pings whose answers
 nobody reads.
@@ -19,7 +21,9 @@ HAProxy has time-outs of its own (`haproxy/configuration.py`).
 from __future__ import annotations
 
 import asyncio
+import functools
 import socket
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import uvicorn
@@ -30,11 +34,13 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites
 
 if TYPE_CHECKING:
-    from starlette.types import Message, Receive, Scope, Send
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
     from websockets.frames import Frame
 
 HEAD_S = 5.0
 """[s] for a request's head, from the connection's begin or the head's first byte on."""
+MAX_HEAD_BYTES = 16384
+"""Of a request's head, as in HAProxy's buffer."""
 BODY_S = 30.0
 """[s] for a body, where a route has no shorter time of its own (`body_timeout_s`)."""
 LINGER_S = 1.0
@@ -60,6 +66,11 @@ NO_UPGRADE = (
     b'{"error":"the header Upgrade is understood for a WebSocket alone, which begins with a GET without a body: '
     b'leave it out","code":"bad-request"}'
 )
+HEAD_TOO_LARGE = b'{"error":"the request\'s headers are larger than %d bytes","code":"bad-request"}' % MAX_HEAD_BYTES
+LARGE_REPLY = (
+    b"HTTP/1.1 431 Request Header Fields Too Large\r\ncontent-type: application/json\r\nconnection: close\r\n"
+    b"content-length: %d\r\n\r\n%s" % (len(HEAD_TOO_LARGE), HEAD_TOO_LARGE)
+)
 # What the subclass overrides or reads of uvicorn's private parts.
 PRIVATE = ("_should_upgrade", "_start_asgi_task", "_unset_keepalive_if_required", "handle_websocket_upgrade")
 PRIVATE_OF_STREAMS = ("handle_cont", "handle_ping", "handle_pong")
@@ -72,6 +83,9 @@ class TimedProtocol(HttpToolsProtocol):
     _body_since = 0.0  # since when the request's body is awaited
     _timer: asyncio.TimerHandle | None = None
     _replies: JoinedWrites
+    _unread = 0  # bytes that came since the last request was complete, so at least those of the head that is read
+    _refuse: ASGIApp | None = None  # answers the next request instead of the application, and ends the connection
+    _on_lost: Callable[[], None] | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first head."""
@@ -88,11 +102,21 @@ class TimedProtocol(HttpToolsProtocol):
         """Stop the timer."""
         self._stop()
         super().connection_lost(exc)
+        if self._on_lost is not None:
+            self._on_lost()
+
+    def data_received(self, data: bytes) -> None:
+        """Read what has come; of a head, not more than may be."""
+        self._unread += len(data)
+        super().data_received(data)
+        if self._unread > MAX_HEAD_BYTES and self._head_since is not None and not self.transport.is_closing():
+            self.transport.write(LARGE_REPLY)
+            self.transport.close()
 
     def handle_websocket_upgrade(self) -> None:
         """Leave the connection to the WebSocket protocol, which sends pings."""
         self._stop()
-        self.ws_protocol_class = BoundedStream
+        self.ws_protocol_class = functools.partial(BoundedStream, on_lost=self._on_lost)  # type: ignore[assignment]
         # A robot's numbers hardly compress, and what unpacks to a thousand times its size is nobody's observation.
         self.config.ws_per_message_deflate = False
         super().handle_websocket_upgrade()
@@ -105,7 +129,16 @@ class TimedProtocol(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         """Begin to wait for the body."""
         self._body_since, self._head_since = self._head_since or 0.0, None
+        if self._unread > MAX_HEAD_BYTES:
+            size = len(self.url) + sum(len(name) + len(value) for name, value in self.headers)
+            if size > MAX_HEAD_BYTES:
+                self._refuse = refusal(431, HEAD_TOO_LARGE)
         super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """Begin to count the next head."""
+        self._unread = 0
+        super().on_message_complete()
 
     def on_response_complete(self) -> None:
         """Give a client that is still sending a moment to take its reply, and close."""
@@ -122,7 +155,7 @@ class TimedProtocol(HttpToolsProtocol):
             self.loop.call_later(LINGER_S, self.transport.close)
 
     def _should_upgrade(self) -> bool:
-        return super()._should_upgrade() and not _has_body(self.scope)
+        return super()._should_upgrade() and not _has_body(self.scope) and self._refuse is None
 
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
         # The parser has stopped at this head: a body is lost, and so is the next request.
@@ -130,7 +163,10 @@ class TimedProtocol(HttpToolsProtocol):
         if parser.should_upgrade() and any(name == b"upgrade" for name, _ in cycle.scope["headers"]):
             cycle.keep_alive = False
             if _has_body(cycle.scope):
-                app = _refuse_upgrade
+                app = refusal(400, NO_UPGRADE)
+        if self._refuse is not None:
+            cycle.keep_alive = False
+            app = self._refuse
         if cycle.scope["method"] == "POST":  # of a HEAD there would be no body for its head to wait for
             self._replies.head = None
             cycle.transport = self._replies
@@ -166,6 +202,17 @@ class BoundedStream(WebSocketsSansIOProtocol):
 
     _since = float("-inf")  # when the second began in which `_empty` counts
     _empty = 0
+
+    def __init__(self, *arguments: Any, on_lost: Callable[[], None] | None = None, **more: Any) -> None:
+        """Call `on_lost` when the connection has ended."""
+        super().__init__(*arguments, **more)
+        self._on_lost = on_lost
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Say so."""
+        super().connection_lost(exc)
+        if self._on_lost is not None:
+            self._on_lost()
 
     def data_received(self, data: bytes) -> None:
         """Read what has come, piece by piece, until it is too much."""
@@ -229,10 +276,15 @@ def _has_body(scope: Any) -> bool:
     )
 
 
-async def _refuse_upgrade(_scope: Scope, _receive: Receive, send: Send) -> None:
-    headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(NO_UPGRADE))]
-    await send({"type": "http.response.start", "status": 400, "headers": headers})
-    await send({"type": "http.response.body", "body": NO_UPGRADE})
+def refusal(status: int, body: bytes, *more: tuple[bytes, bytes]) -> ASGIApp:
+    """Return an application that answers every request so, in JSON; `more` are further headers."""
+    headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(body)), *more]
+
+    async def refuse(_scope: Scope, _receive: Receive, send: Send) -> None:
+        await send({"type": "http.response.start", "status": status, "headers": headers})
+        await send({"type": "http.response.body", "body": body})
+
+    return refuse
 
 
 def install() -> None:
