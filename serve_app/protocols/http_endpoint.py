@@ -50,6 +50,8 @@ TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been
 STAMP_HEADER = STAMP.encode()
 ROOT = "/"  # a page for browsers (`status_page.py`), nothing for programs
 
+REPLY = "rlservo.reply"  # in a connection's scope: writes (status, headers, body) at once, False where that has to wait
+
 Body = bytes | bytearray
 
 PROCESS = secrets.token_hex(8).encode()
@@ -245,8 +247,28 @@ class HttpEndpoint:
             return
         length = (b"content-length", b"%d" % len(content))
         every = [length, *reply_headers, *scope.get(REPLY_HEADERS, ())]
+        reply = scope.get(REPLY)
+        if reply is not None and reply(status, every, content):
+            return
         await send({"type": "http.response.start", "status": status, "headers": every})
         await send({"type": "http.response.body", "body": content})
+
+
+class WholeBody:
+    """The `receive` of a request all of which has come."""
+
+    __slots__ = ("_receive", "body")
+
+    def __init__(self, body: bytes, receive: Receive) -> None:
+        self.body: bytes | None = body
+        self._receive = receive
+
+    async def __call__(self) -> Message:
+        """Return the body, and then what else comes."""
+        body, self.body = self.body, None
+        if body is None:
+            return await self._receive()
+        return {"type": "http.request", "body": body, "more_body": False}
 
 
 async def receive_body(core: Core, headers: Mapping[bytes, bytes], receive: Receive) -> Body:
@@ -259,6 +281,10 @@ async def receive_body(core: Core, headers: Mapping[bytes, bytes], receive: Rece
     length = headers.get(b"content-length", b"")
     if length.isdigit() and len(length) < 20 and int(length) > max_bytes:
         raise too_large(max_bytes)
+    if type(receive) is WholeBody and receive.body is not None:  # nothing to wait for, and so no time-out
+        if len(receive.body) > max_bytes:
+            raise too_large(max_bytes)
+        return receive.body
     admission = core.admission
     given_s = admission.begin_body(timeout_s)
     timer = _BodyTimer(given_s)

@@ -54,8 +54,9 @@ class DirectServer:
         self._listener, self._is_shared = listener, is_shared
         self._per_address = settings.max_connections_per_address
         self._max_wait_s = settings.max_queue_ms / 1e3
+        self.app = DirectApp(app)
         self._config = uvicorn.Config(
-            DirectApp(app),
+            self.app,
             lifespan="off",
             proxy_headers=False,  # nobody's X-Forwarded-For is believed
             access_log=False,
@@ -203,6 +204,10 @@ class DirectConnection(TimedProtocol):
         if self.cycle is not None and not self.cycle.response_complete:
             self.cycle.keep_alive = False
 
+    def find_immediate(self, _scope: Scope) -> ASGIApp | None:
+        """Return what answers a request for an action, if it is one."""
+        return self._server.app.find_immediate(_scope)
+
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
         if self._server.is_draining:
             cycle.keep_alive = False
@@ -214,6 +219,18 @@ class DirectApp:
 
     def __init__(self, app: PolicyApp) -> None:
         self._app = app
+
+    def find_immediate(self, scope: Scope) -> ASGIApp | None:
+        """Return what answers a request for an action, if it is one."""
+        match = self._app.find_direct(scope, scope["path"])
+        if match is None:
+            return None
+        if not self._app.admit_ahead():
+            return self._turn_away
+        return functools.partial(self._app.answer_found, match)
+
+    async def _turn_away(self, _scope: Scope, _receive: Receive, send: Send) -> None:
+        await ingress.turn_away(send)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one connection or request."""

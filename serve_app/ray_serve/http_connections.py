@@ -13,6 +13,9 @@ Of a WebSocket it takes whatever comes: 16 KB that unpack to 16 MB, again and ag
 read, which the application then answers one after the other while the event loop stands still; pings whose answers
 nobody reads.
 
+A request for an action that came whole is answered at once where nothing has to wait (`eager_start.py`), in the turn of
+the event loop that reads it, and its reply is written in one piece.
+
 `install` puts subclasses in place of the classes that uvicorn chooses, in each of Serve's processes that serves HTTP
 (`ingress.py`). One timer a connection checks its phase; a request costs two assignments. In front of the replicas
 HAProxy has time-outs of its own (`haproxy/configuration.py`).
@@ -28,10 +31,12 @@ from typing import TYPE_CHECKING, Any
 
 import uvicorn
 from uvicorn.protocols.http import auto
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites
+from rlservo.serve_app.protocols.http_endpoint import REPLY, WholeBody
+from rlservo.serve_app.ray_serve import eager_start
+from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -86,6 +91,8 @@ class TimedProtocol(HttpToolsProtocol):
     _unread = 0  # bytes that came since the last request was complete, so at least those of the head that is read
     _refuse: ASGIApp | None = None  # answers the next request instead of the application, and ends the connection
     _on_lost: Callable[[], None] | None = None
+    _is_first = True  # of what was read at once; those after it let other connections have their turn
+    _awaited: tuple[Any, Any, ASGIApp] | None = None  # cycle, its application, what answers it at once when it is whole
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first head."""
@@ -108,7 +115,12 @@ class TimedProtocol(HttpToolsProtocol):
     def data_received(self, data: bytes) -> None:
         """Read what has come; of a head, not more than may be."""
         self._unread += len(data)
+        self._is_first = True
         super().data_received(data)
+        if self._awaited is not None:  # more of it is to come
+            cycle, app, _ = self._awaited
+            self._awaited = None
+            super()._start_asgi_task(cycle, app)
         if self._unread > MAX_HEAD_BYTES and self._head_since is not None and not self.transport.is_closing():
             self.transport.write(LARGE_REPLY)
             self.transport.close()
@@ -139,6 +151,8 @@ class TimedProtocol(HttpToolsProtocol):
         """Begin to count the next head."""
         self._unread = 0
         super().on_message_complete()
+        if self._awaited is not None:
+            self._answer(*self._awaited)
 
     def on_response_complete(self) -> None:
         """Give a client that is still sending a moment to take its reply, and close."""
@@ -170,7 +184,43 @@ class TimedProtocol(HttpToolsProtocol):
         if cycle.scope["method"] == "POST":  # of a HEAD there would be no body for its head to wait for
             self._replies.head = None
             cycle.transport = self._replies
+            at_once = None
+            if cycle.more_body and self._is_first and self._refuse is None:
+                at_once = self.find_immediate(cycle.scope)
+            if at_once is not None:
+                self._awaited = (cycle, app, at_once)
+                return
         super()._start_asgi_task(cycle, app)
+
+    def find_immediate(self, _scope: Scope) -> ASGIApp | None:
+        """Return what answers a request without the application's middleware, if anything does."""
+        return None
+
+    def _answer(self, cycle: Any, _app: Any, at_once: ASGIApp) -> None:
+        self._awaited, self._is_first = None, False
+        cycle.receive = WholeBody(bytes(cycle.body), cycle.receive)
+        cycle.scope[REPLY] = functools.partial(self._reply, cycle)
+        task = eager_start.start(cycle.run_asgi(at_once), self.loop)
+        if task is not None:
+            self.tasks.add(task)
+            task.add_done_callback(self.tasks.discard)
+
+    def _reply(self, cycle: Any, status: int, headers: Any, body: bytes) -> bool:
+        """Write a whole reply; return False where that has to wait, since the client does not read."""
+        if cycle.disconnected or cycle.response_started or cycle.flow.write_paused:
+            return bool(cycle.disconnected)
+        pieces = [STATUS_LINE[status]]
+        for name, value in (*cycle.default_headers, *headers):
+            pieces += (name, b": ", value, b"\r\n")
+        pieces += (b"\r\n" if cycle.keep_alive else b"connection: close\r\n\r\n", body)
+        cycle.response_started = cycle.response_complete = True
+        turn.write(self.transport, b"".join(pieces))
+        cycle.message_event.set()
+        if not cycle.keep_alive:
+            turn.flush()
+            self.transport.close()
+        cycle.on_response()
+        return True
 
     def _check_phase(self) -> None:
         if self.transport.is_closing():
