@@ -91,7 +91,7 @@ class TimedProtocol(HttpToolsProtocol):
     _unread = 0  # bytes that came since the last request was complete, so at least those of the head that is read
     _refuse: ASGIApp | None = None  # answers the next request instead of the application, and ends the connection
     _on_lost: Callable[[], None] | None = None
-    _is_first = True  # of what was read at once; those after it let other connections have their turn
+    _is_first = False  # of the requests that are being read: those after it let other connections have their turn
     _awaited: tuple[Any, Any, ASGIApp] | None = None  # cycle, its application, what answers it at once when it is whole
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -117,6 +117,7 @@ class TimedProtocol(HttpToolsProtocol):
         self._unread += len(data)
         self._is_first = True
         super().data_received(data)
+        self._is_first = False
         if self._awaited is not None:  # more of it is to come
             cycle, app, _ = self._awaited
             self._awaited = None
@@ -185,7 +186,7 @@ class TimedProtocol(HttpToolsProtocol):
             self._replies.head = None
             cycle.transport = self._replies
             at_once = None
-            if cycle.more_body and self._is_first and self._refuse is None:
+            if cycle.more_body and self._is_first and app is self.app:
                 at_once = self.find_immediate(cycle.scope)
             if at_once is not None:
                 self._awaited = (cycle, app, at_once)

@@ -182,6 +182,7 @@ def test_what_does_not_come_or_is_too_large_ends_the_connection(
             line + b"content-type: application/json\r\nx-api-key: " + KEY.encode() + b"\r\ncontent-length: 9\r\n\r\n{",
             408,
         ),
+        (line + b"connection: upgrade\r\nupgrade: websocket\r\ncontent-length: 2\r\n\r\n{}", 400),
         (line + many, 431),
         (line + many + b"\r\n", 431),
         (line + b"x-much: " + b"y" * 20000 + b"\r\n\r\n", 431),
