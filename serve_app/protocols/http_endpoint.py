@@ -247,7 +247,7 @@ class HttpEndpoint:
             return
         length = (b"content-length", b"%d" % len(content))
         every = [length, *reply_headers, *scope.get(REPLY_HEADERS, ())]
-        reply = scope.get(REPLY)
+        reply = scope.pop(REPLY, None)
         if reply is not None and reply(status, every, content):
             return
         await send({"type": "http.response.start", "status": status, "headers": every})

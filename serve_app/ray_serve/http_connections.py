@@ -199,10 +199,17 @@ class TimedProtocol(HttpToolsProtocol):
 
     def _answer(self, cycle: Any, _app: Any, at_once: ASGIApp) -> None:
         self._awaited, self._is_first = None, False
-        cycle.receive = WholeBody(bytes(cycle.body), cycle.receive)
+        body = bytes(cycle.body)
+
+        def answer(scope: Scope, receive: Receive, send: Send) -> Any:
+            return at_once(scope, WholeBody(body, receive), send)
+
+        # The cycle leads to its scope, and this back: left there, every request would be for the garbage collector.
         cycle.scope[REPLY] = functools.partial(self._reply, cycle)
-        task = eager_start.start(cycle.run_asgi(at_once), self.loop)
-        if task is not None:
+        task = eager_start.start(cycle.run_asgi(answer), self.loop)
+        if task is None:
+            cycle.scope.pop(REPLY, None)
+        else:
             self.tasks.add(task)
             task.add_done_callback(self.tasks.discard)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import http.client
 import json
 import socket
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from starlette.types import Receive, Scope, Send
+from uvicorn.protocols.http.httptools_impl import RequestResponseCycle
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
@@ -257,6 +259,21 @@ def test_replicas_that_come_and_go_under_load_lose_nothing(start: Callable[[], R
         for each in loads:
             each.result(SOON_S)
     assert min(answered.values()) > 50
+
+
+def test_a_request_leaves_nothing_to_the_garbage_collector(start: Callable[[], Replica], port: int) -> None:
+    start()
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=SOON_S)) as connection:
+        ask_on(connection)
+        gc.collect()
+        gc.disable()
+        try:
+            for number in range(40):
+                ask_on(connection, authorization=f"Bearer {KEY if number % 2 else 'no'}")
+            left = sum(isinstance(each, RequestResponseCycle) for each in gc.get_objects())
+        finally:
+            gc.enable()
+    assert left < 10, "a collection over all of a replica takes milliseconds, in which nobody is answered"
 
 
 def test_what_waited_until_a_replica_came_is_refused_as_late(start: Callable[[], Replica], port: int) -> None:
