@@ -8,9 +8,10 @@ that does wait is carried on by a task.
 from __future__ import annotations
 
 import asyncio
+import functools
 import sys
 import types
-from collections.abc import Coroutine, Generator
+from collections.abc import Callable, Coroutine, Generator
 from typing import Any
 
 
@@ -32,14 +33,13 @@ def start(coroutine: Coroutine[Any, Any, None], loop: asyncio.AbstractEventLoop)
 @types.coroutine
 def _go_on(coroutine: Coroutine[Any, Any, None], waits_for: Any) -> Generator[Any, Any, None]:
     """Wait for what a coroutine waits for, and pass on to it what comes of that."""
+    resume: Callable[[], Any]
     while True:
         try:
-            result = yield waits_for
+            resume = functools.partial(coroutine.send, (yield waits_for))
         except BaseException as error:
-            step, given = coroutine.throw, error
-        else:
-            step, given = coroutine.send, result
+            resume = functools.partial(coroutine.throw, error)
         try:
-            waits_for = step(given)
+            waits_for = resume()
         except StopIteration:
             return
