@@ -27,8 +27,8 @@ def build(onnx_file: str) -> Any:
             await send({"type": "websocket.accept"})
             while (message := await receive())["type"] == "websocket.receive":
                 obs = np.frombuffer(message["bytes"], np.float32)[None]
-                (action,) = session.run(["action"], {"obs": obs})
-                await send({"type": "websocket.send", "bytes": action.tobytes()})
+                streamed: Any = session.run(["action"], {"obs": obs})
+                await send({"type": "websocket.send", "bytes": streamed[0].tobytes()})
             return
         body, more = b"", True
         while more:
@@ -36,8 +36,8 @@ def build(onnx_file: str) -> Any:
             body += message.get("body", b"")
             more = message.get("more_body", False)
         obs = np.asarray(orjson.loads(body)["obs"], np.float32)[None]
-        (action,) = session.run(["action"], {"obs": obs})
-        content = orjson.dumps({"action": action[0]}, option=orjson.OPT_SERIALIZE_NUMPY)
+        outputs: Any = session.run(["action"], {"obs": obs})
+        content = orjson.dumps({"action": outputs[0][0]}, option=orjson.OPT_SERIALIZE_NUMPY)
         headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(content))]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": content})

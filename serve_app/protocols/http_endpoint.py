@@ -281,7 +281,7 @@ async def receive_body(core: Core, headers: Mapping[bytes, bytes], receive: Rece
     length = headers.get(b"content-length", b"")
     if length.isdigit() and len(length) < 20 and int(length) > max_bytes:
         raise too_large(max_bytes)
-    if type(receive) is WholeBody and receive.body is not None:  # nothing to wait for, and so no time-out
+    if isinstance(receive, WholeBody) and receive.body is not None:  # nothing to wait for, and so no time-out
         if len(receive.body) > max_bytes:
             raise too_large(max_bytes)
         return receive.body

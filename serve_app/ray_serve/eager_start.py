@@ -27,7 +27,8 @@ def start(coroutine: Coroutine[Any, Any, None], loop: asyncio.AbstractEventLoop)
         waits_for = coroutine.send(None)
     except StopIteration:
         return None
-    return loop.create_task(_go_on(coroutine, waits_for))
+    rest: Any = _go_on(coroutine, waits_for)  # a coroutine for asyncio, and a generator by its type
+    return loop.create_task(rest)
 
 
 @types.coroutine
