@@ -32,6 +32,10 @@ def serve(
     grpc_port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC, here.")
     ] = None,
+    direct_port: Annotated[
+        int | None,
+        typer.Option(min=1, max=65535, help="The replicas listen here themselves, too: a shorter way."),
+    ] = None,
     replicas: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
     default_policy: Annotated[
         str | None,
@@ -69,6 +73,8 @@ def serve(
             )
         if served.grpc is not None:
             terminal.output().print(f"{served.grpc}  gRPC, Open Inference Protocol", highlight=False, soft_wrap=True)
+        if served.direct is not None:
+            terminal.output().print(f"{served.direct}  without the proxy", highlight=False, soft_wrap=True)
         if not served.haproxy:
             terminal.errors().print(
                 "HAProxy is not installed here: Ray's own proxy answers, at several times the latency"
@@ -91,6 +97,7 @@ def serve(
             name: value
             for name, value in (
                 ("default_policy", default_policy),
+                ("direct_port", direct_port),
                 ("record", record and str(record)),
                 ("poll_s", poll),
             )

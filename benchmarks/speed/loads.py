@@ -173,13 +173,17 @@ class WebSocketLine(Line):
         if not answer.startswith(b"HTTP/1.1 101"):
             raise LoadError(f"the server answered {answer[:300]!r}")
         self._held = answer[end + 4 :]
-        self._frame = _frame(message)
+        self.frame = _frame(message)
         if greets:
             self._message()
 
+    @property
+    def connection(self) -> socket.socket:
+        return self._socket
+
     def __call__(self) -> bytes:
         """Return the answering message. Raises LoadError when it is not binary."""
-        self._socket.sendall(self._frame)
+        self._socket.sendall(self.frame)
         return self._message()
 
     def _message(self) -> bytes:

@@ -10,6 +10,7 @@ import contextlib
 import socket
 import ssl
 import time
+from typing import cast
 
 from rlservo.export.contract.errors import DeadlineError, UnavailableError, UsageError
 
@@ -17,6 +18,7 @@ try:
     from websockets.client import ClientProtocol
     from websockets.exceptions import InvalidHandshake, InvalidStatus
     from websockets.frames import Frame, Opcode
+    from websockets.http11 import Response
     from websockets.uri import parse_uri
 except ModuleNotFoundError as missing:
     raise UsageError("the WebSocket client needs websockets: pip install 'rlservo[client]'") from missing
@@ -70,7 +72,9 @@ class WebSocket:
         except BaseException:
             self.close()
             raise
-        self._events = self._protocol.events_received()[1:]  # the first is the handshake's response
+        response, *self._events = self._protocol.events_received()
+        self.headers = cast("Response", response).headers
+        """Of the handshake's response."""
         self.last_receive_at = time.monotonic()
         """When the server's last bytes came."""
 

@@ -32,6 +32,7 @@ from rlservo.serve_app.server.request_checks import (
     HEADERS,
     LABEL,
     PATH,
+    REPLY_HEADERS,
     REQUEST_ID,
     RequestChecks,
     check_path,
@@ -48,7 +49,8 @@ PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and 
 TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been read
 STAMP_HEADER = STAMP.encode()
 ROOT = "/"  # a page for browsers (`status_page.py`), nothing for programs
-REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, beside the protocol's own
+
+REPLY = "rlservo.reply"  # in a connection's scope: writes (status, headers, body) at once, False where that has to wait
 
 Body = bytes | bytearray
 
@@ -78,6 +80,8 @@ class PolicyApp(FastAPI):
         self._direct: dict[str, list[PostRoute | StreamRoute]] = {"POST": [], "WEBSOCKET": []}
         self._matches: dict[tuple[str, str], DirectMatch] = {}
         self._mount: str | None = None  # the paths' prefix, which the first request that Serve brings tells
+        self.offer: Headers = ()
+        """Headers of replies that went by a proxy: where there is a way without it (`wire/direct_offer.py`)."""
 
     def add_direct(self, route: PostRoute | StreamRoute) -> None:
         """Add a route that is answered without FastAPI, which only documents it."""
@@ -87,7 +91,7 @@ class PolicyApp(FastAPI):
     def find_ahead(self, scope: Scope) -> DirectMatch | None:
         """Return the direct route of a connection that Serve has not handled yet; None is for Serve to handle."""
         mount, path = self._mount, scope["path"]
-        return None if mount is None or not path.startswith(mount) else self._find_direct(scope, path[len(mount) :])
+        return None if mount is None or not path.startswith(mount) else self.find_direct(scope, path[len(mount) :])
 
     def admit_ahead(self) -> bool:
         """Return whether such a request may be read; if not, count it as turned away."""
@@ -96,9 +100,15 @@ class PolicyApp(FastAPI):
     async def answer_ahead(self, match: DirectMatch, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer as Serve would have it answered: under its prefix, and with the request's id on the reply."""
         scope["root_path"] = self._mount
+        await self.answer_found(match, scope, receive, send, offer=self.offer)
+
+    async def answer_found(
+        self, match: DirectMatch, scope: Scope, receive: Receive, send: Send, *, offer: Headers = ()
+    ) -> None:
+        """Answer by a direct route, with the request's id and an `offer` on the reply."""
         headers = fold_headers(scope["headers"])
         request_id = headers.setdefault(REQUEST_ID, b"%s-%x" % (PROCESS, next(numbers)))
-        scope[REPLY_HEADERS] = ((REQUEST_ID, request_id),)
+        scope[REPLY_HEADERS] = ((REQUEST_ID, request_id), *offer)
         try:
             await self._answer_direct(match, headers, scope, receive, send)
         except Exception:  # a fault outside what the request path guards; Serve keeps uvicorn from logging it
@@ -111,8 +121,12 @@ class PolicyApp(FastAPI):
             await super().__call__(scope, receive, send)
             return
         self._mount = scope.get("root_path", "")
+        await self.answer(scope, receive, send)
+
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one ASGI connection under the prefix that it has."""
         path, headers = route_path(scope), fold_headers(scope["headers"])
-        match = self._find_direct(scope, path)
+        match = self.find_direct(scope, path)
         if match is not None:
             await self._answer_direct(match, headers, scope, receive, send)
             return
@@ -170,7 +184,7 @@ class PolicyApp(FastAPI):
         self._core.record_failure(request, error.code, error.message, peer=peer_of(scope))
         await _send_refusal(scope, receive, send, error)
 
-    def _find_direct(self, scope: Scope, path: str) -> DirectMatch | None:
+    def find_direct(self, scope: Scope, path: str) -> DirectMatch | None:
         """Return the direct route of a usable path below the prefix."""
         kind = scope["method"] if scope["type"] == "http" else "WEBSOCKET"
         found = self._matches.get((kind, path))
@@ -233,8 +247,28 @@ class HttpEndpoint:
             return
         length = (b"content-length", b"%d" % len(content))
         every = [length, *reply_headers, *scope.get(REPLY_HEADERS, ())]
+        reply = scope.pop(REPLY, None)
+        if reply is not None and reply(status, every, content):
+            return
         await send({"type": "http.response.start", "status": status, "headers": every})
         await send({"type": "http.response.body", "body": content})
+
+
+class WholeBody:
+    """The `receive` of a request all of which has come."""
+
+    __slots__ = ("_receive", "body")
+
+    def __init__(self, body: bytes, receive: Receive) -> None:
+        self.body: bytes | None = body
+        self._receive = receive
+
+    async def __call__(self) -> Message:
+        """Return the body, and then what else comes."""
+        body, self.body = self.body, None
+        if body is None:
+            return await self._receive()
+        return {"type": "http.request", "body": body, "more_body": False}
 
 
 async def receive_body(core: Core, headers: Mapping[bytes, bytes], receive: Receive) -> Body:
@@ -247,6 +281,10 @@ async def receive_body(core: Core, headers: Mapping[bytes, bytes], receive: Rece
     length = headers.get(b"content-length", b"")
     if length.isdigit() and len(length) < 20 and int(length) > max_bytes:
         raise too_large(max_bytes)
+    if isinstance(receive, WholeBody) and receive.body is not None:  # nothing to wait for, and so no time-out
+        if len(receive.body) > max_bytes:
+            raise too_large(max_bytes)
+        return receive.body
     admission = core.admission
     given_s = admission.begin_body(timeout_s)
     timer = _BodyTimer(given_s)

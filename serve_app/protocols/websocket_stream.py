@@ -36,7 +36,15 @@ from rlservo.serve_app.protocols.http_errors import Headers, encode_bug, error_a
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_checks import HEADERS, LABEL, REQUEST_ID, StreamKey, header_text, presented_key
+from rlservo.serve_app.server.request_checks import (
+    HEADERS,
+    LABEL,
+    REPLY_HEADERS,
+    REQUEST_ID,
+    StreamKey,
+    header_text,
+    presented_key,
+)
 from rlservo.serve_app.server.request_metrics import IDLE
 
 logger = logging.getLogger(__name__)
@@ -87,7 +95,7 @@ class StreamEndpoint:
             return
         await receive()  # websocket.connect
         try:
-            await send({"type": "websocket.accept"})
+            await send({"type": "websocket.accept", "headers": scope.get(REPLY_HEADERS, ())})
         except OSError:  # the client has gone already
             return
         try:

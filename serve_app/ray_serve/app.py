@@ -23,8 +23,9 @@ from rlservo.export.contract.errors import PartlyAppliedError, RlservoError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import InferenceService
-from rlservo.serve_app.ray_serve import ingress, ray_parts
+from rlservo.serve_app.ray_serve import direct_port, ingress, ray_parts
 from rlservo.serve_app.ray_serve.autoscaling import BUSY, Load
+from rlservo.serve_app.ray_serve.direct_server import DirectServer
 from rlservo.serve_app.ray_serve.gcs_ledger import GcsLedger
 from rlservo.serve_app.ray_serve.replica_peers import GcsRecords, ReplicaPeers
 from rlservo.serve_app.server import listing
@@ -36,6 +37,7 @@ from rlservo.serve_app.server.start_check import version_loader
 from rlservo.serve_app.versions.object_storage import place_of
 from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
+from rlservo.serve_app.wire.direct_offer import OFFER, make_offer
 from rlservo.serve_app.wire.loopback import is_loopback
 
 logger = logging.getLogger(__name__)
@@ -124,6 +126,8 @@ class PolicyServer(InferenceService):
         self._replica = context.replica_tag
         self._id = context.replica_id.deployment_id
         self._core: Core | None = None
+        self._app: PolicyApp | None = None
+        self._direct: DirectServer | None = None
         self._watch: asyncio.Task[None] | None = None
         self._poll: asyncio.Task[None] | None = None
         self._load = Load()
@@ -154,7 +158,7 @@ class PolicyServer(InferenceService):
             host=self._host,
         )
         core: Core = app.state.core
-        self._core = core
+        self._core, self._app = core, app
         core.admission.loop_clock.start()
         if self._records is not None:
             core.share_sessions(self._records, ReplicaPeers(self._id, "answer_peer", self._running))
@@ -181,8 +185,23 @@ class PolicyServer(InferenceService):
             gc.collect()
             gc.freeze()
             gc.set_threshold(700, 10, 10)  # Python's own: `lean_imports.py` raised it, and rare collections are long
+            self._listen_directly()
         else:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
+
+    def _listen_directly(self) -> None:
+        """Listen on the direct port, if there is one, and offer it. Raises RuntimeError."""
+        port, app = self._settings.direct_port, self._app
+        if port is None or app is None:
+            return
+        try:
+            listener, is_shared = direct_port.open_port(self._host, port)
+        except RlservoError as error:
+            raise _plain(error) from None
+        self._direct = DirectServer(app, listener, self._settings, is_shared=is_shared)
+        self._direct.start()
+        if (offer := make_offer(self._host, port)) is not None:
+            app.offer = ((OFFER.encode(), offer.encode()),)
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Tell Serve's autoscaler how busy this replica is, for `autoscaling.by_load`."""
@@ -211,7 +230,12 @@ class PolicyServer(InferenceService):
         return None if self._core is None else await self._core.answer_peer(method, *arguments)
 
     async def __del__(self) -> None:
-        """Hand sessions over and end the recording: Serve calls this when the replica has answered its last request."""
+        """Answer the direct port's last requests, hand sessions over and end the recording.
+
+        Serve calls this when the replica has answered its last request of Serve's.
+        """
+        if (direct := getattr(self, "_direct", None)) is not None:
+            await direct.drain()
         core = getattr(self, "_core", None)
         if core is not None and core.shared_sessions is not None:
             await core.shared_sessions.hand_over()

@@ -7,9 +7,14 @@ uvicorn (0.54) bounds one phase of a connection, the idle time after a reply. Fo
 - for a client that does not read its reply, also after the connection has been closed;
 - for nothing: `Upgrade: websocket` with a body is handed to the WebSocket protocol without that body.
 
+And it takes a head of any size.
+
 Of a WebSocket it takes whatever comes: 16 KB that unpack to 16 MB, again and again; as many frames at once as fit a
 read, which the application then answers one after the other while the event loop stands still; pings whose answers
 nobody reads.
+
+A request for an action that came whole is answered at once where nothing has to wait (`eager_start.py`), in the turn of
+the event loop that reads it, and its reply is written in one piece.
 
 `install` puts subclasses in place of the classes that uvicorn chooses, in each of Serve's processes that serves HTTP
 (`ingress.py`). One timer a connection checks its phase; a request costs two assignments. In front of the replicas
@@ -19,22 +24,28 @@ HAProxy has time-outs of its own (`haproxy/configuration.py`).
 from __future__ import annotations
 
 import asyncio
+import functools
 import socket
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import uvicorn
 from uvicorn.protocols.http import auto
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites
+from rlservo.serve_app.protocols.http_endpoint import REPLY, WholeBody
+from rlservo.serve_app.ray_serve import eager_start
+from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
 
 if TYPE_CHECKING:
-    from starlette.types import Message, Receive, Scope, Send
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
     from websockets.frames import Frame
 
 HEAD_S = 5.0
 """[s] for a request's head, from the connection's begin or the head's first byte on."""
+MAX_HEAD_BYTES = 16384
+"""Of a request's head, as in HAProxy's buffer."""
 BODY_S = 30.0
 """[s] for a body, where a route has no shorter time of its own (`body_timeout_s`)."""
 LINGER_S = 1.0
@@ -60,6 +71,11 @@ NO_UPGRADE = (
     b'{"error":"the header Upgrade is understood for a WebSocket alone, which begins with a GET without a body: '
     b'leave it out","code":"bad-request"}'
 )
+HEAD_TOO_LARGE = b'{"error":"the request\'s headers are larger than %d bytes","code":"bad-request"}' % MAX_HEAD_BYTES
+LARGE_REPLY = (
+    b"HTTP/1.1 431 Request Header Fields Too Large\r\ncontent-type: application/json\r\nconnection: close\r\n"
+    b"content-length: %d\r\n\r\n%s" % (len(HEAD_TOO_LARGE), HEAD_TOO_LARGE)
+)
 # What the subclass overrides or reads of uvicorn's private parts.
 PRIVATE = ("_should_upgrade", "_start_asgi_task", "_unset_keepalive_if_required", "handle_websocket_upgrade")
 PRIVATE_OF_STREAMS = ("handle_cont", "handle_ping", "handle_pong")
@@ -72,6 +88,11 @@ class TimedProtocol(HttpToolsProtocol):
     _body_since = 0.0  # since when the request's body is awaited
     _timer: asyncio.TimerHandle | None = None
     _replies: JoinedWrites
+    _unread = 0  # bytes that came since the last request was complete, so at least those of the head that is read
+    _refuse: ASGIApp | None = None  # answers the next request instead of the application, and ends the connection
+    _on_lost: Callable[[], None] | None = None
+    _is_first = False  # of the requests that are being read: those after it let other connections have their turn
+    _awaited: tuple[Any, Any, ASGIApp] | None = None  # cycle, its application, what answers it at once when it is whole
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first head."""
@@ -88,11 +109,27 @@ class TimedProtocol(HttpToolsProtocol):
         """Stop the timer."""
         self._stop()
         super().connection_lost(exc)
+        if self._on_lost is not None:
+            self._on_lost()
+
+    def data_received(self, data: bytes) -> None:
+        """Read what has come; of a head, not more than may be."""
+        self._unread += len(data)
+        self._is_first = True
+        super().data_received(data)
+        self._is_first = False
+        if self._awaited is not None:  # more of it is to come
+            cycle, app, _ = self._awaited
+            self._awaited = None
+            super()._start_asgi_task(cycle, app)
+        if self._unread > MAX_HEAD_BYTES and self._head_since is not None and not self.transport.is_closing():
+            self.transport.write(LARGE_REPLY)
+            self.transport.close()
 
     def handle_websocket_upgrade(self) -> None:
         """Leave the connection to the WebSocket protocol, which sends pings."""
         self._stop()
-        self.ws_protocol_class = BoundedStream
+        self.ws_protocol_class = functools.partial(BoundedStream, on_lost=self._on_lost)  # type: ignore[assignment]
         # A robot's numbers hardly compress, and what unpacks to a thousand times its size is nobody's observation.
         self.config.ws_per_message_deflate = False
         super().handle_websocket_upgrade()
@@ -105,7 +142,18 @@ class TimedProtocol(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         """Begin to wait for the body."""
         self._body_since, self._head_since = self._head_since or 0.0, None
+        if self._unread > MAX_HEAD_BYTES:
+            size = len(self.url) + sum(len(name) + len(value) for name, value in self.headers)
+            if size > MAX_HEAD_BYTES:
+                self._refuse = refusal(431, HEAD_TOO_LARGE)
         super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """Begin to count the next head."""
+        self._unread = 0
+        super().on_message_complete()
+        if self._awaited is not None:
+            self._answer(*self._awaited)
 
     def on_response_complete(self) -> None:
         """Give a client that is still sending a moment to take its reply, and close."""
@@ -122,7 +170,7 @@ class TimedProtocol(HttpToolsProtocol):
             self.loop.call_later(LINGER_S, self.transport.close)
 
     def _should_upgrade(self) -> bool:
-        return super()._should_upgrade() and not _has_body(self.scope)
+        return super()._should_upgrade() and not _has_body(self.scope) and self._refuse is None
 
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
         # The parser has stopped at this head: a body is lost, and so is the next request.
@@ -130,11 +178,57 @@ class TimedProtocol(HttpToolsProtocol):
         if parser.should_upgrade() and any(name == b"upgrade" for name, _ in cycle.scope["headers"]):
             cycle.keep_alive = False
             if _has_body(cycle.scope):
-                app = _refuse_upgrade
+                app = refusal(400, NO_UPGRADE)
+        if self._refuse is not None:
+            cycle.keep_alive = False
+            app = self._refuse
         if cycle.scope["method"] == "POST":  # of a HEAD there would be no body for its head to wait for
             self._replies.head = None
             cycle.transport = self._replies
+            at_once = None
+            if cycle.more_body and self._is_first and app is self.app:
+                at_once = self.find_immediate(cycle.scope)
+            if at_once is not None:
+                self._awaited = (cycle, app, at_once)
+                return
         super()._start_asgi_task(cycle, app)
+
+    def find_immediate(self, _scope: Scope) -> ASGIApp | None:
+        """Return what answers a request without the application's middleware, if anything does."""
+        return None
+
+    def _answer(self, cycle: Any, _app: Any, at_once: ASGIApp) -> None:
+        self._awaited, self._is_first = None, False
+        body = bytes(cycle.body)
+
+        def answer(scope: Scope, receive: Receive, send: Send) -> Any:
+            return at_once(scope, WholeBody(body, receive), send)
+
+        # The cycle leads to its scope, and this back: left there, every request would be for the garbage collector.
+        cycle.scope[REPLY] = functools.partial(self._reply, cycle)
+        task = eager_start.start(cycle.run_asgi(answer), self.loop)
+        if task is None:
+            cycle.scope.pop(REPLY, None)
+        else:
+            self.tasks.add(task)
+            task.add_done_callback(self.tasks.discard)
+
+    def _reply(self, cycle: Any, status: int, headers: Any, body: bytes) -> bool:
+        """Write a whole reply; return False where that has to wait, since the client does not read."""
+        if cycle.disconnected or cycle.response_started or cycle.flow.write_paused:
+            return bool(cycle.disconnected)
+        pieces = [STATUS_LINE[status]]
+        for name, value in (*cycle.default_headers, *headers):
+            pieces += (name, b": ", value, b"\r\n")
+        pieces += (b"\r\n" if cycle.keep_alive else b"connection: close\r\n\r\n", body)
+        cycle.response_started = cycle.response_complete = True
+        turn.write(self.transport, b"".join(pieces))
+        cycle.message_event.set()
+        if not cycle.keep_alive:
+            turn.flush()
+            self.transport.close()
+        cycle.on_response()
+        return True
 
     def _check_phase(self) -> None:
         if self.transport.is_closing():
@@ -166,6 +260,17 @@ class BoundedStream(WebSocketsSansIOProtocol):
 
     _since = float("-inf")  # when the second began in which `_empty` counts
     _empty = 0
+
+    def __init__(self, *arguments: Any, on_lost: Callable[[], None] | None = None, **more: Any) -> None:
+        """Call `on_lost` when the connection has ended."""
+        super().__init__(*arguments, **more)
+        self._on_lost = on_lost
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Say so."""
+        super().connection_lost(exc)
+        if self._on_lost is not None:
+            self._on_lost()
 
     def data_received(self, data: bytes) -> None:
         """Read what has come, piece by piece, until it is too much."""
@@ -229,10 +334,15 @@ def _has_body(scope: Any) -> bool:
     )
 
 
-async def _refuse_upgrade(_scope: Scope, _receive: Receive, send: Send) -> None:
-    headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(NO_UPGRADE))]
-    await send({"type": "http.response.start", "status": 400, "headers": headers})
-    await send({"type": "http.response.body", "body": NO_UPGRADE})
+def refusal(status: int, body: bytes, *more: tuple[bytes, bytes]) -> ASGIApp:
+    """Return an application that answers every request so, in JSON; `more` are further headers."""
+    headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(body)), *more]
+
+    async def refuse(_scope: Scope, _receive: Receive, send: Send) -> None:
+        await send({"type": "http.response.start", "status": status, "headers": headers})
+        await send({"type": "http.response.body", "body": body})
+
+    return refuse
 
 
 def install() -> None:

@@ -93,8 +93,7 @@ class Ingress:
         if found is not None:
             app, match = found
             if http and not app.admit_ahead():
-                await send({"type": "http.response.start", "status": 503, "headers": list(TURNED_AWAY)})
-                await send({"type": "http.response.body", "body": FULL})
+                await turn_away(send)
                 return
             if bypass.answers:
                 await app.answer_ahead(match, scope, receive, send)
@@ -108,6 +107,12 @@ class Ingress:
             headers = [*headers, NO_WATCH]
         scope["headers"] = headers
         await self._app(scope, receive, send)
+
+
+async def turn_away(send: Send) -> None:
+    """Answer a request that nothing is read of."""
+    await send({"type": "http.response.start", "status": 503, "headers": list(TURNED_AWAY)})
+    await send({"type": "http.response.body", "body": FULL})
 
 
 def middlewares() -> list[Middleware]:

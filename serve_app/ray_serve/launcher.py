@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.contract.errors import UnavailableError, UsageError
-from rlservo.serve_app.ray_serve import loopback_ports
+from rlservo.serve_app.ray_serve import direct_port, loopback_ports
 from rlservo.serve_app.ray_serve.environment import ray_environment
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
 from rlservo.serve_app.ray_serve.processes import check_port, describe_end, end_marked, remove_folder
@@ -46,6 +46,7 @@ ENDED_S = 5.0  # from the end of a process's reports to its own
 MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
+DIRECT_SOCKET = "d.sock"
 STOP, STOP_NOW = "stop", "stop now"
 
 
@@ -57,6 +58,7 @@ class RunningServer:
     policies: tuple[tuple[str, str], ...]  # (name, default version)
     haproxy: bool
     grpc: str | None = None  # host:port, if gRPC is served
+    direct: str | None = None  # address of the replicas themselves, if they have one
     admin_key_file: Path | None = None  # the operator's key, for as long as the server runs
 
 
@@ -99,6 +101,10 @@ def serve_policies(
     check_port(host, port)
     if grpc_port is not None:
         check_port(host, grpc_port)
+    if chosen.direct_port is not None:
+        check_port(host, chosen.direct_port)
+        if chosen.direct_port in (port, grpc_port):
+            raise UsageError(f"port {chosen.direct_port} is given twice: the direct port is one of its own")
     keys = check_exposure(host, chosen)
     if not keys.keys and not is_loopback(host):
         logger.warning("listening on %s without authentication: whoever reaches this port can ask for actions", host)
@@ -116,6 +122,7 @@ def serve_policies(
         _signals(events),
         _stop_event(stop, events),
         _folder() as folder,
+        _held_port(host, chosen.direct_port, folder),
         _child(
             {
                 "policies": paths,
@@ -136,7 +143,9 @@ def serve_policies(
         if on_ready is not None:
             grpc = None if grpc_port is None else f"{_shown_host(host)}:{grpc_port}"
             key_file = admin_key_file if digest else None
-            on_ready(RunningServer(f"http://{_shown_host(host)}:{port}", policies, haproxy is not None, grpc, key_file))
+            url = f"http://{_shown_host(host)}"
+            direct = None if chosen.direct_port is None else f"{url}:{chosen.direct_port}"
+            on_ready(RunningServer(f"{url}:{port}", policies, haproxy is not None, grpc, direct, key_file))
         event = _wait_event(events)
         if isinstance(event, Mapping):
             cause = event.get("died") or _cause_of_end(child, folder)
@@ -228,6 +237,10 @@ def _folder() -> Iterator[Path]:
         remove_folder(folder)
 
 
+def _held_port(host: str, port: int | None, folder: Path) -> contextlib.AbstractContextManager[None]:
+    return contextlib.nullcontext() if port is None else direct_port.hold_port(host, port, folder / DIRECT_SOCKET)
+
+
 @contextlib.contextmanager
 def _child(
     plan: Mapping[str, Any], folder: Path, haproxy: str | None, events: queue.SimpleQueue[Any]
@@ -240,6 +253,8 @@ def _child(
     )
     if haproxy is None and not is_loopback(plan["host"]):
         environment[loopback_ports.VARIABLE] = loopback_ports.INNER
+    if settings["direct_port"] is not None:
+        environment[direct_port.VARIABLE] = str(folder / DIRECT_SOCKET)
     # The proxy is no part of the application, which is given its settings.
     for name in ("stream_idle_s", "max_connections_per_address"):
         environment[PREFIX + name.upper()] = str(settings[name])

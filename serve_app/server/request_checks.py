@@ -41,6 +41,7 @@ HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
 LABEL = b"x-session-id"  # whose request it is, where a canary runs; Ray Serve's own routing knows the header, too
 HEADERS = "rlservo.headers"  # in a connection's scope: what `fold_headers` gave
+REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, beside the protocol's own
 ANY_HOST = "*"
 
 

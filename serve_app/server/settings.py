@@ -55,8 +55,13 @@ class ServerSettings(BaseModel):
     """Streams (WebSocket, gRPC) that may be open at once, per replica."""
 
     max_connections_per_address: int = Field(1024, ge=0)
-    """Connections that one client address may have to HAProxy; further ones are answered 429, many more are closed at
-    once. Ray's HAProxy takes 4096 altogether. 0: no bound, for a server that has another proxy before it."""
+    """Connections that one client address may have to HAProxy, and to each replica's direct port; further ones are
+    answered 429, many more are closed at once. Each takes 4096 altogether. 0: no bound, for a server that has another
+    proxy before it."""
+
+    direct_port: int | None = Field(None, ge=1, le=65535)
+    """A port on which the replicas of a machine listen themselves, without HAProxy before them: a shorter way, which
+    our clients on this machine find and use. `rlservo serve --direct-port` sets it, too."""
 
     stream_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
     """[s] A stream (WebSocket, gRPC) whose client says nothing for so long is closed."""

@@ -10,17 +10,21 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import grpc
 import numpy as np
+import psutil
 import pytest
 
+from rlservo.export.contract.errors import LateError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.ray_serve.processes import free_ports, port_holder
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from servers import Run, launched
@@ -43,13 +47,19 @@ def key_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def server(policies: Path, recurrent: Path, key_file: Path) -> Iterator[Run]:
+def direct_port() -> int:
+    return free_ports(1)[0]
+
+
+@pytest.fixture(scope="module")
+def server(policies: Path, recurrent: Path, key_file: Path, direct_port: int) -> Iterator[Run]:
     """A server of two replicas; SIGKILL ends its launcher, and nothing is left then."""
-    settings = {"api_keys_file": str(key_file)}
+    settings = {"api_keys_file": str(key_file), "direct_port": direct_port}
     with launched(policies, recurrent, replicas=2, with_grpc=True, settings=settings) as run:
         run.wait_until_ready()
         yield run
         run.end(signal.SIGKILL)
+    assert port_holder(direct_port) is None
 
 
 def status(port: int, key: str) -> int:
@@ -169,3 +179,48 @@ def test_sessions_of_a_killed_replica_are_lost_and_the_others_go_on(
     for session_id in lost:  # whoever comes after the dead one has nothing of it
         assert ask(server.port, SEEN[2], session_id)[0] == 410
         assert ask(server.port, SEEN[0], session_id, reset=True)[0] == 200
+
+
+def test_over_the_direct_port_a_killed_replica_costs_our_clients_nothing(
+    server: Run, direct_port: int, policies: Path, key_file: Path
+) -> None:
+    key_file.write_text(OLD_LINE + "\n")
+    wait_until_followed(direct_port, {OLD: 200, NEW: 401})
+    with Policy.load(policies / "ur5" / "10") as local:
+        expected = local.act(OBS)
+
+    def connections(replica: int) -> int:
+        found = psutil.Process(replica).net_connections("tcp")
+        return sum(each.laddr.port == direct_port and each.status == psutil.CONN_ESTABLISHED for each in found)
+
+    stop, url = threading.Event(), f"http://127.0.0.1:{server.port}"
+    clients = [kind(url, "ur5", api_key=OLD, deadline_ms=30e3) for kind in (PolicyClient, StreamClient) * 3]
+    asked = [0] * len(clients)
+
+    def drive(number: int) -> None:
+        with clients[number] as policy:
+            while not stop.is_set():
+                with contextlib.suppress(LateError):  # on a busy machine a replica may stand still for a second
+                    np.testing.assert_allclose(policy.act(OBS), expected, rtol=1e-4, atol=1e-5)
+                    asked[number] += policy.is_direct
+
+    def wait_for(more: int) -> None:
+        until, deadline = [count + more for count in asked], time.monotonic() + 120
+        while any(count < least for count, least in zip(asked, until, strict=True)):
+            assert time.monotonic() < deadline, asked
+            for each in driven:
+                if each.done():
+                    each.result()
+            time.sleep(0.02)
+
+    with ThreadPoolExecutor(len(clients)) as pool:
+        driven = [pool.submit(drive, number) for number in range(len(clients))]
+        try:
+            wait_for(30)
+            os.kill(max(server.processes("ServeReplica"), key=connections), signal.SIGKILL)
+            wait_for(30)
+        finally:
+            stop.set()
+        for each in driven:
+            each.result(60)
+    assert sum(client.reconnects for client in clients) > 0  # of those that were the killed one's

@@ -1,0 +1,50 @@
+"""The least that serves a policy over HTTP: a bare ASGI application on uvicorn, orjson, onnxruntime. Checks nothing.
+
+    python benchmarks/peers/bare_asgi.py PORT POLICY.onnx
+
+The WebSocket takes an observation's bytes and gives an action's.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import orjson
+import uvicorn
+
+
+def build(onnx_file: str) -> Any:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(onnx_file, options, providers=["CPUExecutionProvider"])
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.accept"})
+            while (message := await receive())["type"] == "websocket.receive":
+                obs = np.frombuffer(message["bytes"], np.float32)[None]
+                streamed: Any = session.run(["action"], {"obs": obs})
+                await send({"type": "websocket.send", "bytes": streamed[0].tobytes()})
+            return
+        body, more = b"", True
+        while more:
+            message = await receive()
+            body += message.get("body", b"")
+            more = message.get("more_body", False)
+        obs = np.asarray(orjson.loads(body)["obs"], np.float32)[None]
+        outputs: Any = session.run(["action"], {"obs": obs})
+        content = orjson.dumps({"action": outputs[0][0]}, option=orjson.OPT_SERIALIZE_NUMPY)
+        headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(content))]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": content})
+
+    return app
+
+
+if __name__ == "__main__":
+    app = build(sys.argv[2])
+    uvicorn.run(app, host="127.0.0.1", port=int(sys.argv[1]), log_level="warning", access_log=False, lifespan="off")
