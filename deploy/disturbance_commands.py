@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from rlservo.deploy import terminal
 from rlservo.deploy.terminal import needs_extra, note
-from rlservo.export.contract.bundle import load_bundle, write_contract
 from rlservo.export.contract.errors import UsageError
 
 if TYPE_CHECKING:
@@ -41,6 +40,7 @@ def measure(
     if seed < 0:
         raise UsageError(f"--seed is {seed}: expected 0 or more")
     with needs_extra("sim"):
+        from rlservo.export.contract.bundle import load_bundle, write_contract
         from rlservo.serve_app.rollout.disturbance_table import (
             check_plot,
             evaluations_of,

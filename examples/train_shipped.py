@@ -183,15 +183,16 @@ class Beginning:
         the network's weights on it mean nothing, and shake it as soon as the element moves. A forgotten one begins
         with weights of 0 and a spread of 1. Raises ValueError for an element that the environment does not have.
         """
-        learners, runners, runner = algorithm.learner_group, algorithm.env_runner_group, algorithm.env_runner
-        assert learners is not None and runners is not None and runner is not None
+        learners, runners = algorithm.learner_group, algorithm.env_runner_group
+        assert learners is not None and runners is not None
+        runner: Any = algorithm.env_runner  # its pipeline has no public name, and EnvRunner does not declare it
         root = self.checkpoint.resolve()
         learners.restore_from_path(str(root / MODULE), component=MODULE.removeprefix("learner_group/"))
         runner.restore_from_path(str(root / "env_runner" / FILTER), component=FILTER)
         if self.forgotten:
             columns, count = _columns(settings, self.forgotten)
             learners.foreach_learner(lambda learner, *_: _forget(learner, columns, count))
-            for connector in runner._env_to_module:  # RLlib has no public way to the pipeline of a runner
+            for connector in runner._env_to_module:
                 if isinstance(connector, MeanStdFilter):
                     connector.set_state(_with_spread_of_one(connector.get_state(), columns))
         runners.sync_weights(from_worker_or_learner_group=learners, inference_only=True)

@@ -9,11 +9,13 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import pickle
 import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -170,12 +172,27 @@ def test_checkpoints_are_judged_as_the_cards_do_where_the_settings_ask_for_it(tr
     assert (run / "checkpoint" / "rllib_checkpoint.json").exists()
 
 
+def test_training_begins_with_another_network_without_the_elements_it_shall_forget(trained: Any) -> None:
+    done = trained("begun").ended
+    assert done.code == 0, done.out + done.err
+    weights = "learner_group/learner/rl_module/default_policy/module_state.pkl"
+    run = trained("begun").folder / "runs" / "ur5_positioning" / "checkpoint"
+    before, after = (pickle.loads((root / weights).read_bytes()) for root in (SHIPPED / "ur5_positioning", run))
+    wrist_3_velocity = 14
+    for name in ("encoder.actor_encoder.net.mlp.0.weight", "encoder.critic_encoder.net.mlp.0.weight"):
+        assert np.abs(before[name][:, wrist_3_velocity]).max() > 0.05
+        assert np.abs(after[name][:, wrist_3_velocity]).max() < 0.01  # four steps of the optimizer
+        others = np.arange(27) != wrist_3_velocity
+        assert np.abs(after[name] - before[name])[:, others].max() < 0.01
+
+
 @pytest.mark.parametrize(
     ("script", "arguments", "sentence"),
     [
         ("train_shipped.py", ("nobody",), "invalid choice: 'nobody'"),
         ("train_shipped.py", ("cartpole_dqn", "--set", "stop.env_step=1"), "expected KEY=VALUE with a key that"),
         ("train_shipped.py", ("cartpole_dqn", "--set", "stop"), "expected KEY=VALUE with a key that"),
+        ("train_shipped.py", ("cartpole_dqn", "--forget", "x"), "--forget goes with --start-from"),
         ("evaluate_shipped.py", ("nobody",), "no policy 'nobody' ships: expected some of cartpole_dqn"),
         ("evaluate_shipped.py", ("--episodes", "1"), "--episodes is 1 and --seed 20000: expected at least 2 and 0"),
         ("evaluate_shipped.py", ("--checkpoint", "x"), "--checkpoint goes with one NAME and without --write"),
