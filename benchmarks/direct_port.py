@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import secrets
+import signal
 import statistics
 import subprocess
 import sys
@@ -38,6 +39,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="of each turn of a paced load; of wrk, 2")
     parser.add_argument("--bundle", type=Path, help="default: the shipped UR5 checkpoint's, exported first")
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the servers are ended then, too
     with ExitStack() as cleanup:
         folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="rlsb-", ignore_cleanup_errors=True)))
         case = case_of(arguments.bundle or export(folder), UR5)
