@@ -22,7 +22,7 @@ class GcsLedger:
 
     def __init__(self, serve_instance: str, application: str, deployment: str) -> None:
         """A Serve instance that is shut down takes its ledger's name along: the next one starts from its file."""
-        self._prefix = f"{serve_instance}/{application}/{deployment}/"
+        self._prefix = f"{serve_instance}/{application}/{deployment}/plan/"  # beside `session/` (replica_peers.py)
 
     def newest(self) -> int:
         """Return the highest number, 0 when there is none."""

@@ -97,6 +97,25 @@ def ask(port: int, obs: np.ndarray, session_id: str, **more: bool) -> tuple[int,
     return ask(port, obs, session_id, **more) if reply.status == 503 else (reply.status, content)
 
 
+def serving(server: Run, direct_port: int, status: str = psutil.CONN_LISTEN) -> dict[int, int]:
+    """Return by the replicas' process ids how many sockets of the direct port they have: it opens when they are up."""
+    found = {}
+    for pid in server.processes("ServeReplica"):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            sockets = psutil.Process(pid).net_connections("tcp")
+            found[pid] = sum(each.laddr.port == direct_port and each.status == status for each in sockets)
+    return {pid: count for pid, count in found.items() if count}
+
+
+def wait_for_two(server: Run, direct_port: int) -> list[int]:
+    """Wait until two replicas serve; return their process ids."""
+    deadline = time.monotonic() + 120
+    while len(found := serving(server, direct_port)) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    return list(found)
+
+
 def test_states_streams_and_ids_keep_an_episode(server: Run, recurrent: Path, key_file: Path) -> None:
     key_file.write_text(OLD_LINE + "\n")
     wait_until_followed(server.port, {OLD: 200})
@@ -152,7 +171,7 @@ def test_both_follow_the_file_of_keys_and_end_grpc_streams(server: Run, key_file
 
 
 def test_sessions_of_a_killed_replica_are_lost_and_the_others_go_on(
-    server: Run, recurrent: Path, key_file: Path
+    server: Run, recurrent: Path, key_file: Path, direct_port: int
 ) -> None:
     key_file.write_text(OLD_LINE + "\n")
     wait_until_followed(server.port, {OLD: 200})
@@ -162,7 +181,7 @@ def test_sessions_of_a_killed_replica_are_lost_and_the_others_go_on(
     for step in range(2):
         for session_id in ids:
             assert ask(server.port, SEEN[step], session_id, reset=step == 0)[0] == 200
-    before = server.processes("ServeReplica")
+    before = wait_for_two(server, direct_port)
     os.kill(before[0], signal.SIGKILL)
     wait_until_followed(server.port, {OLD: 200})  # HAProxy has heard of it
     replies = [ask(server.port, SEEN[2], session_id) for session_id in ids]
@@ -172,10 +191,7 @@ def test_sessions_of_a_killed_replica_are_lost_and_the_others_go_on(
         assert code in (200, 410), reply
         if code == 200:
             np.testing.assert_allclose(reply["action"], expected[2], rtol=1e-4, atol=1e-5)
-    deadline = time.monotonic() + 120
-    while len(set(server.processes("ServeReplica")) - {before[0]}) < 2:
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    assert before[0] not in wait_for_two(server, direct_port)
     for session_id in lost:  # whoever comes after the dead one has nothing of it
         assert ask(server.port, SEEN[2], session_id)[0] == 410
         assert ask(server.port, SEEN[0], session_id, reset=True)[0] == 200
@@ -189,10 +205,7 @@ def test_over_the_direct_port_our_clients_go_on_when_a_replica_is_killed(
     with Policy.load(policies / "ur5" / "10") as local:
         expected = local.act(OBS)
 
-    def connections(replica: int) -> int:
-        found = psutil.Process(replica).net_connections("tcp")
-        return sum(each.laddr.port == direct_port and each.status == psutil.CONN_ESTABLISHED for each in found)
-
+    wait_for_two(server, direct_port)
     stop, url = threading.Event(), f"http://127.0.0.1:{server.port}"
     clients = [PolicyClient(url, "ur5", api_key=OLD, deadline_ms=30e3) for _ in range(6)]
     asked, direct = [0] * len(clients), [0] * len(clients)
@@ -220,9 +233,8 @@ def test_over_the_direct_port_our_clients_go_on_when_a_replica_is_killed(
         try:
             wait_for(30)
             assert all(direct), direct
-            killed = max(server.processes("ServeReplica"), key=connections)
-            assert connections(killed) > 0
-            os.kill(killed, signal.SIGKILL)
+            connections = serving(server, direct_port, psutil.CONN_ESTABLISHED)
+            os.kill(max(connections, key=lambda pid: connections[pid]), signal.SIGKILL)
             wait_for(30)
         finally:
             stop.set()
