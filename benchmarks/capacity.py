@@ -1,4 +1,4 @@
-"""How far a server goes: CPU per decision by protocol, memory per policy, session and stream, start-up, size of a plan.
+"""Capacity of a server: CPU per decision by protocol, memory per policy, session and stream, start-up, size of a plan.
 
     python benchmarks/capacity.py POLICY_FOLDER [--recurrent POLICY_FOLDER] [--policies 1000] [--seconds 4]
 

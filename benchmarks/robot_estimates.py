@@ -131,6 +131,8 @@ def main() -> None:
                 )
                 for estimate in estimated:
                     candidate.count(estimate)
+            if (repetition + 1) % 10 == 0:
+                print(f"{repetition + 1} of {arguments.repetitions} repetitions estimated", flush=True)
     report(candidates, arguments.repetitions, arguments.episodes)
 
 

@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rlservo.serve_app.ray_serve import lean_imports, ray_parts
+from rlservo.serve_app.ray_serve import ray_parts
 from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, free_ports, remove_folder
 from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, cut_log, error_line
 from rlservo.serve_app.server.admin_key import remove_key
@@ -40,6 +40,8 @@ def main() -> int:
     started = threading.Event()
     threading.Thread(target=_watch_input, args=(stop, started, plan), daemon=True).start()
     try:
+        from rlservo.serve_app.ray_serve import lean_imports  # here: who imports this module keeps its pandas
+
         ray_parts.check()
         import ray
         from ray import serve

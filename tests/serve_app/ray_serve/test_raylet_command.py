@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
 from rlservo.serve_app.ray_serve.cluster_process import without_agent
@@ -37,3 +40,11 @@ def test_port_that_was_given_stays() -> None:
 def test_other_command_ends_the_start() -> None:
     with pytest.raises(RuntimeError, match="starts its raylet with 0 of --runtime_env_agent_port"):
         without_agent([word for word in COMMAND if not word.startswith("--runtime_env_agent_port")])
+
+
+def test_importing_the_module_leaves_pandas_alone() -> None:
+    code = (
+        "import sys; from rlservo.serve_app.ray_serve import cluster_process; "
+        "assert sys.modules.get('pandas', '') is not None"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
