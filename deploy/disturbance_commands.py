@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,6 +39,7 @@ def measure(
     if seed < 0:
         raise UsageError(f"--seed is {seed}: expected 0 or more")
     with needs_extra("sim"):
+        from rlservo.envs.randomization import wrapped_env
         from rlservo.export.contract.bundle import load_bundle, write_contract
         from rlservo.serve_app.rollout.disturbance_table import (
             check_plot,
@@ -52,8 +52,8 @@ def measure(
     if plot is not None:
         check_plot(plot)
     loaded = load_bundle(bundle)
-    trained_with = loaded.contract.provenance.env_config
-    arguments = {**_without_disturbances(trained_with), **env_arguments}
+    trained = loaded.contract.provenance
+    arguments = {**wrapped_env(trained.env_id or "", trained.env_config)[1], **env_arguments}
     with Policy.load(bundle) as policy:
         table = measure_disturbances(
             policy,
@@ -83,13 +83,3 @@ def show(table: DisturbanceTable) -> None:
 
     console = terminal.output()
     console.print(render_table(table), width=max(console.width, WIDTH), soft_wrap=True)
-
-
-def _without_disturbances(env_config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of the environment that `rlservo/Randomized-v0` wrapped."""
-    if "env_id" not in env_config:
-        return dict(env_config)
-    from rlservo.envs.randomization import make_randomized
-
-    own = inspect.signature(make_randomized).parameters
-    return {name: value for name, value in env_config.items() if name not in own}

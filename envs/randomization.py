@@ -7,7 +7,9 @@ environment of this package or one with the methods in `disturbances.py`.
 from __future__ import annotations
 
 import copy
+import inspect
 import math
+import pkgutil
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -31,6 +33,7 @@ Array = NDArray[np.float32]
 Vector = NDArray[np.float64]
 ByElement = float | Sequence[float] | Mapping[str, float] | str
 
+RANDOMIZED = "rlservo/Randomized-v0"
 REAL = "real"
 # Random streams of their own, so that asking for one disturbance changes no other's draws; only append.
 STREAMS = ("model", "base", "extreme", "bias", "stuck", "drop", "late")
@@ -346,6 +349,25 @@ def make_randomized(
         base_offset=base_offset,
         extreme=extreme,
     )
+
+
+def wrapped_env(env_id: str, env_config: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return id and arguments of an environment without the disturbances that `rlservo/Randomized-v0` adds to it."""
+    if env_id != RANDOMIZED or "env_id" not in env_config:
+        return env_id, dict(env_config)
+    own = inspect.signature(make_randomized).parameters
+    return env_config["env_id"], {name: value for name, value in env_config.items() if name not in own}
+
+
+def _describe(**env_config: Any) -> Any:
+    """Name the elements of the environment that is wrapped."""
+    entry_point = gym.spec(env_config["env_id"]).entry_point
+    made_by = pkgutil.resolve_name(entry_point) if isinstance(entry_point, str) else entry_point
+    describe = getattr(made_by, "describe", None)
+    return describe(**wrapped_env(RANDOMIZED, env_config)[1]) if describe else {}
+
+
+make_randomized.describe = _describe  # type: ignore[attr-defined]  # where `rlservo export` looks for names and units
 
 
 def _range(name: str, value: Range) -> Range:

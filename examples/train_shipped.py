@@ -325,11 +325,6 @@ def main() -> None:
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
         help="change a setting of training.yaml for this run, say stop.env_steps=20000 or model.use_lstm=false",
     )  # fmt: skip
-    parser.add_argument("--start-from", type=Path, metavar="CHECKPOINT", help="begin with this checkpoint's network")
-    parser.add_argument(
-        "--forget", action="append", default=[], metavar="ELEMENT",
-        help="with --start-from: let the network begin without this observed element, which never moved before",
-    )  # fmt: skip
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for checkpoint and curve")
     parser.add_argument("--install", action="store_true", help="replace the shipped checkpoint and curve by this run's")
     args = parser.parse_args()
@@ -339,9 +334,8 @@ def main() -> None:
             change_setting(settings, change)
         except ValueError as error:
             parser.error(f"--set {change}: {error}")
-    if args.forget and args.start_from is None:
-        parser.error("--forget goes with --start-from")
-    beginning = None if args.start_from is None else Beginning(args.start_from, tuple(args.forget))
+    begin = settings.get("begin")  # {with: the name of a policy that ships, forget: [observed elements]}
+    beginning = None if begin is None else Beginning(SHIPPED / begin["with"], tuple(begin.get("forget", ())))
     seed = settings["seed"] if args.seed is None else args.seed
     folder = args.storage / args.name
     folder.mkdir(parents=True, exist_ok=True)

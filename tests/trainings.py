@@ -66,13 +66,10 @@ IN_ONE_RAY = {
         "stop.env_steps=5000", "stop.episodes=3", "validation.above=0", "validation.episodes=2",
         "training.train_batch_size_per_learner=2048", "training.num_epochs=1",
     ),
-    "begun": (
-        *_again(
-            "ur5_positioning",
-            "stop.env_steps=500", "envs=4", "training.train_batch_size_per_learner=512", "training.minibatch_size=128",
-            "training.num_epochs=1",
-        ),
-        "--start-from", str(EXAMPLES / "checkpoints" / "ur5_positioning"), "--forget", "wrist_3_velocity",
+    "begun": _again(
+        "ur5_positioning_disturbed",
+        "stop.env_steps=500", "envs=4", "training.train_batch_size_per_learner=512", "training.minibatch_size=128",
+        "training.num_epochs=1",
     ),
     "edges": (str(HERE / "examples" / "train_edges.py"),),
     "benchmark": (str(HERE / "benchmarks" / "measure_training.py"),),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.envs.checks import InvalidResetError
-from rlservo.envs.randomization import DomainRandomization
+from rlservo.envs.randomization import DomainRandomization, wrapped_env
 from rlservo.envs.registration import NAMESPACE
 from rlservo.envs.rendering import RenderedEnv, Start
 from rlservo.envs.shapes import Poses, body_poses, moving_bodies
@@ -122,8 +122,9 @@ class Stage:
 
 
 def home_of(contract: Contract) -> str:
-    """Return the environment that a policy was trained in. Raises UsageError where it is none of ours."""
-    env_id = contract.provenance.env_id
+    """Return the environment that a policy was trained in, undisturbed. Raises UsageError where it is none of ours."""
+    trained = contract.provenance
+    env_id = trained.env_id and wrapped_env(trained.env_id, trained.env_config)[0]
     if env_id is None or not env_id.startswith(f"{NAMESPACE}/"):
         raise UsageError(
             f"policy '{contract.name}' was trained in {env_id or 'an environment it does not name'}, which the cockpit "

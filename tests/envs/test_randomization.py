@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rlservo.envs.randomization import DomainRandomization
+from rlservo.envs.randomization import DomainRandomization, make_randomized, wrapped_env
 
 ARM, BASE = "rlservo/EndEffectorPositioningURSim-v0", "rlservo/NoObstacleNavigationMir100Sim-v0"
 
@@ -333,3 +333,13 @@ def test_what_an_environment_cannot_do_is_named(arguments: dict[str, Any], lack:
         DomainRandomization(Counter(), **arguments)
     with pytest.raises(ValueError, match="CartPoleEnv does not state its sensors' \\(sensor_errors\\)"):
         DomainRandomization(gym.make("CartPole-v1"), observation_noise="real")
+
+
+def test_by_id_it_names_the_elements_of_the_environment_that_it_wraps() -> None:
+    inner = {"ur_model": "ur10e", "fix_wrist_2": True}
+    config = {"env_id": "rlservo/EndEffectorPositioningURSim-v0", "payload": [0, 3], **inner}
+    assert wrapped_env("rlservo/Randomized-v0", config) == (config["env_id"], inner)
+    assert wrapped_env("other/Env-v0", config) == ("other/Env-v0", config)
+    describe = make_randomized.describe  # type: ignore[attr-defined]
+    assert describe(**config) == gym.make(config["env_id"]).unwrapped.describe(**inner)  # type: ignore[attr-defined]
+    assert describe(env_id="CartPole-v1") == {}
