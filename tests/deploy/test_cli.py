@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import rlservo, rlservo_here
 
+from command_line import rlservo, rlservo_here
 from rlservo.deploy.serve_commands import parse_env_arguments
 from rlservo.export.contract.bundle import load_bundle
 from rlservo.export.contract.errors import UsageError
