@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -361,19 +361,30 @@ def recurrent(wide_zoo: Path) -> Path:
     return cached("recurrent-policies", [*RECURRENT, *TRAINED_WITH, *PRODUCT, EXPORTED_WITH], export)
 
 
-@pytest.fixture(scope="session")
-def shipped() -> Path:
-    """A repository of the shipped policies for robo-gym's tasks, by the names in SHIPPED. Not to be written to."""
-    checkpoints = ROOT / "examples" / "checkpoints"
+def _exported(name: str, checkpoints: Mapping[str, str]) -> Path:
+    """Return a repository of shipped checkpoints, by the names given here."""
+    folders = {served: ROOT / "examples" / "checkpoints" / checkpoint for served, checkpoint in checkpoints.items()}
 
     def export(out: Path) -> None:
         from rlservo.export.commands.export import export_checkpoint
 
-        for name, checkpoint in SHIPPED.items():
-            export_checkpoint(checkpoints / checkpoint, out, name=name, notify=lambda line: None)
+        for served, folder in folders.items():
+            export_checkpoint(folder, out, name=served, notify=lambda line: None)
 
-    made_of = [checkpoints / checkpoint for checkpoint in SHIPPED.values()]
-    return cached("shipped-policies", [*SHIPPED, *made_of, *PRODUCT, EXPORTED_WITH], export)
+    return cached(name, [*folders, *folders.values(), *PRODUCT, EXPORTED_WITH], export)
+
+
+@pytest.fixture(scope="session")
+def shipped() -> Path:
+    """A repository of the shipped policies for robo-gym's tasks, by the names in SHIPPED. Not to be written to."""
+    return _exported("shipped-policies", SHIPPED)
+
+
+@pytest.fixture(scope="session")
+def all_shipped() -> Path:
+    """A repository of every shipped policy, by the name of its checkpoint. Not to be written to."""
+    names = [path.parent.name for path in (ROOT / "examples" / "checkpoints").glob("*/training.yaml")]
+    return _exported("all-shipped-policies", {name: name for name in sorted(names)})
 
 
 @pytest.fixture(scope="session")

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import gc
+import os
+import sys
 from typing import Any
 
 import pytest
 from xdist.scheduler import LoadScopeScheduling
+
+# Where PYTHONDONTWRITEBYTECODE is set, each of this suite's hundreds of processes would compile rlservo's modules anew,
+# and each of pytest's all test files.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 pytest_plugins = [
     "checkpoints",

@@ -40,8 +40,11 @@ def command(script: str, *arguments: str) -> list[str]:
 
 
 def environment(home: Path) -> dict[str, str]:
-    """A home of its own shows what a script leaves there. Ray's workers would step back behind all else: nice 15."""
-    return {**os.environ, "HOME": str(home), "RAY_worker_niceness": "0"}
+    """A home of its own shows what a script leaves there. Ray's workers would step back behind all else: nice 15.
+
+    And networks as small as these take no less time on two threads, of which the other one waits by spinning.
+    """
+    return {**os.environ, "HOME": str(home), "RAY_worker_niceness": "0", "OMP_NUM_THREADS": "1"}
 
 
 def _inference(script: str, *more: str) -> tuple[str, ...]:

@@ -1,13 +1,10 @@
 """The command line as a user types it: real commands, their output, their exit codes, their one-sentence errors.
 
-Each kind of command runs in a process of its own once; where more of them export or verify, they run in this process,
-because to import RLlib takes longer than what is tested.
+Each kind of command runs in a process of its own once, the others in this one (command_line.py).
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import shutil
 import subprocess
@@ -18,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from rlservo.deploy import cli, terminal
+from command_line import rlservo, rlservo_here
 from rlservo.deploy.serve_commands import parse_env_arguments
 from rlservo.export.contract.bundle import load_bundle
 from rlservo.export.contract.errors import UsageError
@@ -26,27 +23,6 @@ from rlservo.serve_app.runtime.policy import Policy
 
 ROOT = Path(__file__).resolve().parents[2]
 UR5 = ROOT / "examples" / "checkpoints" / "ur5_positioning"
-
-
-def rlservo(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rlservo.deploy.cli", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd)
-
-
-def rlservo_here(*words: object) -> subprocess.CompletedProcess[str]:
-    """Run the command line in this process."""
-    command = ["rlservo", *map(str, words)]
-    out, err, code = io.StringIO(), io.StringIO(), 0
-    for console in (terminal.output, terminal.errors):
-        console.cache_clear()
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        patch.setattr(sys, "argv", command)
-        try:
-            cli.main()
-        except SystemExit as end:
-            assert end.code is None or isinstance(end.code, int)
-            code = end.code or 0
-    return subprocess.CompletedProcess(command, code, out.getvalue(), err.getvalue())
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +56,7 @@ def refused(done: subprocess.CompletedProcess[str], code: int, *fragments: str) 
 
 def test_export_says_what_it_proved_and_where_it_wrote(tmp_path: Path) -> None:
     began = time.monotonic()
-    done = rlservo("export", UR5, "--out", tmp_path, "--name", "arm", "--version", "1.2.0")
+    done = rlservo_here("export", UR5, "--out", tmp_path, "--name", "arm", "--version", "1.2.0")
     assert done.returncode == 0, done.stderr
     print(f"export took {time.monotonic() - began:.1f} s")
     assert str(tmp_path / "arm" / "1.2.0") in done.stdout
@@ -124,7 +100,7 @@ def test_inspect_shows_names_units_and_proof(policies: Path) -> None:
     assert done.returncode == 0
     for text in ("target_r", "rad/s", "base_position_normalized", "mean_std_filter", "torchscript"):
         assert text in done.stdout
-    document = json.loads(rlservo("inspect", policies, "--json").stdout)
+    document = json.loads(rlservo_here("inspect", policies, "--json").stdout)
     assert document["name"] == "ur5"
 
 
@@ -197,7 +173,7 @@ def test_rollout_in_process_reports_success_as_json(policies: Path) -> None:
     ],
 )
 def test_wrong_path_is_one_sentence(words: tuple[object, ...], fragments: tuple[str, ...], tmp_path: Path) -> None:
-    refused(rlservo(*words, cwd=tmp_path), 1, *fragments)
+    refused(rlservo_here(*words, cwd=tmp_path), 1, *fragments)
     assert not (tmp_path / "x").exists()
 
 
@@ -214,9 +190,9 @@ def test_truncated_or_missing_file_is_refused(bundle: Path, name: str) -> None:
     file = bundle / name
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2])
-    refused(rlservo("inspect", bundle), 1, name)
+    refused(rlservo_here("inspect", bundle), 1, name)
     file.unlink()
-    refused(rlservo("inspect", bundle), 1, name)
+    refused(rlservo_here("inspect", bundle), 1, name)
 
 
 @pytest.mark.parametrize(
@@ -229,27 +205,27 @@ def test_truncated_or_missing_file_is_refused(bundle: Path, name: str) -> None:
     ],
 )
 def test_wrong_use_of_rollout_exits_with_2(policies: Path, words: tuple[str, ...], fragment: str) -> None:
-    refused(rlservo(*(word.format(bundle=policies) for word in words)), 2, fragment)
+    refused(rlservo_here(*(word.format(bundle=policies) for word in words)), 2, fragment)
 
 
 def test_rollout_without_a_server_says_so(policies: Path) -> None:
-    done = rlservo("rollout", "rlservo/EndEffectorPositioningURSim-v0", "--url", "http://127.0.0.1:9", "--policy", "x")
-    refused(done, 1, "http://127.0.0.1:9 cannot be reached")
+    words = ("rollout", "rlservo/EndEffectorPositioningURSim-v0", "--url", "http://127.0.0.1:9", "--policy", "x")
+    refused(rlservo_here(*words), 1, "http://127.0.0.1:9 cannot be reached")
 
 
 def test_serve_refuses_a_broken_bundle_before_anything_starts(bundle: Path) -> None:
     (bundle / "golden.npz").unlink()
     began = time.monotonic()
-    refused(rlservo("serve", bundle.parent), 1, "golden.npz")
-    assert time.monotonic() - began < 15.0
-    for words in ((bundle.parent,), ("nope",)):
-        done = rlservo("serve", *words)
+    broken = rlservo("serve", bundle.parent)
+    refused(broken, 1, "golden.npz")
+    assert time.monotonic() - began < 60.0  # a second, on an idle machine
+    for done in (broken, rlservo("serve", "nope")):
         assert done.returncode != 0 and "starting" not in done.stdout + done.stderr, done.stderr
 
 
 def test_every_command_has_help_with_an_example() -> None:
     for command in ("export", "prune", "inspect", "verify", "serve", "rollout", "demo"):
-        done = rlservo(command, "--help")
+        done = rlservo_here(command, "--help")
         assert done.returncode == 0
         assert "Example" in done.stdout
 
@@ -263,48 +239,55 @@ def test_serve_refuses_a_default_policy_that_is_not_served(policies: Path) -> No
 HEAVY = {"asyncio", "fastapi", "grpc", "gymnasium", "httpcore", "httpx", "mujoco", "numpy", "onnxruntime", "ray",
          "rich", "starlette", "torch"}  # fmt: skip
 MODULES_OF = """
-import sys
+import json, sys
 from rlservo.deploy.cli import main
-try:
-    main()
-finally:
-    print(*sorted({name.split(".")[0] for name in sys.modules}), file=sys.stderr)
+for words in json.loads(sys.argv[1]):
+    sys.argv = ["rlservo", *words]
+    try:
+        main()
+    except SystemExit as end:
+        assert not end.code, words
+    print("MODULES", *sorted({name.split(".")[0] for name in sys.modules}), file=sys.stderr)
 """
 
 
-def modules_of(*words: object) -> set[str]:
-    """The top-level modules that a command has imported when it is done."""
-    done = subprocess.run(
-        [sys.executable, "-c", MODULES_OF, *map(str, words)], capture_output=True, text=True, timeout=300
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    return set(done.stderr.splitlines()[-1].split())
+def modules_of(*commands: tuple[object, ...]) -> list[set[str]]:
+    """Run commands in one process; return for each the top-level modules that it and those before it have imported."""
+    words = json.dumps([[str(word) for word in command] for command in commands])
+    done = subprocess.run([sys.executable, "-c", MODULES_OF, words], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+    found = [set(line.split()) for line in done.stderr.splitlines() if line.startswith("MODULES ")]
+    assert len(found) == len(commands)
+    return found
 
 
 def test_help_imports_nothing_that_takes_time(policies: Path) -> None:
-    assert not modules_of("--help") & {*HEAVY, "pydantic", "importlib.metadata"}
+    plain = [
+        ("--help",), ("--version",),
+        *((command, "--help") for command in
+          ("export", "prune", "inspect", "verify", "serve", "key", "rollout", "demo", "server-manager")),
+        ("policy", "load", "--help"), ("policy", "promote", "--help"),
+        ("robot-server", "ur", "--help"),
+        ("cluster", "env", "--help"), ("cluster", "check", "--help"),
+    ]  # fmt: skip
+    imported = modules_of(*plain, ("key", "cell-7"), ("inspect", policies))
+    assert not imported[0] & {*HEAVY, "pydantic", "importlib.metadata"}
     # pydantic is typer's own for the options of a command.
-    for command in ("export", "prune", "inspect", "verify", "serve", "key", "rollout", "demo", "server-manager"):
-        assert not modules_of(command, "--help") & HEAVY, command
-    for command in ("load", "promote"):
-        assert not modules_of("policy", command, "--help") & HEAVY, command
-    assert not modules_of("robot-server", "ur", "--help") & HEAVY
-    for command in ("env", "check"):
-        assert not modules_of("cluster", command, "--help") & HEAVY
-    assert not modules_of("--version") & HEAVY
-    assert not modules_of("key", "cell-7") & (HEAVY - {"rich"})
-    assert not modules_of("inspect", policies) & (HEAVY - {"rich", "numpy"})
+    for words, modules in zip(plain, imported, strict=False):
+        assert not modules & HEAVY, words
+    assert not imported[-2] & (HEAVY - {"rich"})
+    assert not imported[-1] & (HEAVY - {"rich", "numpy"})
 
 
 def test_lists_of_commands_are_whole_sentences() -> None:
     for group in ((), ("policy",), ("robot-server",), ("cluster",), ("log",)):
-        listed = rlservo(*group, "--help").stdout.partition("Commands:")[2].splitlines()
+        listed = rlservo_here(*group, "--help").stdout.partition("Commands:")[2].splitlines()
         assert len(listed) > 1 and all(line.endswith(".") and "..." not in line for line in listed if line), listed
 
 
 def test_unknown_command_and_option_exit_with_2() -> None:
     assert rlservo("deploy").returncode == 2
-    assert rlservo("inspect", "--colour", "red").returncode == 2
+    assert rlservo_here("inspect", "--colour", "red").returncode == 2
 
 
 def test_prune_keeps_what_export_needs(tmp_path: Path) -> None:
@@ -329,6 +312,6 @@ def test_key_makes_a_key_and_the_line_that_the_server_accepts_it_by() -> None:
     made = json.loads(done.stdout)
     found = Keys.from_settings(ServerSettings(api_keys=made["line"])).find(made["key"].encode())
     assert found is not None and (found.label, found.role) == ("operator", Role.admin)
-    plain = rlservo("key", "cell-7").stdout.split("\n")
+    plain = rlservo_here("key", "cell-7").stdout.split("\n")
     assert plain[0].startswith("rlservo_") and plain[1].startswith("cell-7 act sha256:")
-    refused(rlservo("key", "two words"), 2, "label 'two words': expected 1 to 64 letters")
+    refused(rlservo_here("key", "two words"), 2, "label 'two words': expected 1 to 64 letters")

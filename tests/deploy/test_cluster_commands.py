@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from command_line import rlservo_here
 from rlservo.serve_app.ray_serve.environment import CLUSTER, HAPROXY_BINARY, LOCAL
 from rlservo.serve_app.ray_serve.haproxy.configuration import CHECK_SECRET
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
@@ -68,8 +69,9 @@ def test_an_env_file_has_plain_lines_and_one_machine_has_more_of_them(tmp_path: 
 def test_wrong_use_is_one_sentence(
     words: tuple[object, ...], code: int, fragment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    done = cluster(*words)
+    for name in os.environ.keys() - CLEAN.keys():
+        monkeypatch.delenv(name)
+    done = rlservo_here("cluster", *words, cwd=tmp_path)
     assert done.returncode == code and done.stdout == "", done.stdout + done.stderr
     assert fragment in done.stderr and len(done.stderr.splitlines()) == 1
 

@@ -15,13 +15,14 @@ import pytest
 
 pytest.importorskip("viser", reason="the cockpit draws with viser")
 
+from command_line import rlservo_here
 from servers import free_ports, running
 
 COMMAND = [sys.executable, "-m", "rlservo.deploy.cli", "cockpit"]
 
 
 def refused(*arguments: str) -> tuple[int, str]:
-    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=300)
+    done = rlservo_here("cockpit", *arguments)
     assert "Traceback" not in done.stderr and done.stderr.count("\n") == 1, done.stderr
     return done.returncode, done.stderr
 

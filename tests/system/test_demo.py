@@ -32,30 +32,13 @@ def processes_naming(text: str) -> list[str]:
 
 @pytest.mark.serve
 @pytest.mark.slow
-def test_demo_reaches_the_targets_draws_a_picture_and_leaves_nothing(tmp_path: Path) -> None:
-    out = tmp_path / "demo"
-    for episodes in (4, 1):  # a second one right after works too
-        done = subprocess.run(
-            [sys.executable, "-m", "rlservo.deploy.cli", "demo", "--out", str(out), "--episodes", str(episodes)],
-            capture_output=True, text=True, timeout=900, cwd=ROOT,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert done.stdout.count(f"{episodes} of {episodes} ") == 2
-        assert done.stdout.rstrip().endswith(f"rlservo cockpit --bundle {out / 'policies'}")
-        assert (out / "demo.png").read_bytes().startswith(b"\x89PNG")
-        assert (out / "policies" / "ur5" / "1" / "contract.json").is_file()
-        assert (out / "policies" / "mir100" / "1" / "contract.json").is_file()
-        assert processes_naming(str(out)) == []
-
-
-@pytest.mark.serve
-@pytest.mark.slow
-def test_demo_with_the_cockpit_serves_both_robots_on_a_page_until_ctrl_c(tmp_path: Path) -> None:
+def test_demo_serves_a_page_until_ctrl_c_then_reaches_the_targets_and_leaves_nothing(tmp_path: Path) -> None:
+    """Twice right after each other in the same folder: with the cockpit, and with the episodes and a picture."""
     pytest.importorskip("viser", reason="the cockpit draws with viser")
     out = tmp_path / "demo"
     (port,) = free_ports(1)
-    command = [sys.executable, "-m", "rlservo.deploy.cli", "demo", "--out", str(out), "--cockpit", "--port", str(port)]
-    with running(command, port) as run:
+    command = [sys.executable, "-m", "rlservo.deploy.cli", "demo", "--out", str(out)]
+    with running([*command, "--cockpit", "--port", str(port)], port) as run:
         assert run.process.stdout is not None
         said = [next((line for line in run.process.stdout if line.startswith("cockpit at ")), "nothing")]
         assert said == [f"cockpit at http://127.0.0.1:{port}; Ctrl-C stops\n"]
@@ -63,6 +46,15 @@ def test_demo_with_the_cockpit_serves_both_robots_on_a_page_until_ctrl_c(tmp_pat
             assert reply.status == 200
         run.process.send_signal(signal.SIGINT)
         assert run.process.wait(120) == 0
+    assert processes_naming(str(out)) == []
+    (out / "demo.png").write_bytes(b"of an earlier demo")
+    done = subprocess.run([*command, "--episodes", "4"], capture_output=True, text=True, timeout=900, cwd=ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("4 of 4 ") == 2
+    assert done.stdout.rstrip().endswith(f"rlservo cockpit --bundle {out / 'policies'}")
+    assert (out / "demo.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "policies" / "ur5" / "1" / "contract.json").is_file()
+    assert (out / "policies" / "mir100" / "1" / "contract.json").is_file()
     assert processes_naming(str(out)) == []
 
 

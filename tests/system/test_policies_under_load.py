@@ -37,7 +37,7 @@ pytestmark = [pytest.mark.serve, pytest.mark.slow, pytest.mark.random_order(disa
 ROOT = Path(__file__).resolve().parents[2]
 OBS = [round(0.01 * i, 2) for i in range(27)]
 CLIENTS = 4
-PAUSE_S = 0.01  # between a client's requests: the load is steady, and leaves the machine something
+PAUSE_S = 0.02  # between a client's requests: the load is steady, and leaves the machine something
 
 
 @dataclass
@@ -483,7 +483,7 @@ def test_a_lost_node_costs_a_client_that_retries_once_nothing(cluster: Cluster) 
                 cluster.wait_for(lambda seen: len(seen) == 1)
                 after = load.answered
         finally:
-            del deployment["max_replicas_per_node"], cluster.application["runtime_env"]
+            del deployment["max_replicas_per_node"]  # the same code: the replica that is left stays
             cluster.deploy()
     assert load.failures == [] and after - before > 20
     for version in load.versions:

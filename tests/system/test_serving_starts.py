@@ -1,4 +1,8 @@
-"""Servers that are started here because starting and ending them is what is tested, and what they leave behind."""
+"""Servers that are started here because starting and ending them is what is tested, and what they leave behind.
+
+The ways to end a running one are those of the servers that other tests use: SIGINT and SIGTERM in servers.py, SIGKILL
+in test_serving_replicas.py, Ctrl-C twice in test_remote_repository.py.
+"""
 
 from __future__ import annotations
 
@@ -57,15 +61,6 @@ def test_a_server_ended_while_it_starts_leaves_nothing(policies: Path, number: s
         code = run.end(number)
         if number == signal.SIGKILL:  # it could not remove its folder; the cluster's process must
             assert code == -signal.SIGKILL
-
-
-def test_a_second_ctrl_c_ends_a_running_server_at_once_and_leaves_nothing(policies: Path) -> None:
-    """The other ways to end a running one are those of the servers that other tests share (servers.py)."""
-    with launched(policies, with_admin_key=True) as run:
-        run.wait_until_ready()
-        assert ask(run.port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[0] == 200
-        assert run.key_file is not None and run.key_file.exists()
-        run.end(signal.SIGINT, signal.SIGINT)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

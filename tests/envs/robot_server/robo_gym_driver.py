@@ -2,7 +2,8 @@
 
     python robo_gym_driver.py <jobs.json> <results.json>
 
-Where a job says "pause", the driver prints a line and waits for one on standard input after that many steps.
+Where a job says "pause", the driver prints a line and waits for one on standard input after that many steps; where it
+says "keep", the next job is another episode in the same environment.
 
 Two of robo-gym 2.0.1's base methods cannot work with any server: `URBaseAvoidanceEnv.reset` calls `super(gym.Env)`,
 which has no reset, and refuses the arguments its subclass passes; its `step` returns five values where the subclasses
@@ -46,8 +47,10 @@ def mend_avoidance() -> None:
     URBaseAvoidanceEnv.reset, URBaseAvoidanceEnv.step = reset, step
 
 
-def run(job: dict[str, Any]) -> dict[str, Any]:
-    env = gym.make(job["env"], disable_env_checker=True, **job["arguments"]).unwrapped
+def run(job: dict[str, Any], kept: dict[str, Any]) -> dict[str, Any]:
+    """Drive an episode; `kept` holds the environment of a job that says "keep", for the next one that has the same."""
+    same = json.dumps([job["env"], job["arguments"]])
+    env = kept.pop(same, None) or gym.make(job["env"], disable_env_checker=True, **job["arguments"]).unwrapped
     sent: list[Any] = []  # joint positions or velocities on the wire, and what SetState held
     client = env.client
     set_state, send_action, send_and_get = client.set_state_msg, client.send_action, client.send_action_get_state
@@ -72,11 +75,15 @@ def run(job: dict[str, Any]) -> dict[str, Any]:
         if answer[2]:
             result["status"] = answer[-1]["final_status"]
             break
+    client.set_state_msg, client.send_action, client.send_action_get_state = set_state, send_action, send_and_get
+    if job.get("keep"):
+        kept[same] = env
+        return result
     getattr(env, "kill_sim", lambda: None)()  # `close` of the UR environments finds gymnasium's before robo-gym's
     return result
 
 
-def run_through_a_crash(job: dict[str, Any]) -> dict[str, Any]:
+def run_through_a_crash(job: dict[str, Any], _: dict[str, Any]) -> dict[str, Any]:
     """Episode, crash, and on with robo-gym's own wrapper for it."""
     env = ExceptionHandling(gym.make(job["env"], disable_env_checker=True, **job["arguments"]).unwrapped)
     env.reset()
@@ -96,10 +103,10 @@ def run_through_a_crash(job: dict[str, Any]) -> dict[str, Any]:
 def main() -> None:
     mend_avoidance()
     jobs = json.loads(Path(sys.argv[1]).read_text())
-    results = []
+    results, kept = [], {}
     for job in jobs:
         try:
-            results.append((run_through_a_crash if job.get("crash") else run)(job))
+            results.append((run_through_a_crash if job.get("crash") else run)(job, kept))
         except Exception as error:
             results.append({"error": f"{type(error).__name__}: {error}"})
     Path(sys.argv[2]).write_text(json.dumps(results))

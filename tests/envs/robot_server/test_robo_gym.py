@@ -121,8 +121,9 @@ def test_positioning_episodes_are_ours_for_every_arm(drive: Drive, manager: Serv
             "arguments": sim_arguments(manager, ur_model=ur_model),
             "reset": {"options": options},
             "actions": actions,
+            "keep": number < len(episodes),
         }
-        for options, actions in episodes
+        for number, (options, actions) in enumerate(episodes, 1)
     ]
     results = drive(jobs)
     for (options, actions), theirs in zip(episodes, results, strict=True):
