@@ -65,6 +65,8 @@ CUT_S, LONG_CUT_S = 8.0, 45.0  # Ray gives a node up that it has not reached for
 OLD_STREAM_S = 140.0  # Ray's own limit for a replaced HAProxy is 120
 SETTLE_S = 10.0  # until a new proxy has taken over
 COME_S = 120.0  # for what was deployed to be there
+NO_STORE = "the cluster's store cannot say"
+NO_REPLICA = "no replica"  # can be reached, is there yet: a proxy that has just started
 INSIDES = ("Traceback", "site-packages", 'File "')
 
 
@@ -125,7 +127,7 @@ def _failure(ask: Callable[[], None], seen: Seen) -> str | None:
     except WrongError as error:
         seen.wrong.append(str(error)[:300])
     except (LoadError, OSError) as error:
-        return f"{type(error).__name__}: {error}"[:200]
+        return f"{type(error).__name__}: {error}"[:400]
     return None
 
 
@@ -187,6 +189,11 @@ class Bench:
         """How many replicas there should be."""
         return REPLICAS if self.cluster is None else int(self.cluster.application["args"]["replicas"])
 
+    @property
+    def has_no_front(self) -> bool:
+        """Whether clients reach a node's proxy before it is ready: nodes that share an address have none in front."""
+        return isinstance(self.cluster, Nodes) and not self.server.command
+
     def members(self, beside: int | None = None) -> dict[int, Process]:
         """Return the server's processes, or with `beside` those of the same node."""
         if not isinstance(self.cluster, Nodes):
@@ -207,7 +214,9 @@ class Bench:
 
 
 def pids_of(members: dict[int, Process], title: str) -> list[int]:
-    return sorted(pid for pid, process in members.items() if title in process.command.split(" ")[0])
+    """Return the processes with this in their title or program; a script's is in the words after it."""
+    words = 3 if title.endswith(".py") else 1
+    return sorted(pid for pid, process in members.items() if title in " ".join(process.command.split(" ")[:words]))
 
 
 # The faults: each does its harm, and returns when what it did has come to its end
@@ -435,7 +444,10 @@ def kill_node(bench: Bench, row: Row) -> None:
 
 
 def kill_part(title: str, number: int) -> Callable[[Bench, Row], None]:
-    """Return the fault that kills one process of a node, whose supervisor starts the node again should it end."""
+    """Return the fault that kills one process of a node, whose supervisor starts the node again should it end.
+
+    Not free: the node's other processes end one after the other, within a second, and two tries may meet that.
+    """
 
     def fault(bench: Bench, row: Row) -> None:
         nodes = _nodes(bench)
@@ -626,6 +638,7 @@ class Fault:
     do: Callable[[Bench, Row], None]
     free: bool = True  # nobody fails twice
     smooth: bool = False  # nobody fails at all
+    takes_store: bool = False  # the GCS is away for a while, which sessions by id need
     only_on: tuple[str, ...] = ()
     pause_s: float = PAUSE_S
 
@@ -655,15 +668,15 @@ FAULTS = {
     "variable": Fault(_all_new(_variable), smooth=True, only_on=CLUSTERS),
     "code": Fault(_all_new(_code), smooth=True, only_on=CLUSTERS),
     "autoscale": Fault(autoscale, smooth=True, only_on=CLUSTERS, pause_s=0.25),
-    "raylet": Fault(kill_part("/raylet", NODES - 1), only_on=NODED),
-    "runtime-env-agent": Fault(kill_part("ray::RuntimeEnvAgent", NODES - 1), only_on=NODED),
-    "gcs": Fault(kill_part("/gcs_server", 0), only_on=NODED),
-    "head-raylet": Fault(kill_part("/raylet", 0), only_on=NODED),
-    "dashboard": Fault(kill_part("ray::DashboardHead", 0), only_on=NODED),
-    "redis": Fault(kill_redis, only_on=NODED),
+    "raylet": Fault(kill_part("/raylet", NODES - 1), free=False, only_on=NODED),
+    "runtime-env-agent": Fault(kill_part("ray::RuntimeEnvAgent", NODES - 1), free=False, only_on=NODED),
+    "gcs": Fault(kill_part("/gcs_server", 0), free=False, takes_store=True, only_on=NODED),
+    "head-raylet": Fault(kill_part("/raylet", 0), free=False, takes_store=True, only_on=NODED),
+    "dashboard": Fault(kill_part("/dashboard.py", 0), free=False, takes_store=True, only_on=NODED),
+    "redis": Fault(kill_redis, free=False, takes_store=True, only_on=NODED),
     "node": Fault(kill_node, only_on=NODED),
     "add-node": Fault(add_node, smooth=True, only_on=NODED),
-    "head": Fault(kill_head, only_on=NODED),
+    "head": Fault(kill_head, takes_store=True, only_on=NODED),
     "upgrade": Fault(_all_new(_variable), smooth=True, only_on=NODED),
     "cut-shortly": Fault(cut_shortly, only_on=("namespaces",)),
     "cut": Fault(cut_for_long, only_on=("namespaces",)),
@@ -798,16 +811,23 @@ def undergo(name: str, fault: Fault, bench: Bench) -> Row:
             fault.do(bench, row)
         except TimeoutError as error:
             row.broken.append(str(error))
-        while time.monotonic() < began + BOUND_S and time.monotonic() < max(crowd.last_failure(), began) + CALM_S:
-            time.sleep(0.1)
         wait_for_replicas(bench, row, began)
+        done = time.monotonic()
+        while time.monotonic() < min(done + BOUND_S, max(crowd.last_failure(), began) + CALM_S):
+            time.sleep(0.1)
     add(row, crowd, began)
     if crowd.last_failure() > time.monotonic() - CALM_S / 2:
         row.broken.append("it did not recover")
     if fault.smooth and row.first:
         row.broken.append("a request failed")
-    if fault.free and row.twice:
-        row.broken.append("a client failed twice")
+    costly = [
+        f"{name}: {what}"
+        for name, seen in crowd.seen.items()
+        for _, what in seen.twice
+        if not (fault.takes_store and NO_STORE in what) and not (bench.has_no_front and NO_REPLICA in what)
+    ]
+    if fault.free and costly:
+        row.broken.append(f"a client failed twice: {costly[0]}")
     return row
 
 
@@ -842,7 +862,7 @@ def add(row: Row, crowd: Crowd, began: float) -> None:
         row.twice += len(seen.twice)
         row.wrong += len(seen.wrong)
         row.over_s = max(row.over_s, seen.first[-1][0] - began if seen.first else 0.0)
-        kinds.update(f"{name}: {what[:150]}" for _, what in seen.first)
+        kinds.update(f"{name}: {what[:330]}" for _, what in seen.first)
         row.broken += [f"{name}: {what}" for what in seen.wrong[:2]]
         row.broken += [f"{name} was shown: {what}" for _, what in seen.first if any(part in what for part in INSIDES)]
         row.notes += [f"{name} asked {seen.asked}, {len(seen.first)}/{len(seen.twice)}"] if seen.first else []

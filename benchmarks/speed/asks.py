@@ -177,6 +177,7 @@ class SessionsById:
         self._prefix = secrets.token_hex(4)
         self._steps = [0] * self.count
         self._next = 0
+        self._last = ["none"] * self.count
 
     def __call__(self) -> None:
         """Take a step of the next session. Raises LoadError or OSError."""
@@ -200,10 +201,18 @@ class SessionsById:
             return
         if status in (503, 504):
             self._steps[number] *= status == 503  # a 504 may have been computed
-            raise LoadError(f"{status} {answer.get('code')}: {answer.get('message')}")
+            self._last[number] = f"{status} {answer.get('code')}: {answer.get('error')}"
+            raise LoadError(self._last[number])
         if status != 200:
             raise WrongError(f"{status} {answer}")
-        identical(answer["action"], self.expected[step])
+        try:
+            identical(answer["action"], self.expected[step])
+        except WrongError as error:
+            self._steps[number] = 0  # counted once
+            what = (
+                f"session_step {answer.get('session_step')} instead of {step + 1}, last failure: {self._last[number]}"
+            )
+            raise WrongError(f"{error} ({what})") from None
         self._steps[number] = (step + 1) % len(self.seen)
         self._next = (number + 1) % self.count
 
