@@ -45,10 +45,11 @@ defaults
     timeout connect 1s
     timeout client 1d
     timeout server 1d
+    timeout check 3s
     retries 3
     option redispatch 1
     option httpchk GET /v2/health/ready
-    default-server check inter 500ms fall 2 rise 1 on-marked-down shutdown-sessions
+    default-server check inter 1s fall 2 rise 1 on-marked-down shutdown-sessions
 """
 
 
