@@ -848,6 +848,12 @@ def wait_for_replicas(bench: Bench, row: Row, began: float) -> None:
     if len(serving) < bench.replicas:
         row.broken.append(f"of {bench.replicas} replicas {len(serving)} answered requests within {ALL_SERVE_S:g} s")
         return
+    if isinstance(bench.cluster, Nodes) and not bench.has_no_front:
+        try:
+            wait_for(lambda: all(_is_ready(address) for address in _nodes(bench).replicas_at()), "a node's proxy")
+        except TimeoutError as error:
+            row.broken.append(str(error))
+            return
     row.all_serve_s = time.monotonic() - began
     row.notes.append(f"all {bench.replicas} replicas answer requests, seen after {row.all_serve_s:.0f} s")
 
