@@ -638,7 +638,7 @@ class Fault:
     do: Callable[[Bench, Row], None]
     free: bool = True  # nobody fails twice
     smooth: bool = False  # nobody fails at all
-    takes_store: bool = False  # the GCS is away for a while, which sessions by id need
+    takes_store: bool = False  # the GCS is away for a while, for all or one node, which sessions by id need
     only_on: tuple[str, ...] = ()
     pause_s: float = PAUSE_S
 
@@ -678,8 +678,8 @@ FAULTS = {
     "add-node": Fault(add_node, smooth=True, only_on=NODED),
     "head": Fault(kill_head, takes_store=True, only_on=NODED),
     "upgrade": Fault(_all_new(_variable), smooth=True, only_on=NODED),
-    "cut-shortly": Fault(cut_shortly, only_on=("namespaces",)),
-    "cut": Fault(cut_for_long, only_on=("namespaces",)),
+    "cut-shortly": Fault(cut_shortly, takes_store=True, only_on=("namespaces",)),
+    "cut": Fault(cut_for_long, free=False, takes_store=True, only_on=("namespaces",)),
 }
 
 
@@ -897,6 +897,8 @@ def get(server: Server, path: str) -> dict[str, Any]:
 
 
 def tell(row: Row, console: Console) -> None:
+    tries = f"first try failed {row.first}, retry failed {row.twice}"
+    console.print(f"  asked {row.asked}, {tries}, wrong {row.wrong}, told {row.told}")
     for note in row.notes:
         console.print(f"  {note}", markup=False)
     for kind, times in row.kinds.items():
