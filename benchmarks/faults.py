@@ -194,16 +194,14 @@ class Bench:
         """Whether clients reach a node's proxy before it is ready: nodes that share an address have none in front."""
         return isinstance(self.cluster, Nodes) and not self.server.command
 
-    def members(self, beside: int | None = None) -> dict[int, Process]:
-        """Return the server's processes, or with `beside` those of the same node."""
+    def members(self) -> dict[int, Process]:
+        """Return the server's processes, those of all nodes."""
         if not isinstance(self.cluster, Nodes):
             return self.server.members()
-        parts = [node.members() for node in self.cluster.nodes]
-        return {pid: process for part in parts if beside is None or beside in part for pid, process in part.items()}
+        return {pid: process for node in self.cluster.nodes for pid, process in node.members().items()}
 
-    def pids(self, title: str, beside: int | None = None) -> list[int]:
-        """Return the processes with this in their title or program, or with `beside` those of the same node."""
-        return pids_of(self.members(beside), title)
+    def pids(self, title: str) -> list[int]:
+        return pids_of(self.members(), title)
 
     def serving(self) -> dict[str, int]:
         """Ask once, and return by the answering replica how many requests it has answered."""
