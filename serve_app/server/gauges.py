@@ -121,7 +121,7 @@ def sessions(core: Core, replica: str) -> Iterator[Metric]:
             family.add_metric([replica, name], count[name])
     yield from (open_now, *families)
     shared = core.shared_sessions
-    for name, help_text, count in (
+    for name, help_text, times in (
         ("rlservo_session_hops", "Steps of sessions by id that another replica took", shared.hops if shared else 0),
         (
             "rlservo_session_records_unreachable",
@@ -130,7 +130,7 @@ def sessions(core: Core, replica: str) -> Iterator[Metric]:
         ),
     ):
         counter = CounterMetricFamily(name, help_text, labels=["replica"])
-        counter.add_metric([replica], count)
+        counter.add_metric([replica], times)
         yield counter
     remembered = "Episodes in memory, in sessions and on streams; a batch is so many"
     yield _gauge("rlservo_episodes_remembered", remembered, replica, kept.rows)
