@@ -5,9 +5,10 @@
 The UR5 policy and the LSTM policy that ship, two replicas, on `rlservo serve` or on a cluster by `serve deploy
 deploy/serve.yaml`; or three replicas on three Ray nodes with a proxy each (`nodes`), in network namespaces with
 addresses of their own as well (`namespaces`, as root). Meanwhile clients ask without end, over JSON, the Open Inference
-Protocol (binary, gRPC) and WebSockets, and through `PolicyClient` and `StreamClient` with the LSTM's memory; each tries
-once more when it has failed, and checks every action. Exits with 1 when an answer was wrong, when a client learned of
-our insides, or when what must cost nothing cost something. Written to bench/faults-WHERE.json.
+Protocol (binary, gRPC) and WebSockets, and with the LSTM's state carried, on a stream, and in sessions by id; each
+tries once more when it has failed, and checks every action, the LSTM's bit by bit. A fault is over when all replicas
+answer requests again. Exits with 1 when they do not, when an answer was wrong, when a client learned of our insides, or
+when what must cost nothing cost something. Written to bench/faults-WHERE.json.
 """
 
 from __future__ import annotations
@@ -41,12 +42,13 @@ from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from serving import OUT, ROOT
-from speed.asks import Episode, WrongError, askers, episode_of, open_stream
+from speed.asks import Episode, SessionsById, WrongError, askers, episode_of, open_stream
 from speed.catalogue import Case, case_of, rlservo
 from speed.cluster import Cluster, cluster
 from speed.loads import LoadError, PoliteError, WebSocketLine
+from speed.machine import Process
 from speed.nodes import KEY, NODES, Node, Nodes, nodes_running
-from speed.servers import Server, StartError, listening, running, started, wait_until_answering
+from speed.servers import Server, StartError, ask, listening, running, started, wait_until_answering
 
 CHECKPOINTS = ROOT / "examples" / "checkpoints"
 SHIPPED = {"ur5": CHECKPOINTS / "ur5_positioning", "sparse": CHECKPOINTS / "mir100_sparse_fixes"}
@@ -56,11 +58,15 @@ DEADLINE_MS = 10_000.0  # of those who have one: what is counted is failures, no
 PAUSE_S = 0.02  # between a client's requests
 BEFORE_S, CALM_S = 2.0, 4.0  # of load before a fault, and without a failure before it counts as over
 BOUND_S = 90.0  # for a fault to be over
-HEAD_AWAY_S = 5.0
+RAY_NOTICES_S = 30.0  # that one of its processes has ended
+ALL_SERVE_S = 120.0  # and for every replica to answer
+HEAD_AWAY_S = REDIS_AWAY_S = 5.0
 CUT_S, LONG_CUT_S = 8.0, 45.0  # Ray gives a node up that it has not reached for some 15 s
 OLD_STREAM_S = 140.0  # Ray's own limit for a replaced HAProxy is 120
 SETTLE_S = 10.0  # until a new proxy has taken over
 COME_S = 120.0  # for what was deployed to be there
+NO_STORE = "the cluster's store cannot say"
+NO_REPLICA = "no replica"  # can be reached, is there yet: a proxy that has just started
 INSIDES = ("Traceback", "site-packages", 'File "')
 
 
@@ -121,7 +127,7 @@ def _failure(ask: Callable[[], None], seen: Seen) -> str | None:
     except WrongError as error:
         seen.wrong.append(str(error)[:300])
     except (LoadError, OSError) as error:
-        return f"{type(error).__name__}: {error}"[:200]
+        return f"{type(error).__name__}: {error}"[:400]
     return None
 
 
@@ -137,6 +143,8 @@ class Row:
     told: int = 0
     over_s: float = 0.0
     """From the fault to the last failure."""
+    all_serve_s: float | None = None
+    """From the fault until every replica had answered requests; None: not within the deadline."""
     free: bool = False
     """Whether no try but the first of each may fail (and for `smooth`, not even that)."""
     smooth: bool = False
@@ -170,10 +178,43 @@ class Bench:
         made["lstm, stream"] = lambda: Episode(
             StreamClient(url, name, server_state=True, deadline_ms=DEADLINE_MS), seen, expected, held=True
         )
+        made["lstm, session"] = lambda: Episode(
+            PolicyClient(url, name, server_state=True, deadline_ms=DEADLINE_MS), seen, expected, held=True
+        )
+        made["lstm, sessions by id"] = lambda: SessionsById(self.server.port, name, seen, expected)
         return Crowd(made, pause_s)
 
+    @property
+    def replicas(self) -> int:
+        """How many replicas there should be."""
+        return REPLICAS if self.cluster is None else int(self.cluster.application["args"]["replicas"])
+
+    @property
+    def has_no_front(self) -> bool:
+        """Whether clients reach a node's proxy before it is ready: nodes that share an address have none in front."""
+        return isinstance(self.cluster, Nodes) and not self.server.command
+
+    def members(self) -> dict[int, Process]:
+        """Return the server's processes, those of all nodes."""
+        if not isinstance(self.cluster, Nodes):
+            return self.server.members()
+        return {pid: process for node in self.cluster.nodes for pid, process in node.members().items()}
+
     def pids(self, title: str) -> list[int]:
-        return sorted(pid for pid, process in self.server.members().items() if title in process.command.split(" ")[0])
+        return pids_of(self.members(), title)
+
+    def serving(self) -> dict[str, int]:
+        """Ask once, and return by the answering replica how many requests it has answered."""
+        ask(self.server)
+        told = get(self.server, "/v1/policies")
+        versions = [version for policy in told["policies"] for version in policy["version_states"]]
+        return {told["replica"]: sum(version["requests"] for version in versions)}
+
+
+def pids_of(members: dict[int, Process], title: str) -> list[int]:
+    """Return the processes with this in their title or program; a script's is in the words after it."""
+    words = 3 if title.endswith(".py") else 1
+    return sorted(pid for pid, process in members.items() if title in " ".join(process.command.split(" ")[:words]))
 
 
 # The faults: each does its harm, and returns when what it did has come to its end
@@ -187,17 +228,23 @@ def kill(title: str, count: int, renews: str | None = None) -> Callable[[Bench, 
 
     def fault(bench: Bench, row: Row) -> None:
         before = wait_for(lambda: len(found := bench.pids(title)) >= count and found, f"{count} {title}")
-        renewed = bench.pids(renews) if renews else []
+        victim = before[-1]
+        node = next((each for each in _all_nodes(bench) if victim in each.members()), None)
+
+        def alike(what: str) -> list[int]:  # a replica may come back on another node, a node's own parts only there
+            return bench.pids(what) if node is None or title == REPLICA else pids_of(node.members(), what)
+
+        before, renewed = alike(title), alike(renews) if renews else []
         began = time.monotonic()
-        os.kill(before[-1], signal.SIGKILL)
+        os.kill(victim, signal.SIGKILL)
         wait_for(
-            lambda: len(now := bench.pids(title)) >= count and set(now) - set(before),
+            lambda: len(now := alike(title)) >= min(count, len(before)) and set(now) - set(before),
             f"a new {title}",
         )
         row.notes.append(f"a new process after {time.monotonic() - began:.1f} s")
         if renews is not None:
             other = renews
-            wait_for(lambda: set(bench.pids(other)) - set(renewed), f"a new {other}")
+            wait_for(lambda: set(alike(other)) - set(renewed), f"a new {other}")
             row.notes.append(f"Serve's own after {time.monotonic() - began:.1f} s")
         if "HAProxy" in f"{title}{renews}":
             time.sleep(SETTLE_S)
@@ -389,9 +436,60 @@ def kill_node(bench: Bench, row: Row) -> None:
     began = time.monotonic()
     victim.kill()
     # Serve knows of it when Ray does.
-    wait_for(lambda: len(now := set(nodes.replicas())) == NODES and now != lost, "the lost replica")
+    wait_for(lambda: len(now := set(nodes.replicas())) == bench.replicas and now != lost, "the lost replica")
     row.notes.append(f"as many replicas as before after {time.monotonic() - began:.0f} s")
     _start_node(nodes, victim, row)
+
+
+def kill_part(title: str, number: int) -> Callable[[Bench, Row], None]:
+    """Return the fault that kills one process of a node, whose supervisor starts the node again should it end.
+
+    Not free: the node's other processes end one after the other, within a second, and two tries may meet that.
+    """
+
+    def fault(bench: Bench, row: Row) -> None:
+        nodes = _nodes(bench)
+        node = nodes.nodes[number]
+        (victim, *_) = wait_for(lambda: pids_of(node.members(), title), title)
+        began = time.monotonic()
+        os.kill(victim, signal.SIGKILL)
+        _supervise(bench, row, lambda: not node.runs() or set(pids_of(node.members(), title)) - {victim}, began)
+
+    return fault
+
+
+def kill_redis(bench: Bench, row: Row) -> None:
+    """Kill the head's Redis, and start it again with the file that it has."""
+    nodes = _nodes(bench)
+    began = time.monotonic()
+    nodes.stop_redis(kill=True)
+    time.sleep(REDIS_AWAY_S)
+    nodes.start_redis()
+    _supervise(bench, row, lambda: time.monotonic() > began + RAY_NOTICES_S, began)
+
+
+def _supervise(bench: Bench, row: Row, noticed: Callable[[], Any], began: float) -> None:
+    """Start every node that ends, as what runs it does, until Ray has `noticed` and all replicas run again."""
+    nodes, ended = _nodes(bench), Counter[int]()
+    up = [node for node in nodes.nodes if node.server is not None]
+
+    def well() -> bool:
+        for node in up:
+            if not node.runs():
+                ended[node.number] += 1
+                node.stop()
+                nodes.start(node)
+        running = nodes.status()["status"] == "RUNNING" and len(nodes.replicas()) == bench.replicas
+        return running and all(node.has_joined() for node in up)
+
+    with suppress(TimeoutError):  # it is noted below
+        wait_for(noticed, "", RAY_NOTICES_S)
+    wait_for(well, "all nodes and replicas", BOUND_S * 3)
+    row.notes.append(
+        ", ".join(f"node {number} ended and was started {times} time(s)" for number, times in ended.items())
+        or "no node ended"
+    )
+    row.notes.append(f"as many nodes and replicas as before after {time.monotonic() - began:.0f} s")
 
 
 def add_node(bench: Bench, row: Row) -> None:
@@ -470,6 +568,10 @@ def cut_for_long(bench: Bench, row: Row) -> None:
     _start_node(nodes, cut, row)
 
 
+def _all_nodes(bench: Bench) -> list[Node]:
+    return bench.cluster.nodes if isinstance(bench.cluster, Nodes) else []
+
+
 def _nodes(bench: Bench) -> Nodes:
     assert isinstance(bench.cluster, Nodes)
     return bench.cluster
@@ -534,18 +636,21 @@ class Fault:
     do: Callable[[Bench, Row], None]
     free: bool = True  # nobody fails twice
     smooth: bool = False  # nobody fails at all
+    takes_store: bool = False  # the GCS is away for a while, for all or one node, which sessions by id need
     only_on: tuple[str, ...] = ()
     pause_s: float = PAUSE_S
 
 
 REPLICAS = 2
+REPLICA = "ray::ServeReplica"
 CLUSTERS, NODED = ("cluster",), ("nodes", "namespaces")
+EVERYWHERE = ("serve", *CLUSTERS, *NODED)
 FAULTS = {
-    "replica": Fault(kill("ray::ServeReplica", REPLICAS), only_on=("serve", "cluster")),
-    "haproxy": Fault(kill("/haproxy", 1, "ray::HAProxyManager"), free=False),
-    "proxy-manager": Fault(kill("ray::HAProxyManager", 1), free=False),
-    "proxy-actor": Fault(kill("ray::ProxyActor", 1)),
-    "controller": Fault(kill("ray::ServeController", 1), smooth=True),
+    "replica": Fault(kill(REPLICA, REPLICAS), only_on=EVERYWHERE),
+    "haproxy": Fault(kill("/haproxy", 1, "ray::HAProxyManager"), free=False, only_on=EVERYWHERE),
+    "proxy-manager": Fault(kill("ray::HAProxyManager", 1), free=False, only_on=EVERYWHERE),
+    "proxy-actor": Fault(kill("ray::ProxyActor", 1), only_on=EVERYWHERE),
+    "controller": Fault(kill("ray::ServeController", 1), smooth=True, only_on=EVERYWHERE),
     "old-streams": Fault(old_streams),
     "overload": Fault(overload, free=False),
     "user-config": Fault(
@@ -561,12 +666,18 @@ FAULTS = {
     "variable": Fault(_all_new(_variable), smooth=True, only_on=CLUSTERS),
     "code": Fault(_all_new(_code), smooth=True, only_on=CLUSTERS),
     "autoscale": Fault(autoscale, smooth=True, only_on=CLUSTERS, pause_s=0.25),
+    "raylet": Fault(kill_part("/raylet", NODES - 1), free=False, only_on=NODED),
+    "runtime-env-agent": Fault(kill_part("ray::RuntimeEnvAgent", NODES - 1), free=False, only_on=NODED),
+    "gcs": Fault(kill_part("/gcs_server", 0), free=False, takes_store=True, only_on=NODED),
+    "head-raylet": Fault(kill_part("/raylet", 0), free=False, takes_store=True, only_on=NODED),
+    "dashboard": Fault(kill_part("/dashboard.py", 0), free=False, takes_store=True, only_on=NODED),
+    "redis": Fault(kill_redis, free=False, takes_store=True, only_on=NODED),
     "node": Fault(kill_node, only_on=NODED),
     "add-node": Fault(add_node, smooth=True, only_on=NODED),
-    "head": Fault(kill_head, only_on=NODED),
+    "head": Fault(kill_head, takes_store=True, only_on=NODED),
     "upgrade": Fault(_all_new(_variable), smooth=True, only_on=NODED),
-    "cut-shortly": Fault(cut_shortly, only_on=("namespaces",)),
-    "cut": Fault(cut_for_long, only_on=("namespaces",)),
+    "cut-shortly": Fault(cut_shortly, takes_store=True, only_on=("namespaces",)),
+    "cut": Fault(cut_for_long, free=False, takes_store=True, only_on=("namespaces",)),
 }
 
 
@@ -698,16 +809,51 @@ def undergo(name: str, fault: Fault, bench: Bench) -> Row:
             fault.do(bench, row)
         except TimeoutError as error:
             row.broken.append(str(error))
-        while time.monotonic() < began + BOUND_S and time.monotonic() < max(crowd.last_failure(), began) + CALM_S:
+        wait_for_replicas(bench, row, began)
+        done = time.monotonic()
+        while time.monotonic() < min(done + BOUND_S, max(crowd.last_failure(), began) + CALM_S):
             time.sleep(0.1)
     add(row, crowd, began)
     if crowd.last_failure() > time.monotonic() - CALM_S / 2:
         row.broken.append("it did not recover")
     if fault.smooth and row.first:
         row.broken.append("a request failed")
-    if fault.free and row.twice:
-        row.broken.append("a client failed twice")
+    costly = [
+        f"{name}: {what}"
+        for name, seen in crowd.seen.items()
+        for _, what in seen.twice
+        if not (fault.takes_store and NO_STORE in what) and not (bench.has_no_front and NO_REPLICA in what)
+    ]
+    if fault.free and costly:
+        row.broken.append(f"a client failed twice: {costly[0]}")
     return row
+
+
+def wait_for_replicas(bench: Bench, row: Row, began: float) -> None:
+    """Wait until as many replicas as there should be answer requests, while sessions by id exist.
+
+    A process that is there, or that Ray calls running, may end at once, again and again: what counts are requests.
+    """
+    deadline = time.monotonic() + ALL_SERVE_S
+    first: dict[str, int] = {}
+    serving: set[str] = set()
+    while len(serving) < bench.replicas and time.monotonic() < deadline:
+        with suppress(OSError, KeyError, ValueError):
+            for replica, answered in bench.serving().items():
+                if answered > first.setdefault(replica, answered):
+                    serving.add(replica)
+        time.sleep(0.1)
+    if len(serving) < bench.replicas:
+        row.broken.append(f"of {bench.replicas} replicas {len(serving)} answered requests within {ALL_SERVE_S:g} s")
+        return
+    if isinstance(bench.cluster, Nodes) and not bench.has_no_front:
+        try:
+            wait_for(lambda: all(_is_ready(address) for address in _nodes(bench).replicas_at()), "a node's proxy")
+        except TimeoutError as error:
+            row.broken.append(str(error))
+            return
+    row.all_serve_s = time.monotonic() - began
+    row.notes.append(f"all {bench.replicas} replicas answer requests, seen after {row.all_serve_s:.0f} s")
 
 
 def add(row: Row, crowd: Crowd, began: float) -> None:
@@ -720,7 +866,7 @@ def add(row: Row, crowd: Crowd, began: float) -> None:
         row.twice += len(seen.twice)
         row.wrong += len(seen.wrong)
         row.over_s = max(row.over_s, seen.first[-1][0] - began if seen.first else 0.0)
-        kinds.update(f"{name}: {what[:150]}" for _, what in seen.first)
+        kinds.update(f"{name}: {what[:330]}" for _, what in seen.first)
         row.broken += [f"{name}: {what}" for what in seen.wrong[:2]]
         row.broken += [f"{name} was shown: {what}" for _, what in seen.first if any(part in what for part in INSIDES)]
         row.notes += [f"{name} asked {seen.asked}, {len(seen.first)}/{len(seen.twice)}"] if seen.first else []
@@ -749,6 +895,8 @@ def get(server: Server, path: str) -> dict[str, Any]:
 
 
 def tell(row: Row, console: Console) -> None:
+    tries = f"first try failed {row.first}, retry failed {row.twice}"
+    console.print(f"  asked {row.asked}, {tries}, wrong {row.wrong}, told {row.told}")
     for note in row.notes:
         console.print(f"  {note}", markup=False)
     for kind, times in row.kinds.items():
@@ -758,9 +906,20 @@ def tell(row: Row, console: Console) -> None:
 
 
 def table(rows: list[Row]) -> Table:
-    found = Table("fault", "asked", "first try failed", "retry failed", "wrong", "told", "over after s", "holds")
+    found = Table(
+        "fault",
+        "asked",
+        "first try failed",
+        "retry failed",
+        "wrong",
+        "told",
+        "over after s",
+        "all serve after s",
+        "holds",
+    )
     for row in rows:
-        cells = (row.asked, row.first, row.twice, row.wrong, row.told, f"{row.over_s:.1f}", not row.broken)
+        serve = "never" if row.all_serve_s is None else f"{row.all_serve_s:.0f}"
+        cells = (row.asked, row.first, row.twice, row.wrong, row.told, f"{row.over_s:.1f}", serve, not row.broken)
         found.add_row(row.fault, *map(str, cells))
     return found
 

@@ -7,6 +7,7 @@ import http.client
 import json
 import os
 import secrets
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -31,12 +32,15 @@ DIFFERENT, ITS_VALUE = "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S", "1"
 # [s] For slow bodies, for requests that wait, for a replica that ends and still answers somebody: none of these limits
 # is what is tested here, and a busy machine stands still, or takes to replace two replicas, for longer than the usual.
 PATIENCE_S = 120
+RECURRENT = "lstm_box"
 Check: TypeAlias = tuple[str, bool, str]  # name, whether all is well, message
 
 # A head node as `ray start --head` makes one, but gone when its standard input is.
 CLUSTER = """
 import json, sys, ray
+from rlservo.serve_app.ray_serve.cluster_process import leave_out_agent
 plan = json.loads(sys.argv[1])
+leave_out_agent()
 context = ray.init(address="local", num_cpus=4, num_gpus=0, object_store_memory=80 << 20, include_dashboard=True,
                    dashboard_host="127.0.0.1", dashboard_port=plan["dashboard"], log_to_driver=False,
                    configure_logging=False, _temp_dir=plan["folder"], _node_ip_address="127.0.0.1")
@@ -184,9 +188,12 @@ class Cluster:
 
 
 @pytest.fixture(scope="session")
-def cluster_repository(tmp_path_factory: pytest.TempPathFactory, box_policy: Callable[..., Path]) -> Path:
-    """ur5 in versions 1 to 3, 4 with a byte of its weights changed, and 5 whose actions leave the space."""
+def cluster_repository(
+    tmp_path_factory: pytest.TempPathFactory, box_policy: Callable[..., Path], recurrent: Path
+) -> Path:
+    """ur5 in versions 1 to 3, 4 with a byte of its weights changed, and 5 whose actions leave the space; an LSTM."""
     root = tmp_path_factory.mktemp("repository")
+    shutil.copytree(recurrent / RECURRENT, root / RECURRENT)
     box_policy(root, version="5", seed=5, action_scale=400.0)
     for seed, version in enumerate(("1", "2", "3", "4")):
         box_policy(root, version=version, seed=seed)
@@ -199,7 +206,8 @@ def cluster_repository(tmp_path_factory: pytest.TempPathFactory, box_policy: Cal
 
 def serving(*versions: str, production: str = "1", **more: Any) -> dict[str, Any]:
     """Return the `user_config` for these versions of ur5."""
-    return {"policies": {"ur5": {"versions": list(versions), "aliases": {"production": production}, **more}}}
+    ur5 = {"versions": list(versions), "aliases": {"production": production}, **more}
+    return {"policies": {"ur5": ur5, RECURRENT: {}}}
 
 
 @pytest.fixture(scope="session")

@@ -73,6 +73,11 @@ class Cluster:
         deployments = self.status().get("deployments", {}).values()
         return [one["replica_id"] for each in deployments for one in each["replicas"] if one["state"] == "RUNNING"]
 
+    def replicas_at(self) -> set[str]:
+        """Return the addresses of the nodes that have a replica."""
+        deployments = self.status().get("deployments", {}).values()
+        return {one["node_ip"] for each in deployments for one in each["replicas"] if one["state"] == "RUNNING"}
+
 
 def cluster(case: Case, policies: Path, folder: Path, *, cpus: int = 4) -> Cluster:
     """Return a cluster that is not started yet, and the shipped configuration with these policies in it."""

@@ -45,10 +45,11 @@ defaults
     timeout connect 1s
     timeout client 1d
     timeout server 1d
+    timeout check 3s
     retries 3
     option redispatch 1
     option httpchk GET /v2/health/ready
-    default-server check inter 500ms fall 2 rise 1 on-marked-down shutdown-sessions
+    default-server check inter 1s fall 2 rise 1 on-marked-down shutdown-sessions
 """
 
 
@@ -150,6 +151,23 @@ class Nodes(Cluster):
             words.append(f"--address={self.head.address}:{self.gcs_port}")
         node.start(words, self.mark)
 
+    def start_redis(self) -> None:
+        """Start Redis with what its file has. Raises StartError."""
+        program = shutil.which("redis-server")
+        if program is None:
+            raise Unsupported("GCS fault tolerance needs the program redis-server (Debian's redis-server)")
+        host, _, port = self.variables["RAY_REDIS_ADDRESS"].rpartition(":")
+        words = ["--bind", host, "--port", port, "--protected-mode", "no", "--appendonly", "yes"]
+        words += ["--dir", str(self.folder)]
+        self.redis = subprocess.Popen([program, *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        _until(lambda: listening(int(port), host), None)
+
+    def stop_redis(self, *, kill: bool = False) -> None:
+        if self.redis is not None:
+            self.redis.send_signal(signal.SIGKILL if kill else signal.SIGTERM)
+            self.redis.wait()
+            self.redis = None
+
     def await_head(self) -> None:
         """Return when the head's dashboard listens. Raises StartError."""
         _until(lambda: listening(self.dashboard, self.host), self.head)
@@ -179,7 +197,8 @@ def nodes_running(case: Case, policies: Path, folder: Path, mark: str, *, namesp
     with ExitStack() as cleanup:
         made = _nodes(case, folder, mark, namespaces, cleanup)
         _configure(made, policies, namespaces)
-        _start_redis(made, cleanup)
+        cleanup.callback(made.stop_redis)
+        made.start_redis()
         for node in made.nodes:
             cleanup.callback(node.stop)
         made.start(made.head)
@@ -261,19 +280,6 @@ def _configure(made: Nodes, policies: Path, namespaces: bool) -> None:
     arguments = {"policies": [str(policies)], "replicas": NODES, "settings": settings}
     configuration["applications"][0]["args"] = arguments
     made.configuration = configuration
-
-
-def _start_redis(made: Nodes, cleanup: ExitStack) -> None:
-    program = shutil.which("redis-server")
-    if program is None:
-        raise Unsupported("GCS fault tolerance needs the program redis-server (Debian's redis-server)")
-    host, _, port = made.variables["RAY_REDIS_ADDRESS"].rpartition(":")
-    words = ["--bind", host, "--port", port, "--protected-mode", "no", "--appendonly", "yes", "--dir", str(made.folder)]
-    process = subprocess.Popen([program, *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    cleanup.callback(process.wait)
-    cleanup.callback(process.terminate)
-    made.redis = process
-    _until(lambda: listening(int(port), host), None)
 
 
 def _until(condition: Callable[[], bool], node: Node | None) -> None:

@@ -90,6 +90,10 @@ class SharedSessions:
         self._leaving: asyncio.Event | None = None
         self._tasks: set[asyncio.Task[None]] = set()  # asyncio itself forgets those that nobody waits for
         self._doubtful: set[str] = set()  # records that led nowhere when they were last looked at
+        self.hops = 0
+        """Steps that another replica was asked to take, since it has the memory."""
+        self.unreachable = 0
+        """Reads and writes of records that the store did not answer."""
         episodes.is_shared = True
 
     async def act(self, store: PolicyStore, request: Request) -> Decision:
@@ -179,6 +183,7 @@ class SharedSessions:
         sent = replace(request, headers=headers, reply_options=None, stream=None)
         if request.deadline_ms is not None:  # from when the owner has it
             sent.deadline_ms = request.deadline_ms - (time.perf_counter() - request.received) * 1e3
+        self.hops += 1
         try:
             found = await asyncio.wait_for(self._peers.call(record.replica, "act", sent, record.token), HOP_TIMEOUT_S)
         except Exception as error:
@@ -271,20 +276,28 @@ class SharedSessions:
         try:
             content = await self._records.get(key)
         except Exception as error:
-            raise _unknown(error) from None
+            raise self._count_unreachable(error) from None
         return None if content is None else Record(*json.loads(content))
 
     async def _put(self, key: str, record: Record) -> None:
         try:
             await self._records.put(key, json.dumps(record).encode())
         except Exception as error:
-            raise _unknown(error) from None
+            raise self._count_unreachable(error) from None
 
     async def _delete(self, key: str) -> None:
         try:
             await self._records.delete(key)
         except Exception as error:
-            raise _unknown(error) from None
+            raise self._count_unreachable(error) from None
+
+    def _count_unreachable(self, error: Exception) -> UnavailableError:
+        self.unreachable += 1
+        logger.debug("the records of sessions cannot be reached: %s", error)
+        return UnavailableError(
+            "the cluster's store cannot say at the moment which replica has this session: try again, or "
+            "send the 'state' along"
+        )
 
     def _lost(self, request: Request) -> SessionLostError:
         assert request.episode is not None and request.episode.session_id is not None
@@ -311,11 +324,3 @@ def _bare(session: Session) -> Session:
 def key_of(name: str, session_id: SessionId) -> str:
     """Return the key of an id's record: of one length, whatever the id is."""
     return hashlib.blake2b(json.dumps([name, session_id]).encode(), digest_size=16).hexdigest()
-
-
-def _unknown(error: Exception) -> UnavailableError:
-    logger.debug("the records of sessions cannot be reached: %s", error)
-    return UnavailableError(
-        "the cluster's store cannot say at the moment which replica has this session: try again, or "
-        "send the 'state' along"
-    )

@@ -47,7 +47,7 @@ HEAD_S = 5.0
 MAX_HEAD_BYTES = 16384
 """Of a request's head, as in HAProxy's buffer."""
 BODY_S = 30.0
-"""[s] for a body, where a route has no shorter time of its own (`body_timeout_s`)."""
+"""[s] for a body, where a route has no time of its own (`body_timeout_s`); never less (`leave_time_for_bodies`)."""
 LINGER_S = 1.0
 """[s] in which a client that still sends may take the reply: closed at once, what it sends would destroy the reply."""
 UNREAD_S = 10.0
@@ -84,6 +84,7 @@ PRIVATE_OF_STREAMS = ("handle_cont", "handle_ping", "handle_pong")
 class TimedProtocol(HttpToolsProtocol):
     """A connection that ends when one of its phases takes too long, and writes each reply at once."""
 
+    body_s = BODY_S
     _head_since: float | None = None  # since when a head is awaited; None while something else is
     _body_since = 0.0  # since when the request's body is awaited
     _timer: asyncio.TimerHandle | None = None
@@ -241,7 +242,7 @@ class TimedProtocol(HttpToolsProtocol):
             if self.timeout_keep_alive_task is None:  # something came, but no head began: blank lines
                 self._head_since = now
         else:
-            late = cycle.more_body and now - self._body_since > BODY_S
+            late = cycle.more_body and now - self._body_since > self.body_s
         if not late:
             self._timer = self.loop.call_later(CHECK_PERIOD_S, self._check_phase)
             return
@@ -343,6 +344,11 @@ def refusal(status: int, body: bytes, *more: tuple[bytes, bytes]) -> ASGIApp:
         await send({"type": "http.response.body", "body": body})
 
     return refuse
+
+
+def leave_time_for_bodies(seconds: float) -> None:
+    """Let connections of this process wait at least so long for a body: its route says when it has waited enough."""
+    TimedProtocol.body_s = max(BODY_S, seconds)
 
 
 def install() -> None:

@@ -27,10 +27,11 @@ import numpy as np
 import psutil
 import pytest
 
-from clusters import KEY, PATIENCE_S, Cluster, serving
+from clusters import KEY, PATIENCE_S, RECURRENT, Cluster, serving
 from rlservo.export.contract.errors import ConflictError, RefusedError, UnauthenticatedError
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.runtime.policy import Policy
+from servers import ask
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow, pytest.mark.random_order(disabled=True)]
 
@@ -109,13 +110,56 @@ def loaded(cluster: Cluster, path: str = "/v1/policies/ur5/act") -> Iterator[Loa
             thread.join()
 
 
+class Sessions:
+    """Sessions by id, which all replicas know of: whatever happens to these, a new one must be able to start."""
+
+    def __init__(self, cluster: Cluster, count: int = 8) -> None:
+        self._cluster = cluster
+        self._steps = {f"robot-{number}": 0 for number in range(count)}
+        generator = np.random.default_rng(0)
+        self._seen = [generator.uniform(-1, 1, 3).astype(np.float32) for _ in range(20)]
+        with Policy.load(cluster.repository / RECURRENT) as policy:
+            self._expected = [policy.act(obs) for obs in self._seen]
+        assert self.step() == []
+
+    def step(self) -> list[str]:
+        """Take a step of each, compare it bit by bit, and return those that are lost; they begin anew."""
+        lost = []
+        for session_id, step in self._steps.items():
+            code, reply = self._ask(session_id, step)
+            if code == 410:
+                lost.append(session_id)
+                code, reply = self._ask(session_id, step := 0)
+            assert (code, reply.get("session_step")) == (200, step + 1), reply
+            assert np.array_equal(np.array(reply["action"], np.float32), self._expected[step])
+            self._steps[session_id] = step + 1
+        return lost
+
+    def _ask(self, session_id: str, step: int) -> tuple[int, Any]:
+        body = {"obs": self._seen[step].tolist(), "session_id": session_id, "reset": step == 0}
+        deadline = time.monotonic() + PATIENCE_S
+        while (found := ask(self._cluster.port, "POST", f"/v1/policies/{RECURRENT}/act", body, KEY))[0] == 503:
+            assert time.monotonic() < deadline, found
+            time.sleep(0.2)
+        return found
+
+
+@pytest.fixture(scope="module")
+def sessions(cluster: Cluster) -> Sessions:
+    return Sessions(cluster)
+
+
 def set_alias(cluster: Cluster, alias: str) -> None:
     with cluster.admin() as admin:
         admin.alias("ur5", alias, "1")
 
 
+def policy_of(replica: dict[str, Any]) -> dict[str, Any]:
+    return next(policy for policy in replica["policies"] if policy["name"] == "ur5")
+
+
 def default_of(replica: dict[str, Any]) -> str:
-    return str(next(policy["version"] for policy in replica["policies"] if policy["name"] == "ur5"))
+    return str(policy_of(replica)["version"])
 
 
 def test_aliases_switch_on_every_replica_under_load_without_a_failed_request(cluster: Cluster) -> None:
@@ -137,7 +181,7 @@ def test_aliases_switch_on_every_replica_under_load_without_a_failed_request(clu
     assert load.answered > 50
     for replica in cluster.replicas():
         assert default_of(replica) == "2"
-        assert set(replica["policies"][0]["aliases"]) == {"production", *(f"at-once-{n}" for n in range(6))}
+        assert set(policy_of(replica)["aliases"]) == {"production", *(f"at-once-{n}" for n in range(6))}
 
 
 def test_a_broken_version_is_refused_under_load_and_nothing_changes(cluster: Cluster) -> None:
@@ -156,7 +200,7 @@ def test_a_broken_version_is_refused_under_load_and_nothing_changes(cluster: Clu
     for replica in seen:
         assert default_of(replica) in before
         assert "policy.onnx is not the file that was exported" in replica["refused"]["reason"]
-        states = {v["version"]: v for v in replica["policies"][0]["version_states"]}
+        states = {v["version"]: v for v in policy_of(replica)["version_states"]}
         assert (states["4"]["state"], states["2"]["state"]) == ("failed", "ready")
         assert "is not the file" in states["4"]["reason"]
 
@@ -198,7 +242,9 @@ def half_sent(cluster: Cluster) -> Iterator[Callable[[], list[int]]]:
         yield finish
 
 
-def test_a_rolling_update_of_settings_costs_no_request_and_keeps_the_commands(cluster: Cluster) -> None:
+def test_a_rolling_update_of_settings_costs_no_request_and_keeps_the_commands(
+    cluster: Cluster, sessions: Sessions
+) -> None:
     with cluster.admin() as admin:
         admin.alias("ur5", "candidate", "1")
     old = {each["replica"] for each in cluster.replicas()}
@@ -211,11 +257,14 @@ def test_a_rolling_update_of_settings_costs_no_request_and_keeps_the_commands(cl
         assert finish() == [200, 200]
     assert load.first_failures == [], Counter(load.first_failures)
     assert set(load.versions) == {"3"}
+    assert sessions.step() == []  # handed over
     for replica in seen:
-        assert replica["policies"][0]["aliases"] == {"production": "3", "candidate": "1"}
+        assert policy_of(replica)["aliases"] == {"production": "3", "candidate": "1"}
 
 
-def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_back_as_it_was(cluster: Cluster) -> None:
+def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_back_as_it_was(
+    cluster: Cluster, sessions: Sessions
+) -> None:
     with cluster.admin() as admin:
         admin.alias("ur5", "candidate", "3")
     generation = {each["generation"] for each in cluster.replicas()}
@@ -230,6 +279,7 @@ def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_bac
     assert len(load.first_failures) <= CLIENTS  # each had one request in it at most
     assert set(load.versions) == {"3"}
     assert {each["generation"] for each in cluster.replicas()} == generation
+    sessions.step()
 
 
 def test_a_killed_proxy_is_back_at_once_and_nobody_is_told_that_the_policy_is_unknown(cluster: Cluster) -> None:
@@ -462,7 +512,7 @@ def latencies_of(reply: dict[str, Any]) -> list[int]:
     return [count for version in reply["counts"].values() for count in version["latency"]]
 
 
-def test_a_lost_node_costs_a_client_that_retries_once_nothing(cluster: Cluster) -> None:
+def test_a_lost_node_costs_a_client_that_retries_once_nothing(cluster: Cluster, sessions: Sessions) -> None:
     (deployment,) = cluster.application["deployments"]
     with joined(cluster) as node, cluster.admin() as admin:
         # New replicas, one for each node: those that are there know of no such limit.
@@ -474,6 +524,7 @@ def test_a_lost_node_costs_a_client_that_retries_once_nothing(cluster: Cluster) 
             while not (len(replicas_of(node)) == 1 and len(cluster.replica_pids()) == 2):  # of both nodes
                 assert time.monotonic() < deadline, "the replicas are not apart"
                 time.sleep(0.2)
+            sessions.step()  # those that were begun on the other node go with it
             with loaded(cluster) as load:
                 while not all(any(latencies_of(reply)) for reply in admin.counts("ur5")):
                     assert time.monotonic() < deadline, "a replica was asked nothing"
@@ -493,3 +544,4 @@ def test_a_lost_node_costs_a_client_that_retries_once_nothing(cluster: Cluster) 
             assert np.array_equal(np.array(action, np.float32), expected)
     cluster.wait_for(lambda seen: len(seen) == 2)
     cluster.wait_for_status("RUNNING")
+    sessions.step()

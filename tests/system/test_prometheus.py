@@ -171,6 +171,8 @@ def scraped(prometheus: Prometheus, live_server: LiveServer) -> Iterator[Prometh
             assert ask(port, "POST", "/v1/policies/ur5/act", {**fields, "deadline_ms": 0}, key)[0] == 408
             session = {"obs": [0.0] * 3, "session_id": f"prometheus-{turn}", "reset": True}
             assert ask(port, "POST", "/v1/policies/lstm_box/act", session, key)[0] == 200
+            end = {**session, "reset": False, "end": True, "final_status": "success"}
+            assert ask(port, "POST", "/v1/policies/lstm_box/act", end, key)[0] == 200
 
         everything(0)
         replica = 'rlservo_requests_total{policy="lstm_box",protocol="json",code="ok"}'

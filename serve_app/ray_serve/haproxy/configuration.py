@@ -194,7 +194,8 @@ def _answer_without_replicas(text: str) -> str:
     """Say that replicas are not there yet, or no more: 404 would say that there is no such policy."""
     unknown = r"^( *http-request return) status 404 .*$"
     text = _replace(text, unknown, r"\1 status 503 default-errorfiles", "the answer to unknown paths")
-    if _has_grpc(text):
+    # One application has a backend and all calls, also where it has lost its replicas: nothing is unknown then.
+    if _has_grpc(text) and _count(r"^backend grpc-", text) != 1:
         unknown, new = r"(hdr grpc-status )5( hdr grpc-message) .*$", r'\g<1>14\2 "no replica is there yet"'
         text = _replace(text, unknown, new, "the answer to unknown gRPC applications", times=2)
     return text

@@ -179,7 +179,8 @@ def test_a_number_and_a_string_that_looks_like_it_are_two_sessions(server: Serve
 
 
 def test_sessions_are_on_metrics(server: Server) -> None:
-    assert server.metrics() == {("rlservo_episodes_remembered",): 0}
+    alone = {("rlservo_session_hops_total",): 0, ("rlservo_session_records_unreachable_total",): 0}
+    assert server.metrics() == {("rlservo_episodes_remembered",): 0, **alone}
     server.act("a", reset=True)
     server.act("b", rows=3, reset=True)
     server.act("a", end=True)

@@ -347,6 +347,7 @@ def test_a_request_sent_again_by_the_proxy_is_one_step(world: World, obs: Any) -
         assert (await owner.act(request("s", obs, stamp=b"2"))).episode.step == 3  # type: ignore[union-attr]
         with pytest.raises(SessionError, match="answered already"):
             await one.act(request("s", obs, stamp=b"1"))
+        assert [each.shared.hops for each in (owner, one, other)] == [0, 2, 1]
 
     asyncio.run(run())
 
@@ -359,6 +360,7 @@ def test_without_the_store_nothing_is_computed_and_the_memory_stays(world: World
         for begins in (False, True):
             with pytest.raises(UnavailableError, match="send the 'state' along"):
                 await owner.act(request("s", obs, reset=begins))
+        assert owner.shared.unreachable == 2
         world.cut.clear()
         assert (await owner.act(request("s", obs))).episode.step == 2  # type: ignore[union-attr]
 

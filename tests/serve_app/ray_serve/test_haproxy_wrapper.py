@@ -364,8 +364,8 @@ def test_a_bridge_has_none_of_what_is_rays_own(node: Node) -> None:
     assert f"bind 127.0.0.1:{node.port}" in bridge and "server SERVE_REPLICA" in bridge
 
 
-def rendered(folder: Path, *, replicas: bool, grpc: bool) -> str:
-    """Return what the installed Ray writes, by its own template."""
+def rendered(folder: Path, *, replicas: bool, grpc: bool, lost: bool = False) -> str:
+    """Return what the installed Ray writes, by its own template; `lost`: where Serve's own proxy is a last resort."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # Ray's own
         from ray.serve._private.common import RequestProtocol
@@ -383,12 +383,14 @@ def rendered(folder: Path, *, replicas: bool, grpc: bool) -> str:
         metrics_enabled=False,
     )
     backends = {}
-    for protocol in (RequestProtocol.HTTP, *([RequestProtocol.GRPC] if grpc else [])) if replicas else ():
-        server = ServerConfig(name="SERVE_REPLICA_rlservo-a", host="127.0.0.1", port=1)
+    for protocol in (RequestProtocol.HTTP, *([RequestProtocol.GRPC] if grpc else [])) if replicas or lost else ():
+        servers = [ServerConfig(name="SERVE_REPLICA_rlservo-a", host="127.0.0.1", port=1)] if replicas else []
+        fallback = ServerConfig(name="fallback", host="127.0.0.1", port=2) if lost else None
         name = f"{protocol.value.lower()}-rlservo"
         backends[name] = BackendConfig(
-            name=name, path_prefix="/", app_name="rlservo", servers=[server], protocol=protocol
-        )
+            name=name, path_prefix="/", app_name="rlservo", servers=servers, protocol=protocol,
+            fallback_server=fallback,
+        )  # fmt: skip
     api = HAProxyApi(config, backends, config_file_path=str(folder / "haproxy.cfg"))
     api._generate_config_file_internal()
     return (folder / "haproxy.cfg").read_text()
@@ -403,13 +405,13 @@ def is_valid(text: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize("grpc", [False, True])
-@pytest.mark.parametrize("replicas", [False, True])
+@pytest.mark.parametrize(("replicas", "lost"), [(False, False), (True, False), (True, True), (False, True)])
 @pytest.mark.parametrize("secret", ["", "0123456789abcdef"])
 def test_every_configuration_of_the_installed_ray_is_mended(
-    tmp_path: Path, replicas: bool, grpc: bool, secret: str
+    tmp_path: Path, replicas: bool, lost: bool, grpc: bool, secret: str
 ) -> None:
     error_replies.write_error_replies(tmp_path)
-    text = rendered(tmp_path, replicas=replicas, grpc=grpc)
+    text = rendered(tmp_path, replicas=replicas, grpc=grpc, lost=lost)
     limits = configuration.Limits(max_connections=1000, stream_idle_s=12.5, secret=secret)
     mended = configuration.patch_configuration(text, tmp_path, limits=limits)
     assert is_valid(mended, tmp_path) == ""

@@ -54,7 +54,7 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[uvicorn.Server]:
     """A server whose phases end after a second."""
     monkeypatch.setattr(http_connections, "HEAD_S", 1.0)
-    monkeypatch.setattr(http_connections, "BODY_S", 1.0)
+    monkeypatch.setattr(TimedProtocol, "body_s", 1.0)
     monkeypatch.setattr(http_connections, "UNREAD_S", 1.0)
     monkeypatch.setattr(http_connections, "CHECK_PERIOD_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -111,6 +111,17 @@ def test_so_does_a_further_head(port: int, more: bytes) -> None:
 def test_a_body_that_does_not_come_ends_the_connection(port: int) -> None:
     head = b"POST / HTTP/1.1\r\nhost: x\r\ncontent-length: 100000\r\n\r\n"
     assert until_closed(port, head + b"x" * 1000).startswith(b"HTTP/1.1 408")
+
+
+def test_a_body_has_as_long_as_its_route_gives_it(port: int) -> None:
+    http_connections.leave_time_for_bodies(60.0)  # the fixture's end takes it back
+    with socket.create_connection(("127.0.0.1", port), timeout=2.0) as connection:
+        connection.sendall(b"POST / HTTP/1.1\r\nhost: x\r\ncontent-length: 4\r\n\r\nab")
+        with pytest.raises(TimeoutError):
+            connection.recv(1)
+        connection.settimeout(SOON_S)
+        connection.sendall(b"cd")
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200 ")
 
 
 @pytest.mark.parametrize("announced", ["content-length: 10000000", "transfer-encoding: chunked"])
