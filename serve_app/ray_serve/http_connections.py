@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import uvicorn
 from uvicorn.protocols.http import auto
-from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from rlservo.serve_app.protocols.http_endpoint import REPLY, WholeBody
@@ -79,6 +79,21 @@ LARGE_REPLY = (
 # What the subclass overrides or reads of uvicorn's private parts.
 PRIVATE = ("_should_upgrade", "_start_asgi_task", "_unset_keepalive_if_required", "handle_websocket_upgrade")
 PRIVATE_OF_STREAMS = ("handle_cont", "handle_ping", "handle_pong")
+
+
+class EarlyEnd(RequestResponseCycle):
+    """A request whose connection ends, and says so, when it is answered before all of it has come."""
+
+    ends_early = False
+
+    async def send(self, message: Any) -> None:
+        """Write a part of the reply."""
+        if self.response_started or not self.more_body:
+            await super().send(message)
+            return
+        self.ends_early, self.keep_alive = True, False  # the head says `Connection: close`
+        await super().send(message)
+        self.keep_alive = True  # closed at once, the client that still sends would lose the reply: `_linger`
 
 
 class TimedProtocol(HttpToolsProtocol):
@@ -158,8 +173,8 @@ class TimedProtocol(HttpToolsProtocol):
     def on_response_complete(self) -> None:
         """Give a client that is still sending a moment to take its reply, and close."""
         super().on_response_complete()
-        cycle = self.cycle
-        if cycle.response_complete and cycle.more_body and not self.transport.is_closing():
+        cycle: Any = self.cycle
+        if cycle.response_complete and cycle.ends_early and not self.transport.is_closing():
             self._unset_keepalive_if_required()
             self._stop()
             self.loop.call_soon(self._linger)  # the reply may be held until the end of this turn (`joined_writes.py`)
@@ -173,6 +188,7 @@ class TimedProtocol(HttpToolsProtocol):
         return super()._should_upgrade() and not _has_body(self.scope) and self._refuse is None
 
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
+        cycle.__class__ = EarlyEnd  # uvicorn's class is not the protocol's to choose
         # The parser has stopped at this head: a body is lost, and so is the next request.
         parser: Any = self.parser
         if parser.should_upgrade() and any(name == b"upgrade" for name, _ in cycle.scope["headers"]):
