@@ -29,17 +29,18 @@ import socket
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import uvicorn
-from uvicorn.protocols.http import auto
-from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
-from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-
-from websockets.frames import apply_mask
-from websockets.protocol import OPEN
-
 from rlservo.serve_app.protocols.http_endpoint import REPLY, WholeBody
-from rlservo.serve_app.ray_serve import eager_start
+from rlservo.serve_app.ray_serve import eager_start, uvicorn_parts
 from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
+from rlservo.serve_app.ray_serve.uvicorn_parts import (
+    OPEN,
+    STATUS_LINE,
+    HttpToolsProtocol,
+    RequestResponseCycle,
+    WebSocketsSansIOProtocol,
+    apply_mask,
+    auto,
+)
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -82,9 +83,6 @@ LARGE_REPLY = (
     b"HTTP/1.1 431 Request Header Fields Too Large\r\ncontent-type: application/json\r\nconnection: close\r\n"
     b"content-length: %d\r\n\r\n%s" % (len(HEAD_TOO_LARGE), HEAD_TOO_LARGE)
 )
-# What the subclass overrides or reads of uvicorn's private parts.
-PRIVATE = ("_should_upgrade", "_start_asgi_task", "_unset_keepalive_if_required", "handle_websocket_upgrade")
-PRIVATE_OF_STREAMS = ("handle_cont", "handle_ping", "handle_pong")
 
 
 class EarlyEnd(RequestResponseCycle):
@@ -419,11 +417,5 @@ def install() -> None:
     """Let uvicorn's servers of this process use it. Raises RuntimeError for another uvicorn than is known here."""
     if auto.AutoHTTPProtocol is TimedProtocol:
         return
-    classes: dict[type, tuple[str, ...]] = {HttpToolsProtocol: PRIVATE, WebSocketsSansIOProtocol: PRIVATE_OF_STREAMS}
-    missing = [
-        f"{kind.__name__} has no {name}" for kind, names in classes.items() for name in names if not hasattr(kind, name)
-    ]
-    if auto.AutoHTTPProtocol is not HttpToolsProtocol or missing:
-        what = f"its {missing[0]}" if missing else "httptools is missing"
-        raise RuntimeError(f"uvicorn {uvicorn.__version__} cannot be given time-outs for its connections: {what}")
+    uvicorn_parts.check()
     auto.AutoHTTPProtocol = TimedProtocol

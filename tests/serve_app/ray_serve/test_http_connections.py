@@ -7,6 +7,7 @@ import contextlib
 import http.client
 import json
 import random
+import runpy
 import socket
 import threading
 import time
@@ -15,10 +16,10 @@ from typing import Any
 
 import pytest
 import uvicorn
-from uvicorn.protocols.http import auto
+from uvicorn.protocols.http import auto, httptools_impl
 from uvicorn.server import ServerState
 
-from rlservo.serve_app.ray_serve import http_connections
+from rlservo.serve_app.ray_serve import http_connections, uvicorn_parts
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 from rlservo.serve_app.ray_serve.ingress import Ingress
 
@@ -180,12 +181,25 @@ def test_an_idle_connection_outlives_the_phases_of_a_request(port: int) -> None:
     connection.close()
 
 
-def test_a_uvicorn_without_what_it_changes_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_connections, "PRIVATE", ("_start_asgi_task", "_moved_elsewhere"))
-    with pytest.raises(RuntimeError, match=rf"uvicorn {uvicorn.__version__} .*_moved_elsewhere"):
+NAMES = [(part, kind) for part in (uvicorn_parts.METHODS, uvicorn_parts.FIELDS) for kind in part]
+
+
+@pytest.mark.parametrize(("part", "kind"), NAMES, ids=lambda one: getattr(one, "__name__", ""))
+def test_a_uvicorn_without_what_it_uses_is_refused_by_name(
+    part: dict[type, tuple[str, ...]], kind: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uvicorn_parts.check()
+    monkeypatch.setitem(part, kind, (*part[kind], "_moved_elsewhere"))
+    refused = rf"uvicorn {uvicorn.__version__} .* has no {kind.__name__}\._moved_elsewhere, "
+    with pytest.raises(RuntimeError, match=refused):
         http_connections.install()
     assert auto.AutoHTTPProtocol is not TimedProtocol
-    assert asyncio.iscoroutinefunction(app)
+
+
+def test_so_is_one_without_what_it_imports(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(httptools_impl, "STATUS_LINE")
+    with pytest.raises(RuntimeError, match=rf"uvicorn {uvicorn.__version__} .*STATUS_LINE"):
+        runpy.run_path(uvicorn_parts.__file__)
 
 
 # Streams: what comes faster than it can be answered.
