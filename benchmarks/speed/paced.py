@@ -110,8 +110,9 @@ def paced(make: Callable[[float], Robot], *, robots: int, rate_hz: float, second
             for connection in ready:
                 robot = by_socket[connection]
                 if robot.read():
-                    if robot.due >= counted:
-                        taken.append(time.perf_counter() - robot.due)
+                    at = time.perf_counter()
+                    if at >= counted:
+                        taken.append(at - robot.due)
                     robot.due += period
     finally:
         for robot in fleet:
@@ -156,7 +157,7 @@ def paced_calls(
                 at, number, done = answered.get(timeout=max(0.0, soonest - time.perf_counter()))
                 if done.exception() is not None:
                     raise LoadError(f"gRPC: {done.exception()}")
-                if due_of[number] >= counted:
+                if at >= counted:
                     taken.append(at - due_of[number])
                 heapq.heappush(waiting, (due_of[number] + period, number))
     except grpc.RpcError as error:
