@@ -51,7 +51,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the servers are ended then, too
     if shutil.which("wrk") is None:
         raise SystemExit("the load generator wrk is missing: apt-get install wrk")
-    console = Console(highlight=False)
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
     with ExitStack() as cleanup:
         # A short name: Ray puts Unix sockets below it.
         folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="rlsb-", ignore_cleanup_errors=True)))

@@ -288,11 +288,11 @@ def protocols(result: Result) -> list[list[str]]:
     return rows
 
 
-PACED_HEADINGS = ["load", "server", "p50 ms", "p99 ms", "p99.9 ms", "late %", "x bare ASGI, p99.9"]
+PACED_HEADINGS = ["load", "server", "p50 ms", "p99 ms", "p99.9 ms", "late %", "p99.9 x bare"]
 
 
 def paced_loads(result: Result) -> list[list[str]]:
-    """One row per paced load and server: from when each robot should have asked; late is half a period."""
+    """One row per paced load and server, from when each robot should have asked: late is half a period."""
     rows = []
     for measure, name in result.samples:
         if is_paced(measure):
