@@ -3,6 +3,9 @@
 Its front, which is written in Rust, hands each request to the worker's process.
 """
 
+# pyright: reportMissingImports=false
+# Its library is in an environment of its own.
+
 from __future__ import annotations
 
 import os
