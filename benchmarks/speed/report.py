@@ -267,7 +267,7 @@ def table(result: Result) -> list[list[str]]:
             result.median(JSON64, name, p99),
             result.server_mb.get(name),
         ]
-        formats = ("{:.3f}", "{:.2f}", "{:.2f}", "{:,.0f}", "{:,.0f}", "{:,.0f}", "{:,.0f}")
+        formats: tuple[str, ...] = ("{:.3f}", "{:.2f}", "{:.2f}", "{:,.0f}", "{:,.0f}", "{:,.0f}", "{:,.0f}")
         formats += ("{:,.0f}", "{:.1f}", "{:,.0f}")
         rows.append([name, *("" if c is None else f.format(c) for f, c in zip(formats, columns, strict=True))])
     return rows

@@ -116,7 +116,7 @@ class Rounds:
         heavy = [(one.name, over_wrk(one, one.heavy, CONNECTIONS)) for one in two if one.heavy is not None]
         self._add(HEAVY, heavy)
         for robots, rate_hz in fleets:
-            fleet = {"robots": robots, "rate_hz": rate_hz, "seconds": seconds}
+            fleet: dict[str, Any] = {"robots": robots, "rate_hz": rate_hz, "seconds": seconds}
             self._add(
                 paced_measure("json", robots, rate_hz),
                 [(one.name, partial(paced, partial(http_robot, one.port, one.act), **fleet)) for one in ours],

@@ -38,7 +38,7 @@ from rlservo.serve_app.ray_serve.uvicorn_parts import (
     HttpToolsProtocol,
     RequestResponseCycle,
     WebSocketsSansIOProtocol,
-    apply_mask,
+    apply_mask,  # pyright: ignore[reportPrivateImportUsage]
     auto,
 )
 

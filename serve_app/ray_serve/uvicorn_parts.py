@@ -6,10 +6,8 @@ next Ray", says what each is for.
 
 from __future__ import annotations
 
-import inspect
-
 import uvicorn
-import websockets
+from websockets.version import version as websockets_version
 
 UVICORN = "0.54"
 """The uvicorn these names are of."""
@@ -18,7 +16,7 @@ UVICORN = "0.54"
 def refusal(name: str) -> RuntimeError:
     """Return the error for a name that is missing."""
     return RuntimeError(
-        f"uvicorn {uvicorn.__version__} (with websockets {websockets.__version__}) has no {name}, without which a "
+        f"uvicorn {uvicorn.__version__} (with websockets {websockets_version}) has no {name}, without which a "
         f"replica's connections have no time-outs: install a uvicorn that this version of rlservo knows, such as "
         f"{UVICORN}"
     )
@@ -28,7 +26,9 @@ try:
     from uvicorn.protocols.http import auto
     from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
     from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-    from websockets.frames import apply_mask
+
+    # In C where that is there; neither mypy nor pyright takes it for the module's own.
+    from websockets.frames import apply_mask  # type: ignore[attr-defined]  # pyright: ignore[reportPrivateImportUsage]
     from websockets.protocol import OPEN
     from websockets.server import ServerProtocol
 except ImportError as missing:  # its name is in the sentence of Python's
@@ -82,7 +82,7 @@ def check() -> None:
             if not hasattr(kind, name):
                 raise refusal(f"{kind.__name__}.{name}")
     for kind, names in FIELDS.items():
-        set_by_init = inspect.unwrap(kind.__init__).__code__.co_names  # of an object there is none yet
+        set_by_init = vars(kind)["__init__"].__code__.co_names  # of an object there is none yet
         for name in names:
             if name not in set_by_init:
                 raise refusal(f"{kind.__name__}.{name}")
