@@ -4,11 +4,12 @@
                                  [--bundle DIR --checkpoint RL_MODULE_DIR]
 
 One machine, one run, one policy (the shipped UR5's), one load generator (`wrk`, and for what it does not speak a line
-client in Python). The peers come from PyPI, each in an environment of its own, with one worker each. All servers run at
-the same time and take turns in short rounds, so that a slow moment of the machine falls on all of them. What is
-compared are ratios within rounds; absolute times belong to the machine. CPU time per request, of all of a server's
-processes, depends on it less. Results go to bench/serving.md, .json and .svg; with
---publish the table and the chart also to benchmarks/, to be committed.
+client in Python). The peers come from PyPI and npm, each in an environment of its own, with one worker each. All
+servers run at the same time and take turns in short rounds, so that a slow moment of the machine falls on all of them.
+What is compared are ratios within rounds; absolute times belong to the machine. CPU time per request, of all of a
+server's processes, depends on it less. Robots at their pace come from `speed/paced.py`, whose own share of a tail falls
+on all servers alike. Results go to bench/serving.md, .json and .svg; with --publish the table and the chart also to
+benchmarks/, to be committed.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ from rich.console import Console
 from rich.table import Table
 
 from speed import report
-from speed.catalogue import RLLIB, RLSERVO, Case, case_of, servers
+from speed.catalogue import BARE_ASGI, DIRECT, MAKERS, RLLIB, RLSERVO, Case, case_of, direct, servers
 from speed.machine import REPLICA, pss_mb
 from speed.report import Result, verdicts
-from speed.rounds import Rounds, check_answers
+from speed.rounds import PLANNED_HZ, Rounds, carried, check_answers
 from speed.servers import Server, StartError, running
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -50,17 +51,15 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the servers are ended then, too
     if shutil.which("wrk") is None:
         raise SystemExit("the load generator wrk is missing: apt-get install wrk")
-    console = Console(highlight=False)
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
     with ExitStack() as cleanup:
         # A short name: Ray puts Unix sockets below it.
         folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="rlsb-", ignore_cleanup_errors=True)))
         case = case_of(*policy(arguments, folder, console))
         console.print("preparing the peers' environments (the first time, a few minutes) ...")
-        compared, missing = servers(case, folder)
-        known = {one.name for one in compared} | set(missing)
-        if strange := [name for name in arguments.only or () if name not in known]:
-            raise SystemExit(f"--only: no server is called '{strange[0]}': there are {', '.join(sorted(known))}")
-        compared = [one for one in compared if not arguments.only or one.name in (RLSERVO, *arguments.only)]
+        if strange := [name for name in arguments.only or () if name not in MAKERS]:
+            raise SystemExit(f"--only: no server is called '{strange[0]}': there are {', '.join(MAKERS)}")
+        compared, missing = servers(case, folder, arguments.only)
         result = measure(case, compared, folder, arguments, console)
         result.missing.update(missing)
     facts = {
@@ -133,11 +132,19 @@ def measure(
             else:
                 cold.setdefault(server.name, server.cold_start_s)
                 started.append(server)
+                if server.name == RLSERVO:
+                    started.append(direct(server))
         check_answers(started, case)
         samples = Rounds(case, started, folder, arguments.seconds).run(arguments.rounds, console.print)
+        robots = {
+            (one.name, rate_hz): carried(one, rate_hz, arguments.seconds)
+            for rate_hz in PLANNED_HZ
+            for one in started
+            if one.name in (RLSERVO, DIRECT, BARE_ASGI)
+        }
         replica_mb, server_mb = memory(started)
         console.print("stopping the servers ...")
-    return Result(samples, cold, replica_mb, server_mb, missing)
+    return Result(samples, cold, replica_mb, server_mb, missing, robots)
 
 
 def cold_starts(pair: list[Server], folder: Path, mark: str, times: int, console: Console) -> dict[str, float]:
@@ -166,11 +173,13 @@ def memory(compared: list[Server]) -> tuple[dict[str, float], dict[str, float]]:
 def show(result: Result, console: Console) -> None:
     for title, headings, rows in (
         (
-            "sequential JSON, then 16 connections (CPU: the whole server's, per request)",
+            "sequential JSON, then 16 and 64 connections (CPU: the whole server's, per request)",
             report.HEADINGS,
             report.table(result),
         ),
         ("one protocol and another", report.PROTOCOL_HEADINGS, report.protocols(result)),
+        ("robots at their pace", report.PACED_HEADINGS, report.paced_loads(result)),
+        ("robots with p99.9 under a quarter of the period", report.ROBOTS_HEADINGS, report.robots(result)),
     ):
         shown = Table(title=title, box=None, padding=(0, 1, 0, 0))  # no frame and narrow gaps: it fits a terminal
         for heading in headings:

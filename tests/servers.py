@@ -208,7 +208,7 @@ def launched(
     **environment: str,
 ) -> Iterator[Run]:
     """Start `serve_policies` in processes of its own. Whoever calls ends it, or whatever is left of it is killed."""
-    port, grpc_port = free_ports(2)
+    port, grpc_port, *_ = (one for one in free_ports(3) if one != (settings or {}).get("direct_port"))
     with tempfile.TemporaryDirectory() as keys:
         key_file = Path(keys, "admin.key") if with_admin_key else None
         plan = {

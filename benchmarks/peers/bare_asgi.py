@@ -2,11 +2,14 @@
 
     python benchmarks/peers/bare_asgi.py PORT POLICY.onnx
 
+(granian takes the application from `build_named`.)
+
 The WebSocket takes an observation's bytes and gives an action's.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Any
 
@@ -43,6 +46,10 @@ def build(onnx_file: str) -> Any:
         await send({"type": "http.response.body", "body": content})
 
     return app
+
+
+def build_named() -> Any:
+    return build(os.environ["POLICY_ONNX"])
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import secrets
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,14 @@ from numpy.typing import NDArray
 from rlservo.export.contract.bundle import ONNX_FILE, Bundle, load_bundle
 from rlservo.serve_app.ray_serve.processes import free_ports
 from rlservo.serve_app.wire.msgpack_arrays import pack
-from speed.environments import InstallError, python_of
+from speed.environments import InstallError, node_modules_of, python_of
 from speed.servers import Exchange, Server
 
 PEERS = Path(__file__).resolve().parent.parent / "peers"
 BARE, RLSERVO, TWO = "uvicorn + FastAPI", "rlservo serve", "rlservo serve, 2 replicas"
+DIRECT = "rlservo serve, direct port"
+BARE_ASGI, GRANIAN = "uvicorn, bare ASGI", "granian, bare ASGI"
+MOSEC, FASTIFY = "mosec", "fastify + onnxruntime-node"
 MLSERVER, LITSERVE, BENTOML = "MLServer", "LitServe", "BentoML"
 DEFAULTS, RLLIB = "Ray Serve defaults", "RLlib's Ray Serve example"
 BATCH = 1024
@@ -61,15 +65,16 @@ def case_of(bundle: Path, checkpoint: Path) -> Case:
     return Case(loaded, checkpoint, obs[0], outputs["action"][0])
 
 
-def servers(case: Case, folder: Path) -> tuple[list[Server], dict[str, str]]:
-    """Return the servers, and why others are missing."""
+def servers(case: Case, folder: Path, names: Collection[str] | None = None) -> tuple[list[Server], dict[str, str]]:
+    """Return the servers (those of `names`, and ours), and why others are missing."""
     made: list[Server] = []
     missing: dict[str, str] = {}
-    for make in (rlservo, two_replicas, bare, mlserver, litserve, bentoml, ray_defaults, rllib_example):
-        try:
-            made.append(make(case, folder))
-        except InstallError as error:
-            missing[make.__name__] = str(error)
+    for name, make in MAKERS.items():
+        if names is None or name in (RLSERVO, *names):
+            try:
+                made.append(make(case, folder))
+            except InstallError as error:
+                missing[name] = str(error)
     return made, missing
 
 
@@ -100,9 +105,18 @@ def binary(case: Case, rows: int) -> Exchange:
 
 
 def rlservo(case: Case, _folder: Path, name: str = RLSERVO, replicas: int = 1) -> Server:
-    port, grpc_port = free_ports(2)
+    port, grpc_port, direct_port = free_ports(3)
     command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(case.bundle.path), "--port", str(port)]
-    return asked(case, name, [*command, "--grpc-port", str(grpc_port), "--replicas", str(replicas)], port, grpc_port)
+    command += ["--grpc-port", str(grpc_port), "--direct-port", str(direct_port), "--replicas", str(replicas)]
+    server = asked(case, name, command, port, grpc_port)
+    server.direct_port = direct_port
+    return server
+
+
+def direct(server: Server) -> Server:
+    """Return a started server of ours as who goes without its proxy sees it."""
+    assert server.direct_port is not None
+    return replace(server, name=DIRECT, port=server.direct_port, grpc_port=None)
 
 
 def asked(case: Case, name: str, command: list[str], port: int, grpc_port: int | None = None) -> Server:
@@ -129,6 +143,34 @@ def bare(case: Case, _folder: Path) -> Server:
     python, (port,) = python_of("bare"), free_ports(1)
     command = [str(python), str(PEERS / "bare.py"), str(port), case.onnx_file]
     return Server(BARE, command, port, plain(case, "/act"), stream="/ws", message=case.obs.tobytes())
+
+
+def bare_asgi(case: Case, _folder: Path) -> Server:
+    python, (port,) = python_of("asgi"), free_ports(1)
+    command = [str(python), str(PEERS / "bare_asgi.py"), str(port), case.onnx_file]
+    return Server(BARE_ASGI, command, port, plain(case, "/act"), stream="/", message=case.obs.tobytes())
+
+
+def granian(case: Case, _folder: Path) -> Server:
+    """The same application as `bare_asgi`'s, on a server written in Rust."""
+    python, (port,) = python_of("asgi"), free_ports(1)
+    command = [str(python), "-m", "granian", "--interface", "asgi", "--host", "127.0.0.1", "--port", str(port)]
+    command += ["--workers", "1", "--no-log", "--working-dir", str(PEERS), "--factory", "bare_asgi:build_named"]
+    env = {"POLICY_ONNX": case.onnx_file}
+    return Server(GRANIAN, command, port, plain(case, "/act"), env, stream="/", message=case.obs.tobytes())
+
+
+def mosec(case: Case, folder: Path) -> Server:
+    python, (port,) = python_of("mosec"), free_ports(1)
+    command = [str(python), str(PEERS / "mosec_server.py"), "--address", "127.0.0.1", "--port", str(port)]
+    command += ["--path", str(folder / "mosec")]  # its processes' socket
+    return Server(MOSEC, command, port, plain(case, "/inference"), {"POLICY_ONNX": case.onnx_file})
+
+
+def fastify(case: Case, _folder: Path) -> Server:
+    modules, (port,) = node_modules_of("fastify"), free_ports(1)
+    command = ["node", str(PEERS / "fastify" / "server.js"), str(port), case.onnx_file]
+    return Server(FASTIFY, command, port, plain(case, "/act"), {"NODE_PATH": str(modules)})
 
 
 def mlserver(case: Case, _folder: Path) -> Server:
@@ -172,3 +214,19 @@ def rllib_example(case: Case, folder: Path) -> Server:
     (port,) = free_ports(1)
     command = [sys.executable, str(PEERS / "rllib_example.py"), str(port), str(case.checkpoint)]
     return Server(RLLIB, command, port, plain(case, "/rllib-rlmodule", "observation", "GET"), ray_environment(folder))
+
+
+MAKERS: dict[str, Callable[[Case, Path], Server]] = {
+    RLSERVO: rlservo,
+    TWO: two_replicas,
+    BARE: bare,
+    BARE_ASGI: bare_asgi,
+    GRANIAN: granian,
+    MOSEC: mosec,
+    FASTIFY: fastify,
+    MLSERVER: mlserver,
+    LITSERVE: litserve,
+    BENTOML: bentoml,
+    DEFAULTS: ray_defaults,
+    RLLIB: rllib_example,
+}

@@ -42,6 +42,8 @@ class Load:
     count: int
     seconds: float
     generator_cpu_s: float
+    p999_ms: float | None = None  # of a paced load, as the next one
+    late: float | None = None  # share of the answers later than half a period
 
 
 class LoadError(Exception):

@@ -6,31 +6,23 @@ waited ("coordinated omission"). Here a robot whose answer is late asks at once 
 
 from __future__ import annotations
 
+import heapq
+import queue
 import random
 import select
 import socket
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from speed.loads import LoadError, WebSocketLine
+from speed.loads import INFER, Load, LoadError, WebSocketLine, infer_request
 from speed.servers import Exchange
 
 SETTLE_S = 1.0  # before answers count
-
-
-@dataclass(frozen=True)
-class Paced:
-    """What a paced load gave."""
-
-    p50_ms: float
-    p99_ms: float
-    p999_ms: float
-    late: float
-    """Share of the answers later than half a period."""
-    count: int
 
 
 class Robot:
@@ -99,13 +91,14 @@ def stream_robot(port: int, path: str, message: bytes, greets: bool, due: float)
     return Robot(line.connection, line.frame, is_whole, due)
 
 
-def paced(make: Callable[[float], Robot], *, robots: int, rate_hz: float, seconds: float) -> Paced:
+def paced(make: Callable[[float], Robot], *, robots: int, rate_hz: float, seconds: float) -> Load:
     """Let so many robots ask at the rate, each at a phase of its own. Raises LoadError."""
     period, began = 1 / rate_hz, time.perf_counter() + 0.1 + 0.01 * robots  # in which they connect
     fleet = [make(began + random.random() * period) for _ in range(robots)]
     by_socket = {robot.connection: robot for robot in fleet}
     taken: list[float] = []
     until, counted = began + SETTLE_S + seconds, began + SETTLE_S
+    began_cpu = time.process_time()
     try:
         while (now := time.perf_counter()) < until:
             for robot in fleet:
@@ -117,11 +110,68 @@ def paced(make: Callable[[float], Robot], *, robots: int, rate_hz: float, second
             for connection in ready:
                 robot = by_socket[connection]
                 if robot.read():
-                    if robot.due >= counted:
-                        taken.append(time.perf_counter() - robot.due)
+                    at = time.perf_counter()
+                    if at >= counted:
+                        taken.append(at - robot.due)
                     robot.due += period
     finally:
         for robot in fleet:
             robot.connection.close()
+    return _load(taken, period, seconds, began_cpu)
+
+
+def paced_calls(
+    port: int, model: str, obs: NDArray[np.float32], *, robots: int, rate_hz: float, seconds: float
+) -> Load:
+    """Let robots ask over gRPC, each on a connection of its own. Raises LoadError."""
+    import grpc
+
+    period, request = 1 / rate_hz, infer_request(model, obs)
+    # A subchannel of its own is a connection of its own.
+    channels = [
+        grpc.insecure_channel(f"127.0.0.1:{port}", [("grpc.use_local_subchannel_pool", 1)]) for _ in range(robots)
+    ]
+    calls: list[Any] = [channel.unary_unary(INFER) for channel in channels]
+    answered: queue.SimpleQueue[tuple[float, int, Any]] = queue.SimpleQueue()
+    try:
+        for call in calls:
+            call(request, timeout=30)  # connects
+        began, began_cpu = time.perf_counter(), time.process_time()
+        until, counted = began + SETTLE_S + seconds, began + SETTLE_S
+        waiting = [(began + random.random() * period, number) for number in range(robots)]
+        heapq.heapify(waiting)
+        due_of = dict.fromkeys(range(robots), 0.0)
+        taken: list[float] = []
+
+        def ask(number: int) -> None:
+            future = calls[number].future(request, timeout=30)
+            future.add_done_callback(lambda done: answered.put((time.perf_counter(), number, done)))
+
+        while (now := time.perf_counter()) < until:
+            while waiting and waiting[0][0] <= now:
+                due, number = heapq.heappop(waiting)
+                due_of[number] = due
+                ask(number)
+            soonest = min(waiting[0][0], until) if waiting else until
+            with suppress(queue.Empty):
+                at, number, done = answered.get(timeout=max(0.0, soonest - time.perf_counter()))
+                if done.exception() is not None:
+                    raise LoadError(f"gRPC: {done.exception()}")
+                if at >= counted:
+                    taken.append(at - due_of[number])
+                heapq.heappush(waiting, (due_of[number] + period, number))
+    except grpc.RpcError as error:
+        raise LoadError(f"gRPC: {error}") from None
+    finally:
+        for channel in channels:
+            channel.close()
+    return _load(taken, period, seconds, began_cpu)
+
+
+def _load(taken: list[float], period: float, seconds: float, began_cpu: float) -> Load:
+    if not taken:
+        raise LoadError(f"nothing was answered within {seconds:g} s")
     p50, p99, p999 = (float(value) * 1e3 for value in np.percentile(taken, (50, 99, 99.9)))
-    return Paced(p50, p99, p999, float(np.mean(np.array(taken) > period / 2)), len(taken))
+    late = float(np.mean(np.array(taken) > period / 2))
+    cpu_s = time.process_time() - began_cpu
+    return Load(p50, p99, len(taken) / seconds, len(taken), seconds, cpu_s, p999, late)

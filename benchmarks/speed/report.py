@@ -4,15 +4,49 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from speed.catalogue import BARE, BATCH, BENTOML, DEFAULTS, LITSERVE, MLSERVER, RLLIB, RLSERVO, TWO
+from speed.catalogue import (
+    BARE,
+    BARE_ASGI,
+    BATCH,
+    BENTOML,
+    DEFAULTS,
+    DIRECT,
+    FASTIFY,
+    GRANIAN,
+    LITSERVE,
+    MLSERVER,
+    MOSEC,
+    RLLIB,
+    RLSERVO,
+    TWO,
+)
 from speed.machine import OTHER, PROXY, REPLICA
-from speed.rounds import GRPC, HEAVY, IN_PROCESS, JSON1, JSON16, LARGE, LINE, ONE, STREAM, Sample, Samples
+from speed.rounds import (
+    FLEETS,
+    GRPC,
+    HEAVY,
+    IN_PROCESS,
+    JSON1,
+    JSON16,
+    JSON64,
+    LARGE,
+    LINE,
+    ONE,
+    PLANNED_HZ,
+    STREAM,
+    Sample,
+    Samples,
+    is_paced,
+    paced_measure,
+)
 
 PEERS = (MLSERVER, LITSERVE, BENTOML, DEFAULTS, RLLIB)
+LEAST = (FASTIFY, MOSEC, GRANIAN)
+"""What a performance engineer would pick, which checks nothing; bare ASGI on uvicorn has targets of its own."""
 Value = Callable[[Sample], float]
 
 
@@ -22,6 +56,14 @@ def p50(sample: Sample) -> float:
 
 def p99(sample: Sample) -> float:
     return sample.load.p99_ms
+
+
+def p999(sample: Sample) -> float:
+    return sample.load.p999_ms or 0.0
+
+
+def late(sample: Sample) -> float:
+    return 100 * (sample.load.late or 0.0)
 
 
 def rate(sample: Sample) -> float:
@@ -67,6 +109,8 @@ class Result:
     replica_mb: dict[str, float]
     server_mb: dict[str, float]
     missing: dict[str, str]
+    robots: dict[tuple[str, float], tuple[int, float]] = field(default_factory=dict)
+    """By (server, times a second that each asks): robots that are served in time, and the cores it takes."""
 
     def median(self, measure: str, name: str, value: Value) -> float | None:
         """Return the median over the rounds, or None where it was not measured."""
@@ -128,7 +172,58 @@ def verdicts(result: Result) -> list[Verdict]:
             1.5,
             limits(result, HEAVY),
         ),
+        *_beside_the_least(result),
     ]
+
+
+def _beside_the_least(result: Result) -> list[Verdict]:
+    """Compare with servers that do no more than answer."""
+    ratio = result.ratio
+    quickest = min(LEAST, key=lambda name: result.median(JSON1, name, p50) or float("inf"))
+    best = max(LEAST, key=lambda name: result.median(JSON16, name, rate) or 0)
+    found = [
+        Verdict("direct port: JSON p50, over bare ASGI's", ratio((JSON1, DIRECT), (JSON1, BARE_ASGI), p50), 1.15),
+        Verdict(
+            f"direct port: JSON p50, over the quickest other's ({quickest})",
+            ratio((JSON1, DIRECT), (JSON1, quickest), p50),
+            1.0,
+        ),
+        Verdict(
+            "direct port: requests/s over 16 connections, over bare ASGI's",
+            ratio((JSON16, DIRECT), (JSON16, BARE_ASGI), rate),
+            None,
+            0.9,
+        ),
+        Verdict(
+            f"direct port: requests/s over 16 connections, over the best other's ({best})",
+            ratio((JSON16, DIRECT), (JSON16, best), rate),
+            None,
+            1.0,
+        ),
+        Verdict(
+            "direct port: WebSocket p50, over a bare uvicorn WebSocket's",
+            ratio((STREAM, DIRECT), (STREAM, BARE_ASGI), p50),
+            1.2,
+        ),
+        Verdict("JSON p50, over bare ASGI's", ratio((JSON1, RLSERVO), (JSON1, BARE_ASGI), p50), 1.5),
+        Verdict(
+            f"requests/s over 16 connections, over the best other's ({best})",
+            ratio((JSON16, RLSERVO), (JSON16, best), rate),
+            None,
+            1.0,
+        ),
+        Verdict("p99 over 64 connections [ms]", result.median(JSON64, RLSERVO, p99), 50.0),
+    ]
+    for robots, rate_hz in FLEETS:
+        measure = paced_measure("json", robots, rate_hz)
+        found.append(
+            Verdict(
+                f"direct port: p99.9 of {robots} robots at {rate_hz:g} Hz, over bare ASGI's",
+                ratio((measure, DIRECT), (measure, BARE_ASGI), p999),
+                1.3,
+            )
+        )
+    return found
 
 
 def limits(result: Result, measure: str) -> str:
@@ -151,11 +246,12 @@ def _quotient(values: dict[str, float], over: str, under: str) -> float | None:
 # Tables
 
 
-HEADINGS = ["server", "p50 ms", "p99 ms", "x bare", "req/s c=1", "CPU us", "req/s c=16", "CPU us", "MB"]
+HEADINGS = ["server", "p50 ms", "p99 ms", "x bare", "req/s c=1", "CPU us", "req/s c=16", "CPU us"]
+HEADINGS += ["req/s c=64", "p99 ms", "MB"]
 
 
 def table(result: Result) -> list[list[str]]:
-    """One row per server: sequential JSON, then 16 connections; CPU is the whole server's per request."""
+    """One row per server: sequential JSON, then 16 and 64 connections; CPU is the whole server's per request."""
     rows = []
     names = dict.fromkeys(name for measure, name in result.samples if measure == JSON16)
     for name in sorted(names, key=lambda one: result.median(JSON1, one, p50) or float("inf")):
@@ -167,9 +263,12 @@ def table(result: Result) -> list[list[str]]:
             result.median(JSON1, name, cpu),
             result.median(JSON16, name, rate),
             result.median(JSON16, name, cpu),
+            result.median(JSON64, name, rate),
+            result.median(JSON64, name, p99),
             result.server_mb.get(name),
         ]
-        formats = ("{:.3f}", "{:.2f}", "{:.2f}", "{:,.0f}", "{:,.0f}", "{:,.0f}", "{:,.0f}", "{:,.0f}")
+        formats: tuple[str, ...] = ("{:.3f}", "{:.2f}", "{:.2f}", "{:,.0f}", "{:,.0f}", "{:,.0f}", "{:,.0f}")
+        formats += ("{:,.0f}", "{:.1f}", "{:,.0f}")
         rows.append([name, *("" if c is None else f.format(c) for f, c in zip(formats, columns, strict=True))])
     return rows
 
@@ -189,6 +288,33 @@ def protocols(result: Result) -> list[list[str]]:
     return rows
 
 
+PACED_HEADINGS = ["load", "server", "p50 ms", "p99 ms", "p99.9 ms", "late %", "p99.9 x bare"]
+
+
+def paced_loads(result: Result) -> list[list[str]]:
+    """One row per paced load and server, from when each robot should have asked: late is half a period."""
+    rows = []
+    for measure, name in result.samples:
+        if is_paced(measure):
+            values = [result.median(measure, name, value) for value in (p50, p99, p999, late)]
+            values.append(result.ratio((measure, name), (measure, BARE_ASGI), p999))
+            shown = ["" if value is None else f"{value:.2f}" for value in values]
+            rows.append([measure.removeprefix("paced "), name, *shown])
+    return rows
+
+
+ROBOTS_HEADINGS = ["robots (cores)", *(f"{rate_hz:g} Hz" for rate_hz in PLANNED_HZ)]
+
+
+def robots(result: Result) -> list[list[str]]:
+    """One row per server: robots with p99.9 under a quarter of the period, and the cores that its processes took."""
+    rows = []
+    for name in dict.fromkeys(name for name, _ in result.robots):
+        found = [result.robots.get((name, rate_hz)) for rate_hz in PLANNED_HZ]
+        rows.append([name, *("" if one is None else f"{one[0]:,} ({one[1]:.2f})" for one in found)])
+    return rows
+
+
 def markdown(result: Result, facts: dict[str, Any]) -> str:
     """Return the tables and the verdicts."""
     lines = [
@@ -198,6 +324,10 @@ def markdown(result: Result, facts: dict[str, Any]) -> str:
         *_markdown(HEADINGS, table(result)),
         "",
         *_markdown(PROTOCOL_HEADINGS, protocols(result)),
+        "",
+        *_markdown(PACED_HEADINGS, paced_loads(result)),
+        "",
+        *_markdown(ROBOTS_HEADINGS, robots(result)),
         "",
         *(f"- {verdict}" for verdict in verdicts(result)),
         *(f"- not measured: {name}: {why}" for name, why in result.missing.items()),
@@ -220,6 +350,7 @@ def document(result: Result, facts: dict[str, Any]) -> dict[str, Any]:
             ]
             for (measure, name), taken in result.samples.items()
         },
+        "robots": [[name, rate_hz, *found] for (name, rate_hz), found in result.robots.items()],
         "cold_start_s": result.cold_start_s,
         "replica_mb": result.replica_mb,
         "server_mb": result.server_mb,
@@ -229,20 +360,21 @@ def document(result: Result, facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def chart(result: Result, file: Path) -> None:
-    """Draw sequential latency and throughput over 16 connections, side by side."""
+    """Draw sequential latency and throughput over 16 and 64 connections, side by side."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
     names = [row[0] for row in table(result) if result.median(JSON1, row[0], p50) is not None][::-1]
-    colours = ["#1f6feb" if name == RLSERVO else "#9aa4b2" for name in names]
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 0.42 * len(names) + 1.1), sharey=True)
+    colours = ["#1f6feb" if name in (RLSERVO, DIRECT) else "#9aa4b2" for name in names]
+    figure, (left, *others) = pyplot.subplots(1, 3, figsize=(11, 0.42 * len(names) + 1.1), sharey=True)
     latency = [result.median(JSON1, name, p50) or 0.0 for name in names]
-    throughput = [result.median(JSON16, name, rate) or 0.0 for name in names]
+    throughput = [[result.median(measure, name, rate) or 0.0 for name in names] for measure in (JSON16, JSON64)]
     for axes, values, title, label in (
-        (left, latency, "one connection: p50 [ms], log scale (less is better)", "{:.2f}"),
-        (right, throughput, "16 connections: requests/s (more is better)", "{:,.0f}"),
+        (left, latency, "one connection: p50 [ms], log scale", "{:.2f}"),
+        (others[0], throughput[0], "16 connections: requests/s", "{:,.0f}"),
+        (others[1], throughput[1], "64 connections: requests/s", "{:,.0f}"),
     ):
         bars = axes.barh(names, values, color=colours)
         axes.bar_label(bars, [label.format(value) for value in values], padding=3, fontsize=8)

@@ -17,16 +17,22 @@ from typing import Any
 import numpy as np
 
 from speed import loads
-from speed.catalogue import BARE, BATCH, RLLIB, RLSERVO, TWO, Case
+from speed.catalogue import BARE, BARE_ASGI, BATCH, DIRECT, RLLIB, RLSERVO, TWO, Case
 from speed.loads import GrpcLine, HttpLine, Load, WebSocketLine
 from speed.machine import OTHER, PROXY, REPLICA, cpu_by_role
+from speed.paced import SETTLE_S, http_robot, paced, paced_calls, stream_robot
 from speed.servers import Server, ask
 
 IN_PROCESS = "onnxruntime in process"
 JSON1, JSON16, LINE, STREAM, GRPC = "json, 1 connection", "json, 16 connections", "json line", "websocket", "grpc"
 LARGE, HEAVY = f"binary, batch of {BATCH}", "binary, batch of 64, 16 connections"
 ONE = "one observation"
-CONNECTIONS = 16
+JSON64 = "json, 64 connections"
+CONNECTIONS, MANY_CONNECTIONS = 16, 64
+FLEETS = ((16, 50.0), (64, 20.0))
+"""(robots, how often each asks a second) of the paced loads."""
+PLANNED_HZ = (20.0, 50.0, 125.0, 500.0)
+MOST_ROBOTS = 1024
 
 Turn = Callable[[], Load]
 
@@ -56,7 +62,14 @@ Samples = dict[tuple[str, str], list[Sample]]
 class Rounds:
     """The measures, each with its servers' turns."""
 
-    def __init__(self, case: Case, servers: Iterable[Server], folder: Path, seconds: int) -> None:
+    def __init__(
+        self,
+        case: Case,
+        servers: Iterable[Server],
+        folder: Path,
+        seconds: int,
+        fleets: Iterable[tuple[int, float]] = FLEETS,
+    ) -> None:
         self._servers = {server.name: server for server in servers}
         self._turns: list[tuple[str, str, Turn]] = []
         session = session_of(case)
@@ -76,7 +89,7 @@ class Rounds:
         def in_process(feed: dict[str, Any]) -> Turn:
             return lambda: loads.timed(lambda: session.run(["action"], feed), seconds)
 
-        ours = [server for server in self._servers.values() if server.name in (RLSERVO, BARE)]
+        ours = [server for server in self._servers.values() if server.name in (RLSERVO, DIRECT, BARE, BARE_ASGI)]
         compared = [server for server in self._servers.values() if server.name != TWO]
         two = [server for server in self._servers.values() if server.name in (RLSERVO, TWO)]
         self._add(ONE, [(IN_PROCESS, in_process(single))])
@@ -84,6 +97,7 @@ class Rounds:
         self._add(
             JSON16, [(server.name, over_wrk(server, server.act, CONNECTIONS)) for server in self._servers.values()]
         )
+        self._add(JSON64, [(one.name, over_wrk(one, one.act, MANY_CONNECTIONS)) for one in compared])
         self._add(LINE, [(one.name, over(partial(HttpLine, one.port, one.act))) for one in ours])
         streams = [
             (one.name, over(partial(WebSocketLine, one.port, one.stream, one.message, greets=one.greets)))
@@ -101,6 +115,31 @@ class Rounds:
         self._add(LARGE, [(IN_PROCESS, in_process(many)), *large])
         heavy = [(one.name, over_wrk(one, one.heavy, CONNECTIONS)) for one in two if one.heavy is not None]
         self._add(HEAVY, heavy)
+        for robots, rate_hz in fleets:
+            fleet: dict[str, Any] = {"robots": robots, "rate_hz": rate_hz, "seconds": seconds}
+            self._add(
+                paced_measure("json", robots, rate_hz),
+                [(one.name, partial(paced, partial(http_robot, one.port, one.act), **fleet)) for one in ours],
+            )
+            self._add(
+                paced_measure("websocket", robots, rate_hz),
+                [
+                    (
+                        one.name,
+                        partial(paced, partial(stream_robot, one.port, one.stream, one.message, one.greets), **fleet),
+                    )
+                    for one in ours
+                    if one.stream is not None
+                ],
+            )
+            self._add(
+                paced_measure("grpc", robots, rate_hz),
+                [
+                    (one.name, partial(paced_calls, one.grpc_port, case.name, case.obs[None], **fleet))
+                    for one in compared
+                    if one.grpc_port is not None
+                ],
+            )
 
     def _add(self, measure: str, turns: list[tuple[str, Turn]]) -> None:
         self._turns += [(measure, name, turn) for name, turn in turns]
@@ -129,8 +168,41 @@ class Rounds:
         return Sample(load, {role: after[role] - before[role] for role in (REPLICA, PROXY, OTHER)})
 
     def _warm(self) -> None:
-        for _, _, turn in self._turns:
-            turn()
+        for measure, _, turn in self._turns:
+            if not is_paced(measure):  # which settles first
+                turn()
+
+
+def paced_measure(protocol: str, robots: int, rate_hz: float) -> str:
+    return f"paced {protocol}, {robots} robots at {rate_hz:g} Hz"
+
+
+def is_paced(measure: str) -> bool:
+    return measure.startswith("paced ")
+
+
+def carried(server: Server, rate_hz: float, seconds: float) -> tuple[int, float]:
+    """Return how many robots get 99.9% of their actions within a quarter of the period, and the cores that takes.
+
+    Each number is tried once: twice as many until one fails, then halfway between. JSON.
+    """
+    make = partial(http_robot, server.port, server.act)
+    most, cores, least_bad = 0, 0.0, MOST_ROBOTS + 1
+    robots = max(1, int(400 / rate_hz))
+    while most < robots < least_bad:
+        before = cpu_by_role(server.members())
+        load = paced(make, robots=robots, rate_hz=rate_hz, seconds=seconds)
+        after = cpu_by_role(server.members())
+        if load.p999_ms is not None and load.p999_ms <= 250 / rate_hz:
+            most = robots
+            cores = sum(after[role] - before[role] for role in after) / (load.seconds + SETTLE_S)
+            robots = 2 * robots if least_bad > MOST_ROBOTS else (robots + least_bad) // 2
+        else:
+            least_bad = robots
+            robots = (most + robots) // 2
+        if least_bad <= MOST_ROBOTS and least_bad - most <= max(1, most // 8):
+            break
+    return most, cores
 
 
 def session_of(case: Case) -> Any:

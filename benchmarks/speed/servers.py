@@ -55,6 +55,8 @@ class Server:
     greets: bool = False
     """Whether the WebSocket's server speaks first."""
     grpc_port: int | None = None
+    direct_port: int | None = None
+    """Where its replicas listen themselves."""
     process: subprocess.Popen[bytes] | None = None
     cold_start_s: float = 0.0
     mark: str = ""

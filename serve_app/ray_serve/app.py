@@ -23,7 +23,7 @@ from rlservo.export.contract.errors import PartlyAppliedError, RlservoError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import InferenceService
-from rlservo.serve_app.ray_serve import direct_port, http_connections, ingress, ray_parts
+from rlservo.serve_app.ray_serve import direct_port, http_connections, ingress, ray_parts, uvicorn_parts
 from rlservo.serve_app.ray_serve.autoscaling import BUSY, Load
 from rlservo.serve_app.ray_serve.direct_server import DirectServer
 from rlservo.serve_app.ray_serve.gcs_ledger import GcsLedger
@@ -84,6 +84,7 @@ def build(args: BuildArguments) -> Application:
     RuntimeError in a Ray that lacks what is used of its private parts.
     """
     ray_parts.check()
+    uvicorn_parts.check()
     settings = ServerSettings.from_environment(args.settings)
     ServedConfig.parse(args.served)
     # A folder may exist only on the nodes that run replicas, so it is the replica that looks.

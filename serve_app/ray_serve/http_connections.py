@@ -29,14 +29,18 @@ import socket
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import uvicorn
-from uvicorn.protocols.http import auto
-from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
-from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-
 from rlservo.serve_app.protocols.http_endpoint import REPLY, WholeBody
-from rlservo.serve_app.ray_serve import eager_start
+from rlservo.serve_app.ray_serve import eager_start, uvicorn_parts
 from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
+from rlservo.serve_app.ray_serve.uvicorn_parts import (
+    OPEN,
+    STATUS_LINE,
+    HttpToolsProtocol,
+    RequestResponseCycle,
+    WebSocketsSansIOProtocol,
+    apply_mask,  # pyright: ignore[reportPrivateImportUsage]
+    auto,
+)
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -58,6 +62,9 @@ PIECE_BYTES = 16384
 """Of a WebSocket, between two checks of how much has come: uvloop reads 256 KB at once, which are 40,000 frames."""
 MOST_AHEAD = 64
 """Requests of a stream that wait for those before them: request and answer alternate, a late answer lets some wait."""
+# Of a frame's first two bytes (RFC 6455, 5.2): what begins one that is a whole message, or none.
+BINARY, MASKED, LENGTH_FOLLOWS = 0x82, 0x80, 126
+WHOLE = bytes((0x81, BINARY, 0x88, 0x89, 0x8A))
 MOST_EMPTY, SMALL_BYTES = 1000, 512
 """Frames of a WebSocket in a second that complete no message: pings, pongs, small fragments."""
 
@@ -76,9 +83,21 @@ LARGE_REPLY = (
     b"HTTP/1.1 431 Request Header Fields Too Large\r\ncontent-type: application/json\r\nconnection: close\r\n"
     b"content-length: %d\r\n\r\n%s" % (len(HEAD_TOO_LARGE), HEAD_TOO_LARGE)
 )
-# What the subclass overrides or reads of uvicorn's private parts.
-PRIVATE = ("_should_upgrade", "_start_asgi_task", "_unset_keepalive_if_required", "handle_websocket_upgrade")
-PRIVATE_OF_STREAMS = ("handle_cont", "handle_ping", "handle_pong")
+
+
+class EarlyEnd(RequestResponseCycle):
+    """A request whose connection ends, and says so, when it is answered before all of it has come."""
+
+    ends_early = False
+
+    async def send(self, message: Any) -> None:
+        """Write a part of the reply."""
+        if self.response_started or not self.more_body:
+            await super().send(message)
+            return
+        self.ends_early, self.keep_alive = True, False  # the head says `Connection: close`
+        await super().send(message)
+        self.keep_alive = True  # closed at once, the client that still sends would lose the reply: `_linger`
 
 
 class TimedProtocol(HttpToolsProtocol):
@@ -159,8 +178,8 @@ class TimedProtocol(HttpToolsProtocol):
     def on_response_complete(self) -> None:
         """Give a client that is still sending a moment to take its reply, and close."""
         super().on_response_complete()
-        cycle = self.cycle
-        if cycle.response_complete and cycle.more_body and not self.transport.is_closing():
+        cycle: Any = self.cycle
+        if cycle.response_complete and cycle.ends_early and not self.transport.is_closing():
             self._unset_keepalive_if_required()
             self._stop()
             self.loop.call_soon(self._linger)  # the reply may be held until the end of this turn (`joined_writes.py`)
@@ -174,6 +193,7 @@ class TimedProtocol(HttpToolsProtocol):
         return super()._should_upgrade() and not _has_body(self.scope) and self._refuse is None
 
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
+        cycle.__class__ = EarlyEnd  # uvicorn's class is not the protocol's to choose
         # The parser has stopped at this head: a body is lost, and so is the next request.
         parser: Any = self.parser
         if parser.should_upgrade() and any(name == b"upgrade" for name, _ in cycle.scope["headers"]):
@@ -261,6 +281,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
 
     _since = float("-inf")  # when the second began in which `_empty` counts
     _empty = 0
+    _is_at_frame = False  # whether what is read next begins a frame
 
     def __init__(self, *arguments: Any, on_lost: Callable[[], None] | None = None, **more: Any) -> None:
         """Call `on_lost` when the connection has ended."""
@@ -275,6 +296,15 @@ class BoundedStream(WebSocketsSansIOProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Read what has come, piece by piece, until it is too much."""
+        if self.conn.state is not OPEN:  # the handshake, and what comes before it is answered
+            self._is_at_frame = not self.handshake_initiated
+        elif self._is_at_frame and (message := self._find_message(data)) is not None:
+            waits = not self.queue.empty()
+            self.queue.put_nowait({"type": "websocket.receive", "bytes": message})
+            if waits and not self.read_paused:  # it costs two system calls, which one message is not worth
+                self.read_paused = True
+                self.transport.pause_reading()
+            return
         for start in range(0, len(data), PIECE_BYTES):
             if self.transport.is_closing():
                 return
@@ -299,6 +329,44 @@ class BoundedStream(WebSocketsSansIOProtocol):
         if not event.fin and len(event.data) < SMALL_BYTES:
             self._count()
         super().handle_cont(event)
+
+    def _find_message(self, data: bytes) -> bytes | None:
+        """Return the message that has come, where that is one binary frame and nothing else.
+
+        Nearly all are. The library's parser takes as long for one as a small policy does, and sees all others. From
+        the first on that does not end where a read does, it sees everything: nobody else knows where frames begin.
+        """
+        start, size, frames = 0, len(data), 0
+        content = 0
+        while start + 6 <= size and data[start] in WHOLE and data[start + 1] >= MASKED:
+            length, content = data[start + 1] - MASKED, start + 6
+            if length >= LENGTH_FOLLOWS:
+                if length > LENGTH_FOLLOWS or start + 8 > size:
+                    break
+                length, content = data[start + 2] << 8 | data[start + 3], start + 8
+            start, frames = content + length, frames + 1
+        if start != size:
+            self._is_at_frame = False
+            return None
+        if frames > 1 or data[0] != BINARY or size > PIECE_BYTES or self.close_sent:
+            return None
+        return apply_mask(data[content:], data[content - 4 : content])
+
+    async def send(self, message: Any) -> None:
+        """Send a message; a binary one as a frame of its own."""
+        content = message.get("bytes")
+        if content is None or self.close_sent or self.disconnected or self.conn.state is not OPEN:
+            await super().send(message)
+            return
+        await self.writable.wait()
+        size = len(content)
+        if size < LENGTH_FOLLOWS:
+            head = b"\x82%c" % size
+        elif size < 1 << 16:
+            head = b"\x82\x7e" + size.to_bytes(2, "big")
+        else:
+            head = b"\x82\x7f" + size.to_bytes(8, "big")
+        self.transport.write(head + content)
 
     async def receive(self) -> Message:  # type: ignore[override]
         """Return the next message; others have their turn before one that has come already."""
@@ -355,11 +423,5 @@ def install() -> None:
     """Let uvicorn's servers of this process use it. Raises RuntimeError for another uvicorn than is known here."""
     if auto.AutoHTTPProtocol is TimedProtocol:
         return
-    classes: dict[type, tuple[str, ...]] = {HttpToolsProtocol: PRIVATE, WebSocketsSansIOProtocol: PRIVATE_OF_STREAMS}
-    missing = [
-        f"{kind.__name__} has no {name}" for kind, names in classes.items() for name in names if not hasattr(kind, name)
-    ]
-    if auto.AutoHTTPProtocol is not HttpToolsProtocol or missing:
-        what = f"its {missing[0]}" if missing else "httptools is missing"
-        raise RuntimeError(f"uvicorn {uvicorn.__version__} cannot be given time-outs for its connections: {what}")
+    uvicorn_parts.check()
     auto.AutoHTTPProtocol = TimedProtocol

@@ -30,7 +30,7 @@ from speed.catalogue import BARE, RLLIB, RLSERVO, TWO, Case, binary, case_of, pl
 from speed.loads import HttpLine, Load, LoadError, WebSocketLine, infer_request, wrk
 from speed.machine import OTHER, PROXY, REPLICA, processes
 from speed.report import Result, Verdict, verdicts
-from speed.rounds import JSON1, JSON16, Rounds, Sample, check_answers
+from speed.rounds import JSON1, JSON16, JSON64, Rounds, Sample, check_answers
 from speed.servers import Exchange, Server, listening, running
 from stores import load_store
 
@@ -109,9 +109,15 @@ def test_wrk_counts_and_refuses_errors(server: Server, tmp_path: Path) -> None:
 
 @needs_wrk
 def test_a_round_samples_every_measure_it_can(server: Server, case: Case, tmp_path: Path) -> None:
-    samples = Rounds(case, [server], tmp_path, 1).run(1, lambda _: None)
+    samples = Rounds(case, [server], tmp_path, 1, fleets=[(4, 20.0)]).run(1, lambda _: None)
     assert all(len(taken) == 1 and taken[0].load.count > 0 for taken in samples.values())
-    assert (JSON1, RLSERVO) in samples and (JSON16, RLSERVO) in samples
+    assert {(JSON1, RLSERVO), (JSON16, RLSERVO), (JSON64, RLSERVO)} < samples.keys()
+    for protocol in ("json", "websocket"):
+        ((load,),) = [
+            [taken[0].load] for (measure, _), taken in samples.items() if measure.startswith(f"paced {protocol}")
+        ]
+        assert 0 < load.p50_ms <= load.p99_ms <= (load.p999_ms or 0) and load.late is not None
+        assert load.count <= 90  # no more than robots ask, however quick the server is
 
 
 def test_grpc_request_is_what_the_protocols_message_reads(case: Case) -> None:

@@ -7,11 +7,14 @@ import http.client
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,7 @@ from rlservo.export.contract.errors import DeadlineError, LateError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.ray_serve import direct_server
 from rlservo.serve_app.ray_serve.processes import free_ports, port_holder
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
@@ -35,6 +39,21 @@ OLD, OLD_LINE = new_key("cell-7")
 NEW, NEW_LINE = new_key("cell-8")
 OBS = [0.1] * 27
 MODEL = "lstm_box"
+# Deploys the server's application anew, changed as each line of its input says: what `serve deploy` does on a cluster.
+DEPLOY = """
+import json, sys
+import ray
+from ray import serve
+from rlservo.serve_app.ray_serve import app
+arguments = json.loads(sys.argv[1])
+ray.init(sys.argv[2], log_to_driver=False, configure_logging=False)
+for line in sys.stdin:
+    arguments.update(json.loads(line))
+    serve.run(app.build(app.BuildArguments(**arguments)), name=app.APPLICATION, route_prefix="/")
+    print("deployed", flush=True)
+"""
+CLIENT: dict[str, Any] = {"api_key": OLD, "deadline_ms": 60e3}
+DEPLOYED = ("policies", "replicas", "served", "settings")
 SEEN = [np.random.default_rng(i).uniform(-1, 1, 3).astype(np.float32) for i in range(40)]
 
 
@@ -240,3 +259,133 @@ def test_over_the_direct_port_our_clients_go_on_when_a_replica_is_killed(
             stop.set()
         for each in driven:
             each.result(60)
+
+
+@contextlib.contextmanager
+def deploying(server: Run) -> Iterator[Callable[..., None]]:
+    """Give what deploys the server's application with changes, and returns when Serve has it."""
+    (pid,) = server.processes("ray_serve.cluster_process")
+    cluster = psutil.Process(pid)
+    plan = json.loads(cluster.cmdline()[-1])
+    (raylet,) = server.processes("/raylet/raylet ")
+    address = next(word for word in psutil.Process(raylet).cmdline() if word.startswith("--gcs-address="))
+    command = [sys.executable, "-c", DEPLOY, json.dumps({name: plan[name] for name in DEPLOYED})]
+    command.append(address.partition("=")[2])
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=cluster.environ(), cwd=server.folder
+    ) as process:
+
+        def deploy(**changes: Any) -> None:
+            assert process.stdin is not None and process.stdout is not None
+            process.stdin.write(json.dumps(changes) + "\n")
+            process.stdin.flush()
+            assert process.stdout.readline() == "deployed\n"
+
+        try:
+            yield deploy
+        finally:
+            process.kill()
+
+
+class Load:
+    """Clients of the direct port that ask without end, and what they lost."""
+
+    def __init__(self, server: Run, direct_port: int) -> None:
+        self._stop = threading.Event()
+        self.asked: dict[str, int] = {}
+        self.direct = 0
+        """Actions of the one who takes the server's offer, by that way."""
+        plain = partial(self._keep, direct_port)
+        # A stream that takes the server's offer does so when it connects, or not at all where that took too long.
+        clients: dict[str, tuple[type[PolicyClient] | type[StreamClient], int]] = {
+            "offered": (PolicyClient, server.port),
+            "stream": (StreamClient, direct_port),
+        }
+        self._loads: dict[str, Callable[[str], None]] = {"plain": plain, "another plain": plain}
+        for name, (kind, port) in clients.items():
+            self._loads[name] = partial(self._drive, partial(kind, f"http://127.0.0.1:{port}", "ur5", **CLIENT))
+
+    def __enter__(self) -> Load:
+        self._pool = ThreadPoolExecutor(len(self._loads))
+        self._driven = [self._pool.submit(load, name) for name, load in self._loads.items()]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._pool.shutdown()
+        for each in self._driven:
+            each.result()
+
+    def wait_for(self, more: int) -> None:
+        """Wait until each of them got so many more actions."""
+        until, deadline = {name: self.asked.get(name, 0) + more for name in self._loads}, time.monotonic() + 240
+        while any(self.asked.get(name, 0) < count for name, count in until.items()):
+            assert time.monotonic() < deadline, self.asked
+            for each in self._driven:
+                if each.done():
+                    each.result()  # raises what it lost
+            time.sleep(0.02)
+
+    def _drive(self, make: Callable[[], PolicyClient | StreamClient], name: str) -> None:
+        with make() as policy:
+            while not self._stop.is_set():
+                # On a busy machine a replica may stand still for seconds: refused as late, or not answered by HAProxy.
+                with contextlib.suppress(LateError, DeadlineError):
+                    policy.act(OBS)
+                    self._count(name)
+                    self.direct += policy.is_direct
+
+    def _keep(self, port: int, name: str) -> None:
+        """Ask on a kept connection until a reply says that it ends: no client needs to know more."""
+        headers = {"content-type": "application/json", "authorization": f"Bearer {OLD}"}
+        with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=60)) as connection:
+            answered = time.monotonic()
+            while not self._stop.is_set():
+                idle_s = time.monotonic() - answered
+                try:
+                    connection.request("POST", "/v1/policies/ur5/act", json.dumps({"obs": OBS}), headers)
+                    reply = connection.getresponse()  # closed by http.client where the reply says so
+                    content = json.loads(reply.read())
+                except (ConnectionError, http.client.HTTPException):
+                    if idle_s < direct_server.DRAIN_S / 2:  # else it was idle, and may be closed: ask anew
+                        raise
+                    connection.close()
+                    continue
+                finally:
+                    answered = time.monotonic()
+                assert reply.status == 200 or content["code"] == LateError.code, content
+                self._count(name)
+
+    def _count(self, name: str) -> None:
+        self.asked[name] = self.asked.get(name, 0) + 1
+        time.sleep(0.005)
+
+
+def test_an_update_and_one_to_fewer_replicas_lose_nothing_on_the_direct_port(
+    server: Run, direct_port: int, key_file: Path
+) -> None:
+    key_file.write_text(OLD_LINE + "\n")
+    wait_until_followed(direct_port, {OLD: 200, NEW: 401})
+    old = set(wait_for_two(server, direct_port))
+    settings = {"api_keys_file": str(key_file), "direct_port": direct_port, "max_streams": 200}
+
+    def wait_until_gone(gone: set[int]) -> None:
+        deadline = time.monotonic() + 240
+        while gone & set(server.processes("ServeReplica")):
+            assert time.monotonic() < deadline
+            load.wait_for(1)
+
+    with deploying(server) as deploy, Load(server, direct_port) as load:
+        load.wait_for(20)
+        deploy(settings=settings)
+        wait_until_gone(old)
+        wait_for_two(server, direct_port)
+        load.wait_for(20)
+        assert load.direct > 20
+        deploy(replicas=1)
+        deadline = time.monotonic() + 240
+        while len(left := server.processes("ServeReplica")) > 1:
+            assert time.monotonic() < deadline
+            load.wait_for(1)
+        load.wait_for(20)
+        assert left and not set(left) & old

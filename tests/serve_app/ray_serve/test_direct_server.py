@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pytest
 from starlette.types import Receive, Scope, Send
-from uvicorn.protocols.http.httptools_impl import RequestResponseCycle
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
@@ -199,6 +198,39 @@ def test_what_does_not_come_or_is_too_large_ends_the_connection(
     assert ask(port, x_much="y" * 15000)[0] == 200
 
 
+@pytest.mark.parametrize(
+    ("status", "head"),
+    [
+        (401, "x-api-key: no\r\ncontent-length: 100\r\n"),
+        (403, "host: robot.example\r\ncontent-length: 100\r\n"),
+        (413, f"x-api-key: {KEY}\r\ncontent-length: 100000\r\n"),
+    ],
+    ids=["key", "host", "size"],
+)
+def test_a_refusal_before_the_body_has_come_says_that_the_connection_ends(
+    start: Callable[[], Replica], port: int, status: int, head: str
+) -> None:
+    start()
+    host = "" if "host" in head else "host: 127.0.0.1\r\n"
+    request = f"POST {ACT} HTTP/1.1\r\n{host}content-type: application/json\r\n{head}\r\n".encode()
+    with socket.create_connection(("127.0.0.1", port), timeout=SOON_S) as connection:
+        connection.sendall(request + b"{")
+        received = b""
+        while piece := connection.recv(65536):
+            received += piece
+            connection.sendall(b" ")  # who still sends does not lose the reply
+        reply_head, _, body = received.partition(b"\r\n\r\n")
+        assert reply_head.startswith(b"HTTP/1.1 %d " % status)
+        assert b"\r\nconnection: close" in reply_head.lower()
+        assert json.loads(body)["error"]
+    with socket.create_connection(("127.0.0.1", port), timeout=SOON_S) as connection:
+        for _ in range(2):  # refused as a whole, it goes on
+            line = f"POST {ACT} HTTP/1.1\r\nhost: 127.0.0.1\r\nx-api-key: no\r\n".encode()
+            connection.sendall(line + b"content-length: 2\r\n\r\n{}")
+            refusal = connection.recv(65536)
+            assert refusal.startswith(b"HTTP/1.1 401 ") and b"connection: close" not in refusal.lower()
+
+
 def test_the_connections_of_an_address_are_bounded_and_counted_until_they_end(
     start: Callable[[], Replica], port: int
 ) -> None:
@@ -274,7 +306,7 @@ def test_a_request_leaves_nothing_to_the_garbage_collector(start: Callable[[], R
             for key, status in ((KEY, 200), ("no", 401)) * 20:
                 connection.sendall(f"{head}x-api-key: {key}\r\n\r\n".encode() + body)  # in one piece
                 assert connection.recv(65536).startswith(b"HTTP/1.1 %d " % status)
-            left = sum(type(each) is RequestResponseCycle for each in gc.get_objects())
+            left = sum(type(each) is http_connections.EarlyEnd for each in gc.get_objects())
         finally:
             gc.enable()
     assert left < 10, "a collection over all of a replica takes milliseconds, in which nobody is answered"

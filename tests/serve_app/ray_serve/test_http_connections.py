@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import http.client
 import json
+import random
+import runpy
 import socket
 import threading
 import time
@@ -14,10 +16,10 @@ from typing import Any
 
 import pytest
 import uvicorn
-from uvicorn.protocols.http import auto
+from uvicorn.protocols.http import auto, httptools_impl
 from uvicorn.server import ServerState
 
-from rlservo.serve_app.ray_serve import http_connections
+from rlservo.serve_app.ray_serve import http_connections, uvicorn_parts
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 from rlservo.serve_app.ray_serve.ingress import Ingress
 
@@ -190,12 +192,25 @@ def test_an_idle_connection_outlives_the_phases_of_a_request(port: int) -> None:
     connection.close()
 
 
-def test_a_uvicorn_without_what_it_changes_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_connections, "PRIVATE", ("_start_asgi_task", "_moved_elsewhere"))
-    with pytest.raises(RuntimeError, match=rf"uvicorn {uvicorn.__version__} .*_moved_elsewhere"):
+NAMES = [(part, kind) for part in (uvicorn_parts.METHODS, uvicorn_parts.FIELDS) for kind in part]
+
+
+@pytest.mark.parametrize(("part", "kind"), NAMES, ids=lambda one: getattr(one, "__name__", ""))
+def test_a_uvicorn_without_what_it_uses_is_refused_by_name(
+    part: dict[type, tuple[str, ...]], kind: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uvicorn_parts.check()
+    monkeypatch.setitem(part, kind, (*part[kind], "_moved_elsewhere"))
+    refused = rf"uvicorn {uvicorn.__version__} .* has no {kind.__name__}\._moved_elsewhere, "
+    with pytest.raises(RuntimeError, match=refused):
         http_connections.install()
     assert auto.AutoHTTPProtocol is not TimedProtocol
-    assert asyncio.iscoroutinefunction(app)
+
+
+def test_so_is_one_without_what_it_imports(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(httptools_impl, "STATUS_LINE")
+    with pytest.raises(RuntimeError, match=rf"uvicorn {uvicorn.__version__} .*STATUS_LINE"):
+        runpy.run_path(uvicorn_parts.__file__)
 
 
 # Streams: what comes faster than it can be answered.
@@ -261,6 +276,115 @@ def test_a_stream_some_requests_ahead_gets_all_answers(stream: socket.socket) ->
         answer += stream.recv(65536)
     assert answer.count(b"\x82\x01x") == 60
     assert answer.count(b"\x8a\x01y") == 900
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_streams_messages_are_the_same_however_its_bytes_are_cut(seed: int) -> None:
+    """Of whole frames the parser sees nothing; it must see the rest of one that was cut, and what belongs together."""
+    draw = random.Random(seed)
+    expected, frames = [], []
+    for size in draw.choices((0, 1, 125, 126, 300, 20000), k=30):
+        payload, mask = draw.randbytes(size), draw.randbytes(4)
+        expected.append(payload)
+        frame = masked(2, payload)
+        head = len(frame) - len(payload)
+        frame = frame[: head - 4] + mask + bytes(byte ^ mask[at % 4] for at, byte in enumerate(payload))
+        kind = draw.choice(("plain", "plain", "ping", "fragments"))
+        if kind == "ping":
+            frames.append(masked(9, b"p"))
+        elif kind == "fragments":
+            frames += [masked(2, payload[:1], first=0), masked(9, b"p"), masked(0, payload[1:])]
+            continue
+        frames.append(frame)
+    pieces, whole = [], b"".join(frames)
+    while whole and seed >= 10:  # else each frame is a read
+        at = draw.choice((1, 3, 7, 131, 5000))
+        pieces, whole = [*pieces, whole[:at]], whole[at:]
+
+    assert messages_of(echoed(pieces or frames, draw)) == expected
+
+
+def test_a_frame_in_a_message_that_is_cut_is_no_message() -> None:
+    payload = masked(2, b"inside")
+    frame = masked(2, payload)
+    assert messages_of(echoed([frame[: -len(payload)], payload, masked(2, b"next")], random.Random(0))) == [
+        payload,
+        b"next",
+    ]
+
+
+def test_a_message_amid_fragments_ends_a_stream(stream: socket.socket) -> None:
+    stream.sendall(masked(2, b"a", first=0))
+    stream.sendall(masked(2, b"b"))
+    assert closing_code(stream) == 1002
+
+
+def echoed(pieces: list[bytes], draw: random.Random) -> bytes:
+    """What a stream writes when these pieces are read, each by itself."""
+
+    class Transport(asyncio.Transport):
+        written = b""
+
+        def write(self, data: Any) -> None:
+            self.written += data
+
+        def is_closing(self) -> bool:
+            return False
+
+        def pause_reading(self) -> None: ...
+        def resume_reading(self) -> None: ...
+        def close(self) -> None: ...
+
+    async def run() -> bytes:
+        config = uvicorn.Config(app, lifespan="off", log_level="critical")
+        config.load()
+        transport = Transport()
+        protocol = http_connections.BoundedStream(config, ServerState(), {}, asyncio.get_running_loop())
+        protocol.connection_made(transport)
+        protocol.data_received(f"GET / HTTP/1.1\r\nhost: x\r\n{HANDSHAKE}\r\n".encode())
+        while not transport.written:
+            await asyncio.sleep(0)
+        transport.written = b""
+        for piece in pieces:
+            protocol.data_received(piece)
+            for _ in range(draw.randrange(6)):
+                await asyncio.sleep(0)
+        for _ in range(100):
+            await asyncio.sleep(0)
+        protocol.connection_lost(None)
+        return transport.written
+
+    return asyncio.run(run())
+
+
+def messages_of(written: bytes) -> list[bytes]:
+    """The binary messages in a server's bytes."""
+    found = []
+    while written:
+        size, start = written[1], 2
+        if size >= 126:
+            start = 4 if size == 126 else 10
+            size = int.from_bytes(written[2:start], "big")
+        if written[0] == 0x82:
+            found.append(written[start : start + size])
+        written = written[start + size :]
+    return found
+
+
+@pytest.mark.parametrize("size", [0, 125, 126, 65535, 65536, 300_000])
+def test_a_message_of_any_size_comes_back(stream: socket.socket, size: int) -> None:
+    payload = bytes(size)
+    length = size.to_bytes(8, "big")
+    stream.sendall(masked(2, payload) if size < 1 << 16 else b"\x82\xff" + length + bytes(4) + payload)
+    answer, head = b"", 2 if size < 126 else 4 if size < 1 << 16 else 10
+    while len(answer) < head + size:
+        answer += stream.recv(1 << 20)
+    assert messages_of(answer) == [payload]
+
+
+def test_a_frame_without_a_mask_ends_a_stream(stream: socket.socket) -> None:
+    stream.sendall(b"\x82\x0aunmasked..")
+    assert closing_code(stream) == 1002
 
 
 def test_a_stream_with_requests_ahead_lets_others_have_their_turns() -> None:

@@ -11,7 +11,7 @@ import grpc
 import pytest
 import ray
 
-from rlservo.serve_app.ray_serve import cluster_process, grpc_ingress, ray_parts
+from rlservo.serve_app.ray_serve import cluster_process, grpc_ingress, ray_parts, uvicorn_parts
 from rlservo.serve_app.ray_serve.ray_parts import NEEDED, SPARED
 
 with warnings.catch_warnings():
@@ -40,6 +40,12 @@ def test_a_ray_that_lacks_a_needed_name_is_refused_by_version(name: str, monkeyp
         ray_parts.check()
     assert ray.__version__ in str(refusal.value) and name.replace(":", ".") in str(refusal.value)
     with pytest.raises(RuntimeError, match="install a Ray that it knows"):
+        app.build(app.BuildArguments.model_validate({"policies": ["somewhere"]}))
+
+
+def test_so_is_a_uvicorn_that_lacks_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(uvicorn_parts.RequestResponseCycle, "run_asgi")
+    with pytest.raises(RuntimeError, match=r"uvicorn .* has no RequestResponseCycle\.run_asgi, "):
         app.build(app.BuildArguments.model_validate({"policies": ["somewhere"]}))
 
 
