@@ -92,10 +92,19 @@ class Browser:
         self.page.get_by_role(role, name=name, exact=True).first.click()
 
     def choose(self, label: str, option: str | None) -> None:
-        """Choose an option of a dropdown, by its name or the second one there is."""
-        self.page.get_by_label(label, exact=True).first.click()
+        """Choose an option of a dropdown, by its name or the second one there is; again where the list has closed."""
+        from playwright.sync_api import TimeoutError as NotInTimeError
+
         options = self.page.get_by_role("option")
-        (options.nth(1) if option is None else options.get_by_text(option, exact=True).first).click()
+        wanted = options.nth(1) if option is None else options.get_by_text(option, exact=True).first
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            self.page.get_by_label(label, exact=True).first.click()
+            try:
+                return wanted.click(timeout=20e3)
+            except NotInTimeError:
+                assert time.monotonic() < deadline, f"{option or 'its second'} cannot be chosen as {label}"
+                self.page.keyboard.press("Escape")
 
     def fill(self, label: str, number: str) -> None:
         """Type a number beside a slider."""

@@ -1,7 +1,7 @@
 """Run training scripts one after the other in one process and one Ray, where starting a Ray is not what is tested.
 
 A request is a line on standard input, ["FOLDER", "SCRIPT", "ARGUMENT", ...]: the folder is made, and the script runs
-in it. The reply is a line on standard output: how it ended, and what it left in the home folder.
+in it. The reply is a line on standard output: the folder, how it ended, and what it left in the home folder.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ def main() -> None:
             os.chdir(folder)
             before = in_home()
             code, out, err = run(*words)
-            print(json.dumps({"code": code, "out": out, "err": err, "home": list(in_home() - before)}), flush=True)
+            left = list(in_home() - before)
+            print(json.dumps({"folder": folder, "code": code, "out": out, "err": err, "home": left}), flush=True)
 
 
 def in_home() -> set[str]:

@@ -61,9 +61,8 @@ class Server:
 
     def replica_port(self) -> int:
         (file,) = self.run.folder.rglob("haproxy.cfg")
-        found = re.search(r"server SERVE_REPLICA\S+ [\d.]+:(\d+) check", file.read_text())
-        assert found
-        return int(found[1])
+        line = r"server SERVE_REPLICA\S+ [\d.]+:(\d+) check"
+        return int(until(lambda: re.search(line, file.read_text()))[1])  # it may be being written
 
 
 def until(condition: Callable[[], Any], timeout_s: float = 60) -> Any:

@@ -400,7 +400,7 @@ def outcome_of(process: subprocess.Popen[str]) -> tuple[int, str]:
 
 def arranged(cluster: Cluster) -> set[tuple[str, Any]]:
     """Return what each replica serves: its default version and canary."""
-    policies = [policy for replica in cluster.replicas() for policy in replica["policies"]]
+    policies = [policy_of(replica) for replica in cluster.replicas()]
     return {(policy["version"], policy["canary"] and policy["canary"]["version"]) for policy in policies}
 
 

@@ -196,13 +196,15 @@ def test_requests_on_streams_are_logged_like_others(
 
 
 def test_the_dashboard_asks_for_metrics_that_exist(
-    filtered: Path, served: Callable[[Any], AbstractContextManager[int]]
+    filtered: Path, tmp_path: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
     store = load_store(filtered)
-    with served(create_app(lambda: store, ServerSettings(), replica="r")) as port:
+    with served(create_app(lambda: store, ServerSettings(record=str(tmp_path)), replica="r")) as port:
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27})[0] == 200
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0]})[0] == 422
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27, "session_id": "s", "reset": True})[0] == 200
+        end = {"obs": [0.0] * 27, "session_id": "s", "final_status": "success"}
+        assert post(port, "/v1/policies/ur5/act", end)[0] == 200
         exposed = {name for name, *_ in scrape(port)} | {"rlservo_streams"}  # that one needs a stream
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
         connection.request("GET", "/metrics")
