@@ -61,7 +61,8 @@ TOGETHER = {
 LONGEST = (
     "one Ray", "cluster", "live server", "shipped server", "tests/deploy/cockpit/test_page.py",
     "tests/system/test_demo.py", "tests/examples/test_on_a_cluster.py", "tests/system/test_serving_starts.py",
-    "ports of server managers", "sweep", "several nodes",
+    "ports of server managers", "tests/serve_app/versions/test_remote_repository.py",
+    "tests/export/rllib/test_new_stack.py", "sweep", "several nodes",
 )  # fmt: skip
 
 # Servers and Rays that tests share. One that nobody uses still takes a tenth of a core or more.
