@@ -226,7 +226,7 @@ def test_over_the_direct_port_our_clients_go_on_when_a_replica_is_killed(
 
     wait_for_two(server, direct_port)
     stop, url = threading.Event(), f"http://127.0.0.1:{server.port}"
-    clients = [PolicyClient(url, "ur5", api_key=OLD, deadline_ms=30e3) for _ in range(6)]
+    clients = [kind(url, "ur5", api_key=OLD, deadline_ms=30e3) for kind in (PolicyClient, StreamClient) * 3]
     asked, direct = [0] * len(clients), [0] * len(clients)
 
     def drive(number: int) -> None:

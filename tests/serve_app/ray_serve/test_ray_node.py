@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from ray.util import get_node_ip_address
+from cluster_resources import make_certificates
 
 from rlservo.serve_app.ray_serve.environment import cluster_environment
 from rlservo.serve_app.ray_serve.processes import MARK, end_marked, free_ports, remove_folder
@@ -66,29 +66,6 @@ def run_until(command: list[str], environment: dict[str, str], words: str) -> st
         process.wait()
         process.stdout.close()
     return said
-
-
-def make_certificates(folder: Path) -> dict[str, str]:
-    """Make an authority and a certificate for this node, as docs/cluster.md says; return Ray's variables."""
-
-    def openssl(*words: object) -> None:
-        subprocess.run(["openssl", *map(str, words)], check=True, capture_output=True, timeout=60)
-
-    authority, signer, request = folder / "ca.pem", folder / "ca.key", folder / "node.csr"
-    certificate, key, extensions = folder / "node.pem", folder / "node.key", folder / "extensions"
-    # Ray goes by the machine's address where it is told 127.0.0.1.
-    extensions.write_text(f"subjectAltName=IP:127.0.0.1,IP:{get_node_ip_address()},DNS:localhost\n")
-    kind = ("-newkey", "rsa:2048", "-nodes")
-    openssl("req", "-x509", *kind, "-keyout", signer, "-out", authority, "-days", 2, "-subj", "/CN=ray CA")
-    openssl("req", *kind, "-keyout", key, "-out", request, "-subj", "/CN=ray")
-    openssl("x509", "-req", "-in", request, "-CA", authority, "-CAkey", signer, "-CAcreateserial", "-days", 2,
-            "-extfile", extensions, "-out", certificate)  # fmt: skip
-    return {
-        "RAY_USE_TLS": "1",
-        "RAY_TLS_SERVER_CERT": str(certificate),
-        "RAY_TLS_SERVER_KEY": str(key),
-        "RAY_TLS_CA_CERT": str(authority),
-    }
 
 
 @pytest.fixture(scope="module")
