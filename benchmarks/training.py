@@ -29,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 import shared.training_run as training_run
 
 from rlservo.export.contract.errors import RlservoError
+from rlservo.export.rllib.batched_connectors import batched_connectors
 
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
 
@@ -48,7 +49,7 @@ class Iteration:
     rest_s: float  # sending weights, results, evaluation
     env_step_share: float  # of a runner's sampling: the simulators
     inference_share: float  # the network
-    connectors_share: float  # RLlib's pipelines before and after the network
+    connectors_share: float  # the pipelines before and after the network
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, help="default: 3; with --quick 2")
     parser.add_argument("--batch", type=int, help="environment steps an iteration; default: 4096; with --quick 1024")
     parser.add_argument("--minutes", type=float, help="for all of it; default: 15; with --quick 3")
+    parser.add_argument("--rllib-connectors", action="store_true", help="RLlib's own, to compare")
     parser.add_argument("--quick", action="store_true", help="small batches")
     parser.add_argument("--out", type=Path, default=Path("bench"))
     args = parser.parse_args()
@@ -108,7 +110,8 @@ def main() -> None:
         configurations = list(itertools.product(args.runners, args.envs))
         for done, (runners, envs) in enumerate(configurations):
             limit = max(1.0, (until - time.monotonic()) / (len(configurations) - done))
-            rows.append(measure(args.env, runners, envs, args.iterations, args.batch, limit))
+            own = {"rllib_connectors": args.rllib_connectors}
+            rows.append(measure(args.env, runners, envs, args.iterations, args.batch, limit, **own))
             print(line(rows[-1]), flush=True)
             write(rows, args.env, args.batch, args.out)
     print(f"written: {args.out / 'training.json'}, {args.out / 'training.png'}")
@@ -159,12 +162,15 @@ def line(row: Row | Failed) -> str:
     return " ".join(f"{cell:>14}" for cell in cells) + f"   {shares}{few}"
 
 
-def measure(env: str, runners: int, envs: int, iterations: int, batch: int, limit: float) -> Row | Failed:
+def measure(
+    env: str, runners: int, envs: int, iterations: int, batch: int, limit: float, *, rllib_connectors: bool = False
+) -> Row | Failed:
     """Train a few iterations and return the medians of those that ended in time."""
     taken: list[Iteration] = []
     time_limit = TimeLimit(limit)
+    config = configuration(env, runners, envs, batch, rllib_connectors=rllib_connectors)
     try:
-        with time_limit, training_run.stopping(configuration(env, runners, envs, batch).build_algo()) as algorithm:
+        with time_limit, training_run.stopping(config.build_algo()) as algorithm:
             clock = Clock(algorithm)
             clock.iteration()  # the first one warms up
             for _ in range(iterations):
@@ -178,7 +184,7 @@ def measure(env: str, runners: int, envs: int, iterations: int, batch: int, limi
     return Row(runners, envs, len(taken), *medians)
 
 
-def configuration(env: str, runners: int, envs: int, batch: int) -> Any:
+def configuration(env: str, runners: int, envs: int, batch: int, *, rllib_connectors: bool = False) -> Any:
     """Return PPO's configuration as the UR5 script trains it, the batch smaller."""
     from ray.rllib.algorithms.ppo import PPOConfig
 
@@ -186,6 +192,8 @@ def configuration(env: str, runners: int, envs: int, batch: int) -> Any:
     assert isinstance(config, PPOConfig)
     config.environment(env, env_config={"rs_state_to_info": False} if env.startswith("rlservo/") else {})
     config.env_runners(num_env_runners=runners, num_envs_per_env_runner=envs)
+    if not rllib_connectors:
+        config.env_runners(**batched_connectors(observation_filter=False))
     config.training(train_batch_size_per_learner=batch, minibatch_size=MINIBATCH, num_epochs=4)
     config.rl_module(model_config={"fcnet_hiddens": [256, 256], "fcnet_activation": "tanh", "vf_share_layers": False})
     config.fault_tolerance(restart_failed_env_runners=False)

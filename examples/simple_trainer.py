@@ -37,6 +37,7 @@ from shared.resources import Room
 from shared.training_run import RETURN, STEPS, Run
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.rllib.batched_connectors import batched_connectors, fit
 from rlservo.serve_app.rollout.environment import make_env
 
 ONLINE = ("PPO", "APPO", "IMPALA", "DQN", "SAC")
@@ -250,6 +251,8 @@ def algorithm_config(
         # RLlib's annotation here is narrower than what it takes: the connector's three-argument form.
         env_to_module_connector=cast(Any, observation_steps(spaces[0], args.observation_filter)),
     )
+    if fit(*spaces) and not (is_flattened(spaces[0]) or args.use_lstm):  # the same numbers, sooner
+        config.env_runners(**batched_connectors(observation_filter=args.observation_filter == "MeanStdFilter"))
     config.learners(num_learners=args.num_learners, num_gpus_per_learner=gpus_per_learner(args))
     config.rl_module(
         model_config=DefaultModelConfig(
@@ -289,10 +292,10 @@ def algorithm_config(
 def observation_steps(space: Any, kind: str) -> Any:
     """Return RLlib's connectors between environment and network, or None where it needs none.
 
-    A Box of one axis and an image of a size RLlib has convolutions for go in as they are. Everything else is made one
-    vector: choices one-hot, Dict and Tuple in the space's order, other images pixel by pixel. uint8 is not scaled.
+    What is flattened is made one vector: choices one-hot, Dict and Tuple in the space's order, images pixel by pixel.
+    uint8 is not scaled.
     """
-    flatten = not (isinstance(space, Box) and (len(space.shape) == 1 or _is_known_image(space)))
+    flatten = is_flattened(space)
     has_filter = kind == "MeanStdFilter"
     if has_filter and (not isinstance(space, Box) or np.dtype(space.dtype).kind != "f"):
         raise UsageError(f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, {space} is none")
@@ -303,6 +306,11 @@ def observation_steps(space: Any, kind: str) -> Any:
         return ([FlattenObservations()] if flatten else []) + ([MeanStdFilter()] if has_filter else [])
 
     return build
+
+
+def is_flattened(space: Any) -> bool:
+    """Whether the network is to see a vector: all but a vector, and an image of a size RLlib has convolutions for."""
+    return not (isinstance(space, Box) and (len(space.shape) == 1 or _is_known_image(space)))
 
 
 def _is_known_image(space: Box) -> bool:

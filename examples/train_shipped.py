@@ -40,6 +40,7 @@ from ray.tune.registry import get_trainable_cls
 from shared.training_run import main_with_sentences, ray_session
 
 from rlservo import Policy, export_checkpoint
+from rlservo.export.rllib.batched_connectors import batched_connectors
 
 assert ray_settings
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
@@ -66,12 +67,11 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     """Return the RLlib configuration that `training.yaml` describes."""
     config: AlgorithmConfig = get_trainable_cls(settings["algorithm"]).get_default_config()
     config.environment(settings["env"], env_config=settings.get("env_config", {}), clip_rewards=False)
-    # RLlib's annotation here is narrower than what it takes: the connector's three-argument form.
     config.env_runners(
         num_env_runners=0,
         num_envs_per_env_runner=settings["envs"],
         rollout_fragment_length=settings.get("rollout_fragment_length", "auto"),
-        env_to_module_connector=cast(Any, _mean_std_filter if settings["filter"] else None),
+        **batched_connectors(observation_filter=settings["filter"]),
     )
     config.learners(num_learners=0, num_gpus_per_learner=0)
     config.rl_module(model_config=settings.get("model", {}))
@@ -84,10 +84,6 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     config.callbacks(on_episode_end=_log_episode)
     config.debugging(seed=seed, log_level="ERROR")
     return config
-
-
-def _mean_std_filter(env: Any, spaces: Any, device: Any) -> MeanStdFilter:
-    return MeanStdFilter()
 
 
 def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any = None, **_: Any) -> None:

@@ -16,10 +16,10 @@ from typing import Any, cast
 import shared.training_run as training_run  # before Ray  # isort: skip
 import yaml
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
-from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
 import shared.resources as resources
+from rlservo.export.rllib.batched_connectors import batched_connectors
 from shared.help_text import DefaultsFormatter
 from shared.resources import Room
 from shared.training_run import RETURN, STEPS, Run
@@ -131,11 +131,10 @@ def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: floa
     config.framework("torch")
     config.env_runners(
         num_env_runners=max(2, cpus - 1),
-        # RLlib's annotations here are narrower than what it takes: a fraction of a core, and the connector's
-        # three-argument form.
+        # RLlib's annotation here is narrower than what it takes: a fraction of a core.
         num_cpus_per_env_runner=cast(Any, 0.5 if cpus == 2 else 0.25 if cpus < 2 else 1),
         num_envs_per_env_runner=args.num_envs_per_env_runner,
-        env_to_module_connector=cast(Any, _mean_std_filter),
+        **batched_connectors(observation_filter=True),
     )
     config.resources(num_cpus_for_main_process=cast(Any, 1 if cpus >= 2 else 0.5))
     # RLlib takes the larger of this and the main process's; left alone it is a whole core.
@@ -147,10 +146,6 @@ def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: floa
     config.callbacks(on_episode_end=training_run.log_success, on_train_result=training_run.fill_return(RETURN, "max"))
     config.debugging(seed=args.seed, log_level="ERROR")
     return config
-
-
-def _mean_std_filter(env: Any, spaces: Any, device: Any) -> MeanStdFilter:
-    return MeanStdFilter()
 
 
 def run(task: Task, parser: argparse.ArgumentParser) -> None:

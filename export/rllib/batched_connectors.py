@@ -1,12 +1,13 @@
-"""RLlib's default connectors for one agent, in two pieces that take all environments of a runner at once.
+"""RLlib's default connectors for one agent, as two pieces that take all environments of a runner at once.
 
 RLlib (2.60) passes each environment's observation and action through ten pieces, one by one and each timed, which takes
-as long as the simulator or longer. These give the same numbers, bit by bit, in half the time or less. They fit where an
-observation is a Box, an action a Box, Discrete or MultiDiscrete, and the network keeps no state.
+as long as the simulator or longer. These give the same numbers, bit by bit. They do where an observation is a Box, an
+action a Box, Discrete or MultiDiscrete, and the network has no memory:
 
     config.env_runners(**batched_connectors(observation_filter=True))
 
-An export reads them as it reads RLlib's own (`new_connectors.py`).
+Two are called as RLlib's own, whose work they do: a checkpoint keeps a piece's state under its class's name, so that
+what was trained with either goes on with the other, and `new_connectors.py` exports both alike.
 """
 
 from __future__ import annotations
@@ -15,15 +16,17 @@ import functools
 from typing import Any
 
 import numpy as np
+import ray
 import torch
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from ray.rllib.connectors import env_to_module, module_to_env
 from ray.rllib.connectors.connector_v2 import ConnectorV2
-from ray.rllib.connectors.env_to_module import MeanStdFilter
-from ray.rllib.connectors.module_to_env import GetActions, NormalizeAndClipActions
 from ray.rllib.core.columns import Columns
 from ray.rllib.utils.filter import RunningStat
 from ray.rllib.utils.numpy import SMALL_NUMBER, convert_to_numpy
 from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
+
+from rlservo.export.contract.errors import UsageError
 
 
 def batched_connectors(
@@ -31,30 +34,26 @@ def batched_connectors(
 ) -> dict[str, Any]:
     """Return the arguments of `AlgorithmConfig.env_runners` that put these pieces in the place of RLlib's.
 
-    `normalize_actions` and `clip_actions` are what they are in RLlib, and have its defaults.
+    `normalize_actions` and `clip_actions` mean what they do in RLlib, and have its defaults.
     """
 
-    def env_to_module(env: Any, spaces: Any, device: Any) -> ConnectorV2:
-        return BatchedMeanStdFilter(device=device) if observation_filter else BatchedObservations(device=device)
+    def before(_env: Any, _spaces: Any, device: Any) -> ConnectorV2:
+        return MeanStdFilter(device=device) if observation_filter else BatchedObservations(device=device)
 
-    def module_to_env(env: Any, spaces: Any) -> ConnectorV2:
-        return BatchedActions(normalize_actions=normalize_actions, clip_actions=clip_actions)
+    def after(_env: Any, _spaces: Any) -> ConnectorV2:
+        return NormalizeAndClipActions(normalize_actions=normalize_actions, clip_actions=clip_actions)
 
     return {
-        "env_to_module_connector": env_to_module,
-        "module_to_env_connector": module_to_env,
+        "env_to_module_connector": before,
+        "module_to_env_connector": after,
         "add_default_connectors_to_env_to_module_pipeline": False,
         "add_default_connectors_to_module_to_env_pipeline": False,
     }
 
 
-def fit(observation_space: Any, action_space: Any, model: dict[str, Any]) -> bool:
-    """Whether these pieces do for such spaces, and for a network of RLlib's own with such settings."""
-    return (
-        isinstance(observation_space, Box)
-        and isinstance(action_space, Box | Discrete | MultiDiscrete)
-        and not model.get("use_lstm")
-    )
+def fit(observation_space: Any, action_space: Any) -> bool:
+    """Whether these pieces do for an agent with such spaces, if its network has no memory."""
+    return isinstance(observation_space, Box) and isinstance(action_space, Box | Discrete | MultiDiscrete)
 
 
 class BatchedObservations(ConnectorV2):
@@ -66,14 +65,17 @@ class BatchedObservations(ConnectorV2):
         super().__init__(input_observation_space, input_action_space, **kwargs)
         self._device = device
 
+    def recompute_output_observation_space(self, input_observation_space: Any, input_action_space: Any) -> Any:
+        return super().recompute_output_observation_space(_check_box(input_observation_space), input_action_space)
+
     def __call__(self, *, rl_module: Any, batch: dict[str, Any], episodes: list[Any], **_: Any) -> dict[str, Any]:
         rows = [episode.observations.data[-1] for episode in episodes]
         batch[Columns.OBS] = _tensor(rows, rl_module, self._device)
         return batch
 
 
-class BatchedMeanStdFilter(MeanStdFilter):
-    """The same after RLlib's running filter, whose statistics, state and place in the checkpoint these are."""
+class MeanStdFilter(env_to_module.MeanStdFilter):
+    """The same after RLlib's running filter."""
 
     def __init__(
         self, input_observation_space: Any = None, input_action_space: Any = None, *, device: Any = None, **kwargs: Any
@@ -81,12 +83,19 @@ class BatchedMeanStdFilter(MeanStdFilter):
         super().__init__(
             input_observation_space=input_observation_space, input_action_space=input_action_space, **kwargs
         )
+        if missing := [name for name in ("_filters", "_update_stats") if not hasattr(self, name)]:
+            lacks = " and no ".join(missing)
+            raise UsageError(f"Ray {ray.__version__}'s filter has no {lacks}: use RLlib's own connectors")
         self._device = device
+
+    def recompute_output_observation_space(self, input_observation_space: Any, input_action_space: Any) -> Any:
+        return super().recompute_output_observation_space(_check_box(input_observation_space), input_action_space)
 
     def __call__(self, *, rl_module: Any, batch: dict[str, Any], episodes: list[Any], **_: Any) -> dict[str, Any]:
         if self._filters is None:
-            self._init_new_filters()
-        running = self._filters[None]
+            self.get_state()  # makes new ones
+        filters: Any = self._filters
+        running = filters[None]
         rows = []
         for episode in episodes:
             row = np.asarray(episode.observations.data[-1])
@@ -101,26 +110,27 @@ class BatchedMeanStdFilter(MeanStdFilter):
         return batch
 
 
-class BatchedActions(NormalizeAndClipActions):
+class NormalizeAndClipActions(module_to_env.NormalizeAndClipActions):
     """Actions drawn from the network's distribution and scaled for the environments, `[environments, ...]`."""
 
     def __init__(self, input_observation_space: Any = None, input_action_space: Any = None, **kwargs: Any) -> None:
-        super().__init__(input_observation_space, input_action_space, **kwargs)
-        self._get_actions = GetActions()
         self._low: Any = None  # of actions that are scaled
         self._range: Any = None
+        self._space: Any = None
+        super().__init__(input_observation_space, input_action_space, **kwargs)
+        self._get_actions = module_to_env.GetActions()
 
     def recompute_output_action_space(self, input_observation_space: Any, input_action_space: Any) -> Any:
-        space = super().recompute_output_action_space(input_observation_space, input_action_space)
-        if self.normalize_actions and isinstance(space, Box) and space.dtype.kind == "f" and space.is_bounded():
+        self._space = space = super().recompute_output_action_space(input_observation_space, input_action_space)
+        if isinstance(space, Box) and space.dtype in (np.float32, np.float64) and space.is_bounded():
             self._low, self._range = space.low, space.high - space.low
         return space
 
     def __call__(self, *, batch: Any, **kwargs: Any) -> dict[str, Any]:
         drawn = self._get_actions(batch=batch, **kwargs)
         columns = {name: _array(value) for name, value in drawn.items()}
-        actions, space = columns[Columns.ACTIONS], self._action_space_struct
-        if self._range is not None:
+        actions, space = columns[Columns.ACTIONS], self._space
+        if self.normalize_actions and self._range is not None:
             scaled = self._low + (actions + 1.0) * self._range / 2.0
             columns[Columns.ACTIONS_FOR_ENV] = scaled.clip(space.low, space.high)
         elif self.normalize_actions:
@@ -130,12 +140,22 @@ class BatchedActions(NormalizeAndClipActions):
         return columns
 
 
+def _check_box(space: Any) -> Any:
+    if not isinstance(space, Box):
+        raise UsageError(f"observations are {space}: the batched connectors take a Box, RLlib's own take all")
+    return space
+
+
 def _tensor(rows: list[Any], module: Any, device: Any) -> Any:
     """Return observations as the network's input, or as an array where there is no network."""
     stacked = np.array(rows)
     if module is None:
         return stacked
     if module.training:  # RLlib would walk all layers twice a step, to leave training mode and to enter it again
+        if module.is_stateful():
+            raise UsageError(
+                "the network has a memory (an LSTM, say): the batched connectors have no place for it, RLlib's own do"
+            )
         module.eval()
         module.eval = functools.partial(_evaluate, module)
     tensor = torch.from_numpy(stacked)

@@ -31,6 +31,7 @@ from rlservo.export.rllib.frozen_filter import frozen_filter
 # Pieces that move data about without changing a number.
 PLUMBING = frozenset({
     "AddObservationsFromEpisodesToBatch",
+    "BatchedObservations",
     "AddTimeDimToBatchAndZeroPad",
     "AddStatesFromEpisodesToBatch",
     "AgentToModuleMapping",
@@ -46,6 +47,8 @@ PLUMBING = frozenset({
 })  # fmt: skip
 BATCHES_OBSERVATION = frozenset({"AddObservationsFromEpisodesToBatch", "FrameStacking"})
 """Pieces that put the observation into the batch: what a later one changes in the episode comes too late."""
+BATCHED_CONNECTORS = "rlservo.export.rllib.batched_connectors"
+"""Pieces that do what RLlib's of the same names do; those for observations batch them, too."""
 
 HOOK = "torch_forward"
 
@@ -84,7 +87,9 @@ def read_observation_steps(env_to_module: Any, files: CheckpointFiles, slot: Age
                 f"the env-to-module connector {name} comes after {batched_by}, which has handed the observation on "
                 "already: what RLlib does then depends on the step before, which is not exported"
             )
-        if name in BATCHES_OBSERVATION and _comes_from_rllib(type(piece)):
+        if type(piece).__module__ == BATCHED_CONNECTORS or (
+            name in BATCHES_OBSERVATION and _comes_from_rllib(type(piece))
+        ):
             batched_by = name
         if step is not None:
             steps.append(step)
@@ -200,5 +205,5 @@ def _filter(piece: Any, space: Any, slot: AgentSlot) -> ObservationFilter:
 
 
 def _comes_from_rllib(kind: type) -> bool:
-    """Return whether a piece is RLlib's own, not the user's of the same name."""
-    return kind.__module__.startswith("ray.rllib.connectors.")
+    """Return whether a piece is RLlib's own or does the same, and not the user's of the same name."""
+    return kind.__module__ == BATCHED_CONNECTORS or kind.__module__.startswith("ray.rllib.connectors.")
