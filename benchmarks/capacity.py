@@ -130,7 +130,7 @@ def load_some(folder: Path, fitting: int) -> str:
     )
     taken, used, grown = time.perf_counter() - began, time.process_time() - cpu, rss_mb(os.getpid()) - before
     networks = [network for name in store.names if (network := store.get(name).droppable) is not None]
-    restorer, opened_ms = NetworkRestorer(60.0), []
+    restorer, opened_ms = NetworkRestorer(), []
 
     async def restore() -> None:
         for index in np.random.default_rng(0).integers(0, len(networks), 600):

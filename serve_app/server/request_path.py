@@ -195,7 +195,7 @@ class RequestPath:
         self.metrics = Metrics()
         self.log = RequestLog(settings)
         self.shadows = Shadows()
-        self._restorer = NetworkRestorer(settings.load_timeout_s)
+        self._restorer = NetworkRestorer()
         self.recorder: RequestRecorder | None = None
 
     def store(self) -> PolicyStore:

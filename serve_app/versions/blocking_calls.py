@@ -29,23 +29,23 @@ class BlockingCalls:
         self._limit = limit
         self._free = asyncio.Semaphore(limit)
 
-    async def run(self, function: Callable[..., Result], *arguments: Any, timeout_s: float, what: str) -> Result:
+    async def run(self, function: Callable[..., Result], *arguments: Any, timeout_s: float | None, what: str) -> Result:
         """Return what the function returns; raise what it raises, and UnavailableError when it takes too long.
 
-        `what` says in the error what was being done.
+        `what` says in the error what was being done. None waits for as long as it takes.
         """
-        deadline = time.monotonic() + timeout_s
+        began = time.monotonic()
         try:
-            async with asyncio.timeout(timeout_s):
-                await self._free.acquire()
-        except TimeoutError:
+            await asyncio.wait_for(self._free.acquire(), timeout_s)
+        except asyncio.TimeoutError:  # which is Python's own from 3.11 on
             raise UnavailableError(
                 f"{what} could not begin within {timeout_s:g} s: {self._limit} earlier calls have not come back "
                 "from the file system"
             ) from None
         returned = asyncio.wrap_future(self._start(function, arguments))
         try:
-            done, _ = await asyncio.wait([returned], timeout=deadline - time.monotonic())
+            left_s = None if timeout_s is None else timeout_s - (time.monotonic() - began)
+            done, _ = await asyncio.wait([returned], timeout=left_s)
         finally:
             returned.cancel()  # if it has not returned: nobody waits for it any more
         if not done:
@@ -66,10 +66,14 @@ class BlockingCalls:
                 future.set_exception(error)
             else:
                 future.set_result(result)
-
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(self._free.release)
 
         # A daemon: the process can end while the thread is stuck.
-        threading.Thread(target=call, name="policies", daemon=True).start()
+        thread = threading.Thread(target=call, name="policies", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError:  # there are too many in this process
+            self._free.release()
+            raise
         return future

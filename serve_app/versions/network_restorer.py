@@ -14,9 +14,7 @@ from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 class NetworkRestorer:
     """Opens networks again for the requests of one event loop."""
 
-    def __init__(self, open_timeout_s: float) -> None:
-        """A network that takes longer than `open_timeout_s` is given up; the next request tries again."""
-        self._open_timeout_s = open_timeout_s
+    def __init__(self) -> None:
         self._calls = BlockingCalls()
         self._tasks: dict[DroppableNetwork, asyncio.Task[Any]] = {}
 
@@ -24,9 +22,8 @@ class NetworkRestorer:
         """Return when the network is in memory. Raises UnavailableError; after `patience_s` the opening goes on."""
         task = self._tasks.get(network)
         if task is None:
-            opened = self._calls.run(
-                network.restore, timeout_s=self._open_timeout_s, what=f"opening {network.what} again"
-            )
+            # Where files hang its thread does, however long anybody waits: one for a network is enough.
+            opened = self._calls.run(network.restore, timeout_s=None, what=f"opening {network.what} again")
             task = self._tasks[network] = asyncio.create_task(opened)
             task.add_done_callback(partial(self._end, network))
         done, _ = await asyncio.wait([task], timeout=patience_s)
