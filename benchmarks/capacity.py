@@ -69,7 +69,7 @@ def main() -> None:
             copies = folder / str(count)
             copy_policy(bundle, copies, count)
             alone(load, copies, count)
-        alone(load_some, copies, arguments.policies // 10)
+        alone(load_some, folder / str(arguments.policies), max(1, arguments.policies // 10))
         if arguments.recurrent is not None:
             alone(remember, newest(arguments.recurrent))
         alone(plan, str(case.name))

@@ -215,9 +215,9 @@ class Promotion:
             start["production"], bool(start["own_shadow"]), None if canary is None else (canary[0], canary[1])
         )
         started, decision = newest(entries, STARTED), newest(entries, DECISION)
-        if started is not None:
+        known = newest(entries, CHECK) or started
+        if started is not None and known is not None:
             state.shadow, state.began = started["shadow"], seconds_of(started)
-            known = newest(entries, CHECK) or started
             self._counts = Counts(known["total"], known["seen"])
             state.generation = known["generation"]
         if decision is not None:
@@ -226,7 +226,7 @@ class Promotion:
             state.decided_at = decision["generation"]
             self._say(f"goes on: it was decided ({decision['outcome']}) and not yet carried out")
             return state, Outcome(decision["outcome"], decision["why"])
-        if started is None:
+        if known is None:
             self._say("goes on: it had ended before its canary was known to run")
         else:
             # A clock that was set back adds nothing, and one that was set while the promotion ran changes nothing.

@@ -171,7 +171,7 @@ class Policy(Closeable):
         the golden vectors. `threads` is onnxruntime's intra-op thread count; one is fastest for networks of this size.
 
         `options` say how strict it is at its edges, `limits` how large the bundle's files may be. With a `memory` the
-        network is in memory only while it fits into that bound.
+        network is in memory only while it fits into that bound; who asks it then gets NetworkDroppedError.
 
         Raises BundleError, BundleTamperedError or GoldenMismatchError, and UsageError where the options do not fit.
         """

@@ -53,9 +53,11 @@ def core(folder: Path) -> Iterator[Core]:
     yield core_of(folder)
 
 
-def core_of(folder: Path, config: Any = None, **settings: Any) -> Core:
+def core_of(folder: Path, config: Any = None, *, max_queue_ms: float = 60_000) -> Core:
     size = (folder / "a" / "1" / "policy.onnx").stat().st_size
-    chosen = ServerSettings(network_bytes=int((FITTING + 0.5) * size), policy_options=OPTIONS, **settings)
+    chosen = ServerSettings(
+        network_bytes=int((FITTING + 0.5) * size), policy_options=OPTIONS, max_queue_ms=max_queue_ms
+    )
     store = load_served([folder], ServedConfig.parse(config or {}), chosen)
     return Core(lambda: store, chosen)
 
