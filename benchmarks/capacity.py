@@ -36,6 +36,7 @@ from rlservo.serve_app.episodes.request import Episode, Request
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
+from rlservo.serve_app.versions.network_restorer import NetworkRestorer
 from rlservo.serve_app.versions.plan import PRODUCTION, Plan, PolicyPlan, ServedConfig, now
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from speed.asks import askers, open_stream
@@ -68,6 +69,7 @@ def main() -> None:
             copies = folder / str(count)
             copy_policy(bundle, copies, count)
             alone(load, copies, count)
+        alone(load_some, folder / str(arguments.policies), max(1, arguments.policies // 10))
         if arguments.recurrent is not None:
             alone(remember, newest(arguments.recurrent))
         alone(plan, str(case.name))
@@ -116,6 +118,35 @@ def load(folder: Path, count: int) -> str:
     assert found == count, f"{found} of {count} policies were loaded"
     store.close()
     return f"{count} policies: {taken:.1f} s, {used:.2f} CPU s ({1e3 * used / count:.1f} ms each), {grown:.0f} MB"
+
+
+def load_some(folder: Path, fitting: int) -> str:
+    """Load all policies of a folder with a bound that so many networks fit into; open those again that were dropped."""
+    size = (newest(folder) / ONNX_FILE).stat().st_size
+    before, began, cpu = rss_mb(os.getpid()), time.perf_counter(), time.process_time()
+    patience = {"load_timeout_s": 600.0, "scan_timeout_s": 600.0}
+    store = load_served(
+        [folder], ServedConfig(), ServerSettings.from_environment({"network_bytes": size * fitting, **patience})
+    )
+    taken, used, grown = time.perf_counter() - began, time.process_time() - cpu, rss_mb(os.getpid()) - before
+    networks = [network for name in store.names if (network := store.get(name).droppable) is not None]
+    restorer, opened_ms = NetworkRestorer(), []
+
+    async def restore() -> None:
+        for index in np.random.default_rng(0).integers(0, len(networks), 600):
+            if not networks[index].is_in_memory:
+                since = time.perf_counter()
+                await restorer.restore(networks[index], 60.0)
+                opened_ms.append(1e3 * (time.perf_counter() - since))
+
+    asyncio.run(restore())
+    after = rss_mb(os.getpid()) - before
+    p50, p99 = np.percentile(opened_ms, (50, 99))
+    store.close()
+    return (
+        f"{len(networks)} policies, {fitting} in memory: {taken:.1f} s, {used:.2f} CPU s, {grown:.0f} MB, "
+        f"{after:.0f} MB after {len(opened_ms)} were opened again (p50 {p50:.1f} ms, p99 {p99:.1f} ms each)"
+    )
 
 
 def remember(bundle: Path) -> str:

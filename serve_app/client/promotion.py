@@ -94,6 +94,7 @@ class _State:
     shadow: str | None = None
     began: float = 0.0  # [s] since 1970; 0 before the canary runs
     generation: int = 0
+    decided_at: int | None = None  # the generation of a decision that an earlier run wrote down
 
 
 class Promotion:
@@ -135,14 +136,22 @@ class Promotion:
             outcome = decided or (None if state.began else self._start(state)) or self._watch(state)
         except KeyboardInterrupt:
             outcome = Outcome(INTERRUPTED, "interrupted by Ctrl-C")
+        except UsageError as error:  # of the log
+            outcome = Outcome(STOPPED, error.message)
         if decided is None:
-            self._log.write(DECISION, outcome=outcome.outcome, why=outcome.why)
+            try:
+                self._log.write(DECISION, outcome=outcome.outcome, why=outcome.why, generation=state.generation)
+            except UsageError as error:  # nothing is put into production that is not written down
+                outcome = Outcome(STOPPED, error.message)
         try:
             outcome = self._carry_out(state, outcome)
         except KeyboardInterrupt:
             outcome = self._unsure(outcome, "interrupted meanwhile")
         if outcome.is_finished:
-            self._log.write(END, outcome=outcome.outcome, why=outcome.why)
+            try:
+                self._log.write(END, outcome=outcome.outcome, why=outcome.why)
+            except UsageError as error:
+                self._tell(error.message, at_once=True)  # started again it finds nothing left to do
         return outcome
 
     def close(self) -> None:
@@ -206,20 +215,23 @@ class Promotion:
             start["production"], bool(start["own_shadow"]), None if canary is None else (canary[0], canary[1])
         )
         started, decision = newest(entries, STARTED), newest(entries, DECISION)
-        if started is not None:
+        known = newest(entries, CHECK) or started
+        if started is not None and known is not None:
             state.shadow, state.began = started["shadow"], seconds_of(started)
-            known = newest(entries, CHECK) or started
             self._counts = Counts(known["total"], known["seen"])
             state.generation = known["generation"]
         if decision is not None:
             if decision["outcome"] not in EXIT_CODES:
                 raise ValueError(f"no outcome is called {decision['outcome']!r:.40}")
+            state.decided_at = decision["generation"]
             self._say(f"goes on: it was decided ({decision['outcome']}) and not yet carried out")
             return state, Outcome(decision["outcome"], decision["why"])
-        if started is None:
+        if known is None:
             self._say("goes on: it had ended before its canary was known to run")
         else:
-            self._ends_at = self._clock() + state.began + terms.seconds - time.time()
+            # A clock that was set back adds nothing, and one that was set while the promotion ran changes nothing.
+            away_s = max(0.0, time.time() - seconds_of(known))
+            self._ends_at = self._clock() + float(known.get("remaining_s", terms.seconds)) - away_s
             self._say(f"goes on: {_duration(self._remaining)} are left")
         return state, None
 
@@ -396,6 +408,11 @@ class Promotion:
             return outcome
         if outcome.outcome == PROMOTED and served.production != terms.version:
             changed = self._changed(state, served)
+            if changed is None and state.decided_at is not None and served.generation != state.decided_at:
+                changed = (
+                    "what is served was changed after the decision, and this promotion may have been undone "
+                    f"({served.last_change}): decide anew"
+                )
             if changed is not None:
                 outcome = Outcome(STOPPED, changed)
             else:

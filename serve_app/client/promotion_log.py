@@ -52,14 +52,17 @@ class PromotionLog:
             os.close(descriptor)
 
     def write(self, event: str, **fields: Any) -> Entry:
-        """Append an entry, and have the disk keep it: what follows may not be undone."""
+        """Append an entry, and have the disk keep it: what follows may not be undone. Raises UsageError."""
         entry = {"time": datetime.now(timezone.utc).isoformat(timespec="milliseconds"), "event": event, **fields}
         line = json.dumps(entry, allow_nan=False, default=str).encode() + b"\n"
         # A process that was killed may have left half a line.
         content = b"\n" + line if self._is_torn else line
-        self._is_torn = False
-        while content:
-            content = content[os.write(self._descriptor, content) :]
+        try:
+            while content:
+                content = content[os.write(self._descriptor, content) :]
+                self._is_torn = bool(content)
+        except OSError as error:  # the disk is full, say
+            raise UsageError(f"the log {self.file} cannot be written: {error.strerror}") from None
         with contextlib.suppress(OSError):  # a pipe, say
             os.fsync(self._descriptor)
         self._entries.append(entry)
@@ -95,7 +98,7 @@ def _read(file: Path, descriptor: int) -> tuple[list[Entry], bool]:
     if size > LARGEST:
         raise UsageError(f"{file} is larger than {LARGEST >> 20} MiB: name another --log")
     content = b""
-    while part := os.pread(descriptor, 1 << 20, len(content)):
+    while len(content) < size and (part := os.pread(descriptor, 1 << 20, len(content))):  # a device has no size
         content += part
     entries = []
     *lines, rest = content.split(b"\n")

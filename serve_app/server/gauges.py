@@ -30,7 +30,7 @@ class _Families(Collector):
     def collect(self) -> Iterator[Metric]:
         core, replica = self._core, self._core.replica
         yield from core.metrics.families(replica)
-        for families in (loaded, queue, batches, drift, sessions, keys, recording):
+        for families in (loaded, networks, queue, batches, drift, sessions, keys, recording):
             yield from families(core, replica)
         yield from core.shadows.families(replica)
 
@@ -45,6 +45,24 @@ def loaded(core: Core, replica: str) -> Iterator[Metric]:
     for name, version, _ in core.policies():
         family.add_metric([replica, name, version], float(version == core.store().default(name)))
     yield family
+
+
+def networks(core: Core, replica: str) -> Iterator[Metric]:
+    """Yield how many networks are in memory, and how often one was opened again, where there is a bound."""
+    restores = CounterMetricFamily(
+        "rlservo_network_restores",
+        "Networks that had been dropped from memory and were opened again",
+        labels=["replica", "policy", "version"],
+    )
+    in_memory = 0
+    for name, version, policy in core.policies():
+        network = policy.droppable
+        if network is None:
+            return
+        in_memory += network.is_in_memory
+        restores.add_metric([replica, name, version], network.restores)
+    yield _gauge("rlservo_networks_in_memory", "Networks in memory, of all that are loaded", replica, in_memory)
+    yield restores
 
 
 def queue(core: Core, replica: str) -> Iterator[Metric]:

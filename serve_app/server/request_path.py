@@ -35,10 +35,12 @@ from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import Request, check_deadline
 from rlservo.serve_app.episodes.shared_sessions import SharedSessions, without_policy
+from rlservo.serve_app.runtime.network_memory import DroppableNetwork, NetworkDroppedError
 from rlservo.serve_app.server.loop_clock import LoopClock
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
 from rlservo.serve_app.server.request_metrics import Metrics
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.network_restorer import NetworkRestorer
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blamed_version
 from rlservo.serve_app.versions.shadow import Shadows
 from rlservo.serve_app.wire.request_stamp import clock_id
@@ -193,6 +195,7 @@ class RequestPath:
         self.metrics = Metrics()
         self.log = RequestLog(settings)
         self.shadows = Shadows()
+        self._restorer = NetworkRestorer()
         self.recorder: RequestRecorder | None = None
 
     def store(self) -> PolicyStore:
@@ -238,7 +241,7 @@ class RequestPath:
         return reply
 
     async def decide(self, request: Request) -> Decision:
-        """Decide, unless its deadline has passed.
+        """Decide, unless its deadline has passed; a network that was dropped from memory is opened again first.
 
         Raises DeadlineError, LateError, TooLargeError, UnavailableError and what `PolicyStore.act` and `Episodes.act`
         raise.
@@ -249,19 +252,24 @@ class RequestPath:
         single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
         if (len(obs) if single else most_rows(obs)) > self._max_batch:
             self._check_batch(store, request)
-        if request.episode is not None or request.stream is not None:
-            shared = self.shared_sessions
-            if shared is not None and request.episode is not None and request.episode.session_id is not None:
-                decision = await shared.act(store, request)
-            else:
-                decision = self.episodes.act(store, request)
-        elif store.batches and not request.explore:
-            check = partial(_check_again, request, time.perf_counter(), self.admission.max_wait_s)
-            decision = await store.act_together(name, request.version, obs, label=request.label, check=check)
-        else:
-            decision = store.act(
-                name, request.version, obs, explore=request.explore, seed=request.seed, label=request.label
-            )
+        while True:
+            try:
+                if request.episode is not None or request.stream is not None:
+                    shared = self.shared_sessions
+                    if shared is not None and request.episode is not None and request.episode.session_id is not None:
+                        decision = await shared.act(store, request)
+                    else:
+                        decision = self.episodes.act(store, request)
+                elif store.batches and not request.explore:
+                    check = partial(_check_again, request, time.perf_counter(), self.admission.max_wait_s)
+                    decision = await store.act_together(name, request.version, obs, label=request.label, check=check)
+                else:
+                    decision = store.act(
+                        name, request.version, obs, explore=request.explore, seed=request.seed, label=request.label
+                    )
+                break
+            except NetworkDroppedError as dropped:  # nothing was computed, and nobody's state has moved on
+                await self._restore(dropped.network, request)
         shadow = store.shadow(name)
         if shadow is not None and decision.version == shadow.of and not request.explore:
             self.shadows.offer(shadow, obs, decision)
@@ -277,7 +285,12 @@ class RequestPath:
         request.received = time.perf_counter()
         try:
             self.admission.enter()
-            decision = await shared.act_here(store, request, token)
+            while True:
+                try:
+                    decision = await shared.act_here(store, request, token)
+                    break
+                except NetworkDroppedError as dropped:
+                    await self._restore(dropped.network, request)
         except RlservoError as error:
             return error
         if decision is None:
@@ -285,6 +298,16 @@ class RequestPath:
         if self.recorder is not None:
             self.recorder.note_answer(request, decision, time.perf_counter() - request.received)
         return without_policy(decision)
+
+    async def _restore(self, network: DroppableNetwork, request: Request) -> None:
+        """Wait for a network that was dropped, for as long as a request may wait.
+
+        Raises UnavailableError and DeadlineError.
+        """
+        left_s = self.admission.max_wait_s - (time.perf_counter() - request.received)
+        await self._restorer.restore(network, max(left_s, 0.0))
+        if request.deadline_ms is not None:
+            check_deadline(request)
 
     def record_failure(
         self, request: Request, code: str, sentence: str, *, peer: str | None = None, asked: str | None = None

@@ -131,6 +131,11 @@ class ServerSettings(BaseModel):
     max_policy_bytes: int = Field(512 << 20, ge=1024)
     """A larger policy.onnx (or policy.ts) is refused before it is read. Loading takes about twice its size."""
 
+    network_bytes: int | None = Field(None, ge=1)
+    """Bytes of policy.onnx whose networks a replica keeps in memory at most, at up to twice their size. All policies
+    are loaded and proven at the start all the same; the network used longest ago is dropped for another, and opened
+    again when a request asks for it. Without it all are kept."""
+
     max_golden_bytes: int = Field(512 << 20, ge=1024)
     """A larger golden.npz, packed or unpacked, is refused before it is read."""
 

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from rlservo.export.contract.errors import BundleError, RlservoError
+from rlservo.serve_app.runtime.network_memory import NetworkMemory
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan import ServedConfig
@@ -31,7 +32,9 @@ def load_served(
 def version_loader(places: Iterable[str | Path], settings: ServerSettings) -> VersionLoader:
     """Return what loads the versions of these folders and URIs as the settings say. Raises UsageError."""
     limits = settings.bundle_limits
-    load = partial(load_policy, threads=settings.threads, options=settings.policy_options, limits=limits)
+    memory = None if settings.network_bytes is None else NetworkMemory(settings.network_bytes)
+    options = settings.policy_options
+    load = partial(load_policy, threads=settings.threads, options=options, limits=limits, memory=memory)
     repository = Repository(
         places,
         limits,

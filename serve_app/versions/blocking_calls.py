@@ -8,6 +8,7 @@ ends when the file system comes back, or with the process. There are never more 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -17,7 +18,6 @@ from typing import Any, TypeVar
 from rlservo.export.contract.errors import UnavailableError
 
 LIMIT = 4  # threads at once, those that were given up included
-POLL_S = 0.05  # [s] between looks for a thread that has become free
 
 Result = TypeVar("Result")
 
@@ -27,24 +27,25 @@ class BlockingCalls:
 
     def __init__(self, limit: int = LIMIT) -> None:
         self._limit = limit
-        self._threads: set[threading.Thread] = set()
+        self._free = asyncio.Semaphore(limit)
 
-    async def run(self, function: Callable[..., Result], *arguments: Any, timeout_s: float, what: str) -> Result:
+    async def run(self, function: Callable[..., Result], *arguments: Any, timeout_s: float | None, what: str) -> Result:
         """Return what the function returns; raise what it raises, and UnavailableError when it takes too long.
 
-        `what` says in the error what was being done.
+        `what` says in the error what was being done. None waits for as long as it takes.
         """
-        deadline = time.monotonic() + timeout_s
-        while self._running() >= self._limit:
-            if time.monotonic() > deadline:
-                raise UnavailableError(
-                    f"{what} could not begin within {timeout_s:g} s: {self._limit} earlier calls have not come back "
-                    "from the file system"
-                )
-            await asyncio.sleep(POLL_S)
+        began = time.monotonic()
+        try:
+            await asyncio.wait_for(self._free.acquire(), timeout_s)
+        except asyncio.TimeoutError:  # which is Python's own from 3.11 on
+            raise UnavailableError(
+                f"{what} could not begin within {timeout_s:g} s: {self._limit} earlier calls have not come back "
+                "from the file system"
+            ) from None
         returned = asyncio.wrap_future(self._start(function, arguments))
         try:
-            done, _ = await asyncio.wait([returned], timeout=deadline - time.monotonic())
+            left_s = None if timeout_s is None else timeout_s - (time.monotonic() - began)
+            done, _ = await asyncio.wait([returned], timeout=left_s)
         finally:
             returned.cancel()  # if it has not returned: nobody waits for it any more
         if not done:
@@ -53,13 +54,10 @@ class BlockingCalls:
             )
         return returned.result()
 
-    def _running(self) -> int:
-        self._threads = {thread for thread in self._threads if thread.is_alive()}
-        return len(self._threads)
-
     def _start(self, function: Callable[..., Result], arguments: tuple[Any, ...]) -> Future[Result]:
         future: Future[Result] = Future()
         future.set_running_or_notify_cancel()  # from now on it cannot be cancelled, only left alone
+        loop = asyncio.get_running_loop()
 
         def call() -> None:
             try:
@@ -68,9 +66,14 @@ class BlockingCalls:
                 future.set_exception(error)
             else:
                 future.set_result(result)
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(self._free.release)
 
         # A daemon: the process can end while the thread is stuck.
         thread = threading.Thread(target=call, name="policies", daemon=True)
-        thread.start()
-        self._threads.add(thread)
+        try:
+            thread.start()
+        except RuntimeError:  # there are too many in this process
+            self._free.release()
+            raise
         return future

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import itertools
 import json
+import os
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -36,7 +39,7 @@ from rlservo.serve_app.client.promotion_log import PromotionLog
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.api_keys import new_key
+from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
@@ -579,3 +582,133 @@ def test_a_file_that_is_no_log_is_not_written_to(tmp_path: Path, content: str) -
     with pytest.raises(UsageError, match="is none of a promotion's log"), PromotionLog.open(file):
         pass
     assert file.read_text() == content
+
+
+class Killed(BaseException):
+    """What no handler sees, as SIGKILL."""
+
+
+@contextmanager
+def killed_at(is_over: Callable[[list[str]], bool]) -> Iterator[list[str]]:
+    """Die at one of the moments before and after each entry of the log and each command, by those that were."""
+    moments: list[str] = []
+
+    def dying(function: Callable[..., Any], what: Callable[..., str]) -> Callable[..., Any]:
+        def call(*given: Any, **named: Any) -> Any:
+            def pass_by(when: str) -> None:
+                moments.append(f"{when} {what(*given)}")
+                if is_over(moments):
+                    raise Killed
+
+            pass_by("before")
+            result = function(*given, **named)
+            pass_by("after")
+            return result
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PromotionLog, "write", dying(PromotionLog.write, lambda _, event: f"'{event}' is written"))
+        patch.setattr(AdminClient, "_command", dying(AdminClient._command, lambda _, n, command, d: f"{command} {d}"))
+        yield moments
+
+
+def test_killed_at_any_moment_and_started_again_it_is_carried_out_once(run: Any, server: Server) -> None:
+    unless = "error_rate>20% or action_difference>1"
+    for number in itertools.count():
+        promotion = run(unless=unless, seconds=2 * EVERY_S, min_requests=5)
+        try:
+            with killed_at(lambda moments, most=number: len(moments) > most) as moments:  # type: ignore[misc]
+                promotion(*[lambda: server.ask(20)] * 3)
+        except Killed:
+            moment = moments[-1]
+        else:
+            break
+        try:
+            outcome = promotion(*[lambda: server.ask(20)] * 3)
+        except UsageError as error:
+            assert moment == "after 'end' is written" and "in production already" in error.message
+        else:
+            assert outcome.outcome == PROMOTED and outcome.is_finished, (moment, outcome)
+        plan = server.plan
+        assert (plan.default, plan.canary, plan.shadow) == ("2", None, None), moment
+        assert promotion.events().count("end") == 1
+        promotion.log.unlink()
+        with server.admin() as admin:
+            admin.alias("ur5", "production", "1")
+    assert number >= 24 and promotion.events()[-1] == "end"
+
+
+def test_a_promotion_that_was_undone_is_not_done_again(run: Any, server: Server) -> None:
+    promotion = run()
+    with pytest.raises(Killed), killed_at(lambda moments: moments[-1].startswith("after alias")):
+        promotion(lambda: server.ask(200))
+    assert server.plan.default == "2"
+    with server.admin() as admin:
+        admin.rollback("ur5", "production")
+    outcome = promotion()
+    assert outcome.outcome == STOPPED and outcome.is_finished and "may have been undone (the last change" in outcome.why
+    assert (server.plan.default, server.plan.canary) == ("1", None)
+
+
+@pytest.mark.parametrize("entry", ["start", "started", "check", "decision", "end"])
+def test_a_log_that_cannot_be_written_is_a_sentence_and_promotes_nothing(
+    run: Any, server: Server, entry: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_full, written = [False], os.write
+
+    def write(descriptor: int, content: bytes) -> int:
+        is_full[0] |= f'"event": "{entry}"'.encode() in content
+        if is_full[0] and b'"event": ' in content:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return written(descriptor, content)
+
+    promotion = run()
+    monkeypatch.setattr("rlservo.serve_app.client.promotion_log.os.write", write)
+    says = r"the log .*log\.jsonl cannot be written: No space left on device"
+    if entry == "start":
+        with pytest.raises(UsageError, match=says):
+            promotion(lambda: server.ask(200))
+    else:
+        outcome = promotion(lambda: server.ask(200))
+        assert outcome.outcome == (PROMOTED if entry == "end" else STOPPED), outcome
+        assert re.search(says, " ".join([outcome.why, *promotion.said]))
+    assert (server.plan.default, server.plan.canary) == ("2" if entry == "end" else "1", None)
+
+
+@pytest.mark.parametrize(("jump_s", "left"), [(-1e9, "10 s are left"), (1e9, "0 s are left")])
+def test_a_clock_that_was_set_while_nobody_watched_adds_no_time(
+    run: Any, server: Server, jump_s: float, left: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def kill() -> None:
+        raise Killed
+
+    promotion = run(seconds=2 * EVERY_S)
+    with pytest.raises(Killed):
+        promotion(lambda: server.ask(20), kill)
+    promotion.now = 0.0
+    now = time.time
+    monkeypatch.setattr("rlservo.serve_app.client.promotion.time.time", lambda: now() + jump_s)
+    idle = [lambda: None] * 9
+    outcome = promotion(lambda: server.ask(60), *idle, lambda: pytest.fail("it goes on for ever"))
+    assert any(f"goes on: {left}" in line for line in promotion.said), promotion.said
+    assert outcome.outcome == (PROMOTED if jump_s < 0 else UNDECIDED) and server.plan.canary is None
+
+
+def test_a_key_that_is_revoked_stops_it_and_the_way_on_is_said(
+    run: Any, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others = ServerSettings(operator_key=new_key("another", admin=True)[1].split()[-1])
+
+    def revoke() -> None:
+        server.ask(200)
+        monkeypatch.setattr(server.core.keys, "accepted", Keys.from_settings(others))
+
+    promotion = run()
+    outcome = promotion(revoke)
+    assert outcome.outcome == STOPPED and not outcome.is_finished
+    assert "takes the admin key no longer" in outcome.why and "'rlservo policy canary ur5 off' ends" in outcome.why
+    assert server.plan.canary is not None
+    monkeypatch.undo()
+    outcome = promotion()
+    assert outcome.outcome == STOPPED and outcome.is_finished and server.plan.canary is None

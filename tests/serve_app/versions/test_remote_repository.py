@@ -212,6 +212,65 @@ def test_a_storage_that_lies_is_told_in_a_sentence_and_what_runs_goes_on(
     assert not list(cache.glob(".fetching-*"))
 
 
+UNFINISHED: dict[str, tuple[str, bytes | None, type[RlservoError], str]] = {
+    "swallowed": ("/1/SHA256SUMS", None, UnavailableError, r"/ur5/1/SHA256SUMS is not there after it was written$"),
+    "changed": (
+        "/1/policy.onnx",
+        b"another",
+        ConflictError,
+        r"/ur5/1/policy\.onnx holds another file than .*manifest:",
+    ),
+    "manifest swallowed": ("/1.json", None, UnavailableError, r"/ur5/1\.json is not there after it was written$"),
+    "manifest changed": ("/1.json", b"{}", BundleError, r"/ur5/1\.json is of format None"),
+}
+
+
+@pytest.mark.parametrize("kind", list(UNFINISHED))
+def test_a_storage_that_keeps_something_else_than_it_was_given_publishes_nothing(
+    kind: str, made: Path, storage: Storage, cache: Path
+) -> None:
+    put(made, storage.uri, "2")
+    end, kept, error, sentence = UNFINISHED[kind]
+
+    def lie(path: str, *reply: Any) -> Any:
+        if path.partition("?")[0].endswith(end) and storage.proxy.requests[-1].startswith("PUT "):
+            storage.change("DELETE" if kept is None else "PUT", f"ur5{end}", kept or b"")
+        return reply
+
+    storage.tell(lie)
+    with pytest.raises(error, match=sentence):
+        put(made, storage.uri, "1")
+    digests, wrong = repository(storage, cache).look()
+    assert list(digests) == [("ur5", "2")] and len(wrong) == (kind == "manifest changed")
+    storage.tell(None)
+    if kept is None:
+        put(made, storage.uri, "1")  # what was kept is the same bundle's: it goes on from there
+
+
+@pytest.mark.parametrize(
+    "page", [b"", b"<html><body>log in, please</body></html>"], ids=["nothing", "a page to log in"]
+)
+def test_a_list_that_is_none_withdraws_nothing(page: bytes, made: Path, storage: Storage, cache: Path) -> None:
+    put(made, storage.uri, "1")
+    held = repository(storage, cache)
+    fetch(held)
+    storage.tell(lambda path, *reply: (200, {}, page) if "list-type" in path else reply)
+    assert held.look()[0] == {} and "holds no published version" in str(held.look()[1][0])
+    storage.tell(echo)  # and what the cache knew before is still known
+    assert list(repository(storage, cache).available(ALL)["ur5"]) == ["1"]
+
+
+def test_any_uri_that_fsspec_reads_is_a_repository(made: Path, cache: Path) -> None:
+    uri = "memory://bucket/policies"
+    put(made, uri, "1", "2")
+    with pytest.raises(
+        ConflictError, match=r"memory://bucket/policies/ur5/1\.json is there already \(another bundle\)"
+    ):
+        publish(load_bundle(made / "other" / "ur5" / "1"), uri)
+    with contextlib.closing(load_served([uri], ALL, ServerSettings(cache=str(cache)))) as store:
+        assert store.default("ur5") == "2" and store.get("ur5", "2").digest == load_bundle(made / "ur5" / "2").digest
+
+
 def test_wrong_etags_and_wrong_sizes_in_the_list_change_nothing(made: Path, storage: Storage, cache: Path) -> None:
     put(made, storage.uri, "1")
 
@@ -309,7 +368,7 @@ def test_uris_with_secrets_or_tricks_are_refused_without_showing_them(uri: str, 
         place_of(uri)
 
 
-@pytest.mark.parametrize("uri", ["s3://b/p", "gs://b/p", "nowhere://b"])
+@pytest.mark.parametrize("uri", ["s3://b/p", "gs://b/p", "az://b/p", "abfs://b/p", "nowhere://b"])
 def test_a_missing_extra_is_named(uri: str, monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
     if uri.startswith("s3"):
         monkeypatch.setitem(sys.modules, "fsspec", None)
