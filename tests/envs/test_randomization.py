@@ -359,7 +359,7 @@ def test_what_an_environment_cannot_do_is_named(arguments: dict[str, Any], lack:
 
 def test_by_id_it_names_the_elements_of_the_environment_that_it_wraps() -> None:
     inner = {"ur_model": "ur10e", "fix_wrist_2": True}
-    config = {"env_id": "rlservo/EndEffectorPositioningURSim-v0", "payload": [0, 3], **inner}
+    config = {"env_id": "rlservo/EndEffectorPositioningURSim-v0", "payload": [0, 3], "robot_models": ["ur3"], **inner}
     assert wrapped_env("rlservo/Randomized-v0", config) == (config["env_id"], inner)
     assert wrapped_env("other/Env-v0", config) == ("other/Env-v0", config)
     describe = make_randomized.describe  # type: ignore[attr-defined]
