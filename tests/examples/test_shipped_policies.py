@@ -86,7 +86,7 @@ def test_threshold_is_the_binomial_quantile(rate: float, episodes: int, expected
 @pytest.mark.parametrize("name", NAMES)
 def test_each_acts_as_well_as_its_card_says(name: str, bundles: dict[str, Path]) -> None:
     settings = evaluate_shipped.load_settings(name)
-    # An episode of CartPole is 500 steps; a card of many rows gets few episodes in each, and is judged by their sum too.
+    # An episode of CartPole is 500 steps; a card of many rows gets few episodes in each, which are judged together too.
     episodes = 20 if name == "cartpole_dqn" else min(40, 120 // len(settings["evaluation"]))
     with Policy.load(bundles[name]) as policy:
         measured = evaluate_shipped.evaluate(policy, settings, episodes, SEED)
