@@ -27,6 +27,15 @@ class CarriesPayload(Protocol):
 
 
 @runtime_checkable
+class HasRobotModels(Protocol):
+    """An environment in which another robot of the same kind may stand."""
+
+    def set_robot_model(self, name: str) -> None:
+        """Exchange the robot, from the next reset on. Raises ValueError for a model that does not exist."""
+        ...
+
+
+@runtime_checkable
 class HasModelError(Protocol):
     """A simulation whose robot may differ from its data sheet."""
 

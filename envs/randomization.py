@@ -25,6 +25,7 @@ from rlservo.envs.disturbances import (
     HasBaseOffset,
     HasExtremes,
     HasModelError,
+    HasRobotModels,
     HasSensorErrors,
 )
 
@@ -36,7 +37,7 @@ ByElement = float | Sequence[float] | Mapping[str, float] | str
 RANDOMIZED = "rlservo/Randomized-v0"
 REAL = "real"
 # Random streams of their own, so that asking for one disturbance changes no other's draws; only append.
-STREAMS = ("model", "base", "extreme", "bias", "stuck", "drop", "late")
+STREAMS = ("model", "base", "extreme", "bias", "stuck", "drop", "late", "robot")
 EXTREMES: tuple[Extreme, ...] = ("target", "start")
 
 
@@ -55,6 +56,7 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
     | `payload` | a point mass at the tool that the arm does not know of, uniformly in a range | reset | kg |
     | `model_error` | by how much masses, inertias, gains, friction and velocities may differ: 0.05 is 5% | reset | 1 |
     | `base_offset` | how far from its believed place the robot stands, in any direction, in a range | reset | m |
+    | `robot_models` | which robot it is, of these models (named twice: twice as often) | reset | |
     | `extreme` | "target": a target out of reach; "start": the robot in a corner | reset | |
 
     `observation_noise` and `observation_bias` are one number for all elements, one each, a mapping by element name, or
@@ -90,6 +92,7 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         payload: Range = (0.0, 0.0),
         model_error: float = 0.0,
         base_offset: Range = (0.0, 0.0),
+        robot_models: Sequence[str] = (),
         extreme: Extreme | None = None,
     ) -> None:
         super().__init__(env)
@@ -111,10 +114,15 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         if extreme is not None and extreme not in EXTREMES:
             raise ValueError(f"extreme is {extreme!r}: expected {' or '.join(EXTREMES)}")
         self._extreme: Extreme | None = extreme
-        self._simulation = getattr(env.unwrapped, "simulation", None)
+        if isinstance(robot_models, str):
+            raise ValueError(f"robot_models is {robot_models!r}: expected a list of names")
+        self._robot_models = tuple(robot_models)
         self._check_environment()
-        if isinstance(self._simulation, HasModelError):  # another wrapper may have changed it
-            self._simulation.draw_model_error(0.0, np.random.default_rng())
+        for model in self._robot_models or (None,):
+            if model is not None:
+                self._set_robot_model(model)
+            if isinstance(self._simulation, HasModelError):  # another wrapper may have changed it
+                self._simulation.draw_model_error(0.0, np.random.default_rng())
         if isinstance(env.unwrapped, HasBaseOffset):
             env.unwrapped.set_base_offset((0.0, 0.0))
 
@@ -136,12 +144,16 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
             # Not the environment's own stream: its episodes stay what they are without this wrapper.
             self._rng = np.random.default_rng([seed, 1])
             self._streams = {kind: np.random.default_rng([seed, 2 + i]) for i, kind in enumerate(STREAMS)}
+        draws: dict[str, Any] = {}
+        if self._robot_models:
+            draws["robot_model"] = str(self._streams["robot"].choice(self._robot_models))
+            self._set_robot_model(draws["robot_model"])
         self._delay = int(self._rng.integers(*self._action_latency, endpoint=True))
         age = int(self._rng.integers(*self._observation_latency, endpoint=True))
         mass = float(self._rng.uniform(*self._payload))
         if isinstance(self._simulation, CarriesPayload):
             self._simulation.set_payload(mass)
-        draws: dict[str, Any] = {"action_latency": self._delay, "observation_latency": age, "payload": mass}
+        draws |= {"action_latency": self._delay, "observation_latency": age, "payload": mass}
         draws |= self._draw_model()
         if self._extreme is not None:
             assert isinstance(self.env.unwrapped, HasExtremes)
@@ -175,6 +187,10 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         return self._arrived(self._sensed(self._observations[0])), reward, terminated, truncated, info
 
     # -- once an episode
+
+    def _set_robot_model(self, model: str) -> None:
+        assert isinstance(self.env.unwrapped, HasRobotModels)
+        self.env.unwrapped.set_robot_model(model)
 
     def _draw_model(self) -> dict[str, Any]:
         draws: dict[str, Any] = {}
@@ -242,6 +258,10 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
 
     # -- what the environment offers
 
+    @property
+    def _simulation(self) -> Any:
+        return getattr(self.env.unwrapped, "simulation", None)
+
     def _check_environment(self) -> None:
         env = self.env.unwrapped
         name = type(env).__name__
@@ -251,6 +271,8 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
             raise ValueError(f"model_error is {self._model_error:g}: {name} has no simulation with draw_model_error")
         if self._base_offset[1] > 0.0 and not isinstance(env, HasBaseOffset):
             raise ValueError(f"base_offset is {self._base_offset}: {name} has no set_base_offset")
+        if self._robot_models and not isinstance(env, HasRobotModels):
+            raise ValueError(f"robot_models is {self._robot_models}: {name} has no set_robot_model")
         if self._extreme is not None and not isinstance(env, HasExtremes):
             raise ValueError(f"extreme is {self._extreme!r}: {name} has no extreme_options")
 
@@ -327,6 +349,7 @@ def make_randomized(
     payload: Range = (0.0, 0.0),
     model_error: float = 0.0,
     base_offset: Range = (0.0, 0.0),
+    robot_models: Sequence[str] = (),
     extreme: Extreme | None = None,
     **arguments: Any,
 ) -> DomainRandomization:
@@ -347,6 +370,7 @@ def make_randomized(
         payload=payload,
         model_error=model_error,
         base_offset=base_offset,
+        robot_models=robot_models,
         extreme=extreme,
     )
 

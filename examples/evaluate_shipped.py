@@ -15,7 +15,7 @@ import json
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -60,10 +60,17 @@ def load_settings(name: str) -> dict[str, Any]:
     return settings
 
 
-def evaluate(policy: rlservo.Policy, settings: Mapping[str, Any], episodes: int, seed: int) -> list[Evaluation]:
+def evaluate(
+    policy: rlservo.Policy,
+    settings: Mapping[str, Any],
+    episodes: int,
+    seed: int,
+    notify: Callable[[str], None] = lambda line: None,
+) -> list[Evaluation]:
     """Run every evaluation of the settings with a loaded policy."""
     evaluations = []
     for setting in settings["evaluation"]:
+        notify(f"{episodes} episodes: {setting['start']}")
         env_config = setting.get("env_config", {})
         report = rlservo.rollout(policy, settings["env"], episodes=episodes, seed=seed, env_kwargs=env_config)
         if report.interrupted:
@@ -129,6 +136,10 @@ def write_card(name: str, evaluations: list[Evaluation]) -> None:
     card.write_text(f"{before}{BEGIN}\n{render(evaluations)}\n{END}{after}", encoding="utf-8")
 
 
+def note(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Evaluate the policies that ship, from bundles exported now.",
@@ -155,7 +166,7 @@ def main() -> None:
                     args.checkpoint or SHIPPED / name, bundles, name=name, notify=lambda line: None
                 )
                 with rlservo.Policy.load(bundle.path) as policy:
-                    evaluations = evaluate(policy, load_settings(name), args.episodes, args.seed)
+                    evaluations = evaluate(policy, load_settings(name), args.episodes, args.seed, note)
             except rlservo.errors.RlservoError as error:
                 sys.exit(f"error: {name}: {error.message}")
             print(f"{name}\n{render(evaluations)}\n", flush=True)

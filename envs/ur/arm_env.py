@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -83,13 +84,11 @@ class URArmEnv(RenderedEnv):
             raise ValueError("all six joints are fixed: there is nothing left to act on")
         super().__init__(render_mode, gui=gui)
         self.metadata = {**self.metadata, "render_fps": rate_hz}
-        self.simulation = URSimulation(
-            ur_model,
-            max_velocity_scale=scale,
-            cycle_s=1.0 / rate_hz,
-            objects=self.OBJECTS,
-            table=self.TABLE,
+        build = partial(
+            URSimulation, max_velocity_scale=scale, cycle_s=1.0 / rate_hz, objects=self.OBJECTS, table=self.TABLE
         )
+        self._simulation_of = cache(build)  # by model: an arm that comes again is not built again
+        self.simulation = self._simulation_of(ur_model)
         self._free = np.flatnonzero(~fixed)
         self._fixed = np.flatnonzero(fixed)
         self._rs_state_to_info = rs_state_to_info
@@ -153,6 +152,14 @@ class URArmEnv(RenderedEnv):
         return observation, reward, terminated, truncated, info
 
     # -- for disturbances
+
+    def set_robot_model(self, name: str) -> None:
+        """Put another arm on the table, from the next reset on. Raises ValueError naming the seven."""
+        simulation = self._simulation_of(name)
+        if simulation is not self.simulation:
+            self.simulation = simulation
+            self._camera.close()
+            self._camera = Camera(simulation.model, simulation.data, **VIEW)
 
     def set_base_offset(self, offset: tuple[float, float]) -> None:
         """Tell positions of objects wrong by `offset` (x, y) [m]: the base stands elsewhere than it was measured."""

@@ -266,6 +266,25 @@ def test_a_misplaced_base_is_told_the_target_wrong_and_judged_by_where_it_is(env
         assert env.step(action)[1] == pytest.approx(plain.step(action)[1], abs=1e-6)
 
 
+def test_each_episode_is_of_a_drawn_robot_that_is_disturbed_as_when_it_is_alone() -> None:
+    disturbances: dict[str, Any] = {"payload": (1.0, 2.0), "model_error": 0.1, "observation_noise": "real"}
+    models = ("ur3", "ur10e")
+    drawn = arm(robot_models=models, **disturbances)
+    alone = {model: DomainRandomization(gym.make(ARM, ur_model=model), **disturbances) for model in models}
+    seen = []
+    for seed in range(4):
+        model = drawn.reset(seed=seed)[1]["randomization"]["robot_model"]
+        assert (episode(drawn, seed, steps=5) == episode(alone[model], seed, steps=5)).all()
+        seen.append(model)
+    assert set(seen) == set(models)
+    drawn.reset(seed=0)
+    assert {drawn.reset()[1]["randomization"]["robot_model"] for _ in range(10)} == set(models)
+    # What one wrapper did to any of the robots is undone by the next.
+    plain = gym.make(ARM, ur_model=seen[0])
+    undisturbed = DomainRandomization(drawn.env, robot_models=models)
+    assert (episode(undisturbed, 0, steps=5) == episode(plain, 0, steps=5)).all()
+
+
 def test_extreme_targets_are_out_of_reach_and_extreme_starts_are_clear_of_collisions() -> None:
     far = arm(extreme="target")
     for seed in range(3):
@@ -310,6 +329,8 @@ def test_everything_at_once_repeats_by_seed_and_leaves_the_older_draws_alone() -
         ({"observation_noise": "reel"}, "observation_noise is 'reel': expected numbers, 'real' or a multiple"),
         ({"observation_bias": "-1*real"}, "observation_bias is '-1\\*real'"),
         ({"extreme": "sideways"}, "extreme is 'sideways': expected target or start"),
+        ({"robot_models": ["ur3", "ur7"]}, "'ur7' does not exist: expected one of ur3, ur3e"),
+        ({"robot_models": "ur3"}, "robot_models is 'ur3': expected a list of names"),
     ],
 )
 def test_impossible_disturbances_are_refused(arguments: dict[str, Any], message: str) -> None:
@@ -324,6 +345,7 @@ def test_impossible_disturbances_are_refused(arguments: dict[str, Any], message:
         ({"model_error": 0.05}, "no simulation with draw_model_error"),
         ({"base_offset": (0.0, 0.02)}, "no set_base_offset"),
         ({"extreme": "start"}, "no extreme_options"),
+        ({"robot_models": ["ur3"]}, "no set_robot_model"),
         ({"observation_noise": 0.1}, "expected a Box of one dimension"),
         ({"stuck_sensor": "any"}, "expected a Box of one dimension"),
     ],
@@ -337,7 +359,7 @@ def test_what_an_environment_cannot_do_is_named(arguments: dict[str, Any], lack:
 
 def test_by_id_it_names_the_elements_of_the_environment_that_it_wraps() -> None:
     inner = {"ur_model": "ur10e", "fix_wrist_2": True}
-    config = {"env_id": "rlservo/EndEffectorPositioningURSim-v0", "payload": [0, 3], **inner}
+    config = {"env_id": "rlservo/EndEffectorPositioningURSim-v0", "payload": [0, 3], "robot_models": ["ur3"], **inner}
     assert wrapped_env("rlservo/Randomized-v0", config) == (config["env_id"], inner)
     assert wrapped_env("other/Env-v0", config) == ("other/Env-v0", config)
     describe = make_randomized.describe  # type: ignore[attr-defined]
