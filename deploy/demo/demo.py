@@ -38,7 +38,7 @@ STOP_TIMEOUT_S = 30.0
 ROBOTS = (
     Robot(
         policy="ur5",
-        checkpoint="ur5_positioning",
+        checkpoint="ur_positioning",
         env_id="rlservo/EndEffectorPositioningURSim-v0",
         title="UR5",
         success_distance_m=0.1,

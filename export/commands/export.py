@@ -149,7 +149,7 @@ def _export(
     with user_code(app_dir) as folder, contextlib.ExitStack() as folders:
         options.progress("reading the checkpoint")
         facts = read_facts(root, options.notify)
-        base = options.name or default_name(facts.env_id, root)
+        base = options.name or default_name(facts.env_id, facts.env_config, root)
         written: list[tuple[Path, ExportResult]] = []
         queue = list(policies)
         while queue:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, version_key
 from rlservo.export.contract.errors import UsageError
 
 
-def default_name(env_id: str | None, root: Path) -> str:
+def default_name(env_id: str | None, env_config: Mapping[str, Any], root: Path) -> str:
     """Return a policy name: 'rlservo/EndEffectorPositioningURSim-v0' gives 'end-effector-positioning-ur'.
 
-    Without an environment it is the checkpoint folder's name.
+    Without an environment it is the checkpoint folder's name. One that wraps another (`rlservo/Randomized-v0`) has the
+    other's id among its arguments.
     """
+    wrapped = env_config.get("env_id")
+    env_id = wrapped if isinstance(wrapped, str) and wrapped else env_id
     stem = re.split(r"[/:.]", env_id)[-1] if env_id else root.name
     stem = re.sub(r"-v\d+$", "", stem)
     stem = re.sub(r"(Sim|Rob|Env)$", "", stem) or stem

@@ -291,11 +291,12 @@ def test_an_export_of_either_stack_starts_no_ray_no_environment_and_no_process(a
     ],
 )
 def test_a_policy_is_named_after_its_environment(env_id: str, name: str) -> None:
-    assert default_name(env_id, Path("anything")) == name
+    assert default_name(env_id, {}, Path("anything")) == name
+    assert default_name("rlservo/Randomized-v0", {"env_id": env_id}, Path("anything")) == name
 
 
 def test_without_an_environment_a_policy_is_named_after_its_folder() -> None:
-    assert default_name(None, Path("/runs/checkpoint_000003")) == "checkpoint-000003"
+    assert default_name(None, {}, Path("/runs/checkpoint_000003")) == "checkpoint-000003"
 
 
 def test_names_and_versions_that_cannot_be_used_are_refused_before_anything_is_loaded(
