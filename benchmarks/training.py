@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 import shared.training_run as training_run
 
 from rlservo.export.contract.errors import RlservoError
-from rlservo.export.rllib.batched_connectors import batched_connectors
+from rlservo.export.rllib.batched_connectors import use_batched_connectors
 
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
 
@@ -110,8 +110,8 @@ def main() -> None:
         configurations = list(itertools.product(args.runners, args.envs))
         for done, (runners, envs) in enumerate(configurations):
             limit = max(1.0, (until - time.monotonic()) / (len(configurations) - done))
-            own = {"rllib_connectors": args.rllib_connectors}
-            rows.append(measure(args.env, runners, envs, args.iterations, args.batch, limit, **own))
+            rllibs = args.rllib_connectors
+            rows.append(measure(args.env, runners, envs, args.iterations, args.batch, limit, rllib_connectors=rllibs))
             print(line(rows[-1]), flush=True)
             write(rows, args.env, args.batch, args.out)
     print(f"written: {args.out / 'training.json'}, {args.out / 'training.png'}")
@@ -193,7 +193,7 @@ def configuration(env: str, runners: int, envs: int, batch: int, *, rllib_connec
     config.environment(env, env_config={"rs_state_to_info": False} if env.startswith("rlservo/") else {})
     config.env_runners(num_env_runners=runners, num_envs_per_env_runner=envs)
     if not rllib_connectors:
-        config.env_runners(**batched_connectors(observation_filter=False))
+        use_batched_connectors(config, observation_filter=False)
     config.training(train_batch_size_per_learner=batch, minibatch_size=MINIBATCH, num_epochs=4)
     config.rl_module(model_config={"fcnet_hiddens": [256, 256], "fcnet_activation": "tanh", "vf_share_layers": False})
     config.fault_tolerance(restart_failed_env_runners=False)

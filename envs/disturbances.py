@@ -31,7 +31,7 @@ class HasRobotModels(Protocol):
     """An environment in which another robot of the same kind may stand."""
 
     def set_robot_model(self, name: str) -> None:
-        """Exchange the robot, from the next reset on. Raises ValueError for a model that does not exist."""
+        """Exchange the robot; `reset` is next. Raises ValueError for a model that does not exist."""
         ...
 
 

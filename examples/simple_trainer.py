@@ -37,7 +37,7 @@ from shared.resources import Room
 from shared.training_run import RETURN, STEPS, Run
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.export.rllib.batched_connectors import batched_connectors, fit
+from rlservo.export.rllib.batched_connectors import supports, use_batched_connectors
 from rlservo.serve_app.rollout.environment import make_env
 
 ONLINE = ("PPO", "APPO", "IMPALA", "DQN", "SAC")
@@ -251,8 +251,8 @@ def algorithm_config(
         # RLlib's annotation here is narrower than what it takes: the connector's three-argument form.
         env_to_module_connector=cast(Any, observation_steps(spaces[0], args.observation_filter)),
     )
-    if fit(*spaces) and not (is_flattened(spaces[0]) or args.use_lstm):  # the same numbers, sooner
-        config.env_runners(**batched_connectors(observation_filter=args.observation_filter == "MeanStdFilter"))
+    if supports(*spaces) and not (is_flattened(spaces[0]) or args.use_lstm):  # the same numbers, sooner
+        use_batched_connectors(config, observation_filter=args.observation_filter == "MeanStdFilter")
     config.learners(num_learners=args.num_learners, num_gpus_per_learner=gpus_per_learner(args))
     config.rl_module(
         model_config=DefaultModelConfig(

@@ -40,7 +40,7 @@ from ray.tune.registry import get_trainable_cls
 from shared.training_run import main_with_sentences, ray_session
 
 from rlservo import Policy, export_checkpoint
-from rlservo.export.rllib.batched_connectors import batched_connectors
+from rlservo.export.rllib.batched_connectors import use_batched_connectors
 
 assert ray_settings
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
@@ -71,8 +71,11 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
         num_env_runners=0,
         num_envs_per_env_runner=settings["envs"],
         rollout_fragment_length=settings.get("rollout_fragment_length", "auto"),
-        **batched_connectors(observation_filter=settings["filter"]),
     )
+    if not settings.get("model", {}).get("use_lstm"):  # the same numbers, sooner
+        use_batched_connectors(config, observation_filter=settings["filter"])
+    elif settings["filter"]:
+        config.env_runners(env_to_module_connector=cast(Any, _mean_std_filter))
     config.learners(num_learners=0, num_gpus_per_learner=0)
     config.rl_module(model_config=settings.get("model", {}))
     config.training(**settings.get("training", {}))
@@ -84,6 +87,10 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     config.callbacks(on_episode_end=_log_episode)
     config.debugging(seed=seed, log_level="ERROR")
     return config
+
+
+def _mean_std_filter(*_: Any) -> MeanStdFilter:
+    return MeanStdFilter()
 
 
 def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any = None, **_: Any) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -84,11 +84,11 @@ class URArmEnv(RenderedEnv):
             raise ValueError("all six joints are fixed: there is nothing left to act on")
         super().__init__(render_mode, gui=gui)
         self.metadata = {**self.metadata, "render_fps": rate_hz}
-        build = partial(
+        self._build = partial(
             URSimulation, max_velocity_scale=scale, cycle_s=1.0 / rate_hz, objects=self.OBJECTS, table=self.TABLE
         )
-        self._simulation_of = cache(build)  # by model: an arm that comes again is not built again
-        self.simulation = self._simulation_of(ur_model)
+        self._simulations = {ur_model: self._build(ur_model)}  # an arm that comes again is not built again
+        self.simulation = self._simulations[ur_model]
         self._free = np.flatnonzero(~fixed)
         self._fixed = np.flatnonzero(fixed)
         self._rs_state_to_info = rs_state_to_info
@@ -154,8 +154,8 @@ class URArmEnv(RenderedEnv):
     # -- for disturbances
 
     def set_robot_model(self, name: str) -> None:
-        """Put another arm on the table, from the next reset on. Raises ValueError naming the seven."""
-        simulation = self._simulation_of(name)
+        """Put another arm on the table; `reset` is next. Raises ValueError naming the seven."""
+        simulation = self._simulations.get(name) or self._simulations.setdefault(name, self._build(name))
         if simulation is not self.simulation:
             self.simulation = simulation
             self._camera.close()

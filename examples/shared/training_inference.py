@@ -19,7 +19,7 @@ from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
 import shared.resources as resources
-from rlservo.export.rllib.batched_connectors import batched_connectors
+from rlservo.export.rllib.batched_connectors import use_batched_connectors
 from shared.help_text import DefaultsFormatter
 from shared.resources import Room
 from shared.training_run import RETURN, STEPS, Run
@@ -134,8 +134,8 @@ def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: floa
         # RLlib's annotation here is narrower than what it takes: a fraction of a core.
         num_cpus_per_env_runner=cast(Any, 0.5 if cpus == 2 else 0.25 if cpus < 2 else 1),
         num_envs_per_env_runner=args.num_envs_per_env_runner,
-        **batched_connectors(observation_filter=True),
     )
+    use_batched_connectors(config, observation_filter=True)
     config.resources(num_cpus_for_main_process=cast(Any, 1 if cpus >= 2 else 0.5))
     # RLlib takes the larger of this and the main process's; left alone it is a whole core.
     config.learners(num_learners=0, num_gpus_per_learner=gpus, num_cpus_per_learner=cast(Any, 1 if cpus >= 2 else 0.5))

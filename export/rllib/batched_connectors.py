@@ -4,10 +4,11 @@ RLlib (2.60) passes each environment's observation and action through ten pieces
 as long as the simulator or longer. These give the same numbers, bit by bit. They do where an observation is a Box, an
 action a Box, Discrete or MultiDiscrete, and the network has no memory:
 
-    config.env_runners(**batched_connectors(observation_filter=True))
+    use_batched_connectors(config, observation_filter=True)
 
 Two are called as RLlib's own, whose work they do: a checkpoint keeps a piece's state under its class's name, so that
-what was trained with either goes on with the other, and `new_connectors.py` exports both alike.
+what was trained with either goes on with the other, and `new_connectors.py` exports both alike. Checkpoints name this
+module and its classes: under other names they could not be read.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from ray.rllib.connectors import env_to_module, module_to_env
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.core.columns import Columns
+from ray.rllib.utils.filter import MeanStdFilter as RunningFilter
 from ray.rllib.utils.filter import RunningStat
 from ray.rllib.utils.numpy import SMALL_NUMBER, convert_to_numpy
 from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
@@ -29,29 +31,29 @@ from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 from rlservo.export.contract.errors import UsageError
 
 
-def batched_connectors(
-    *, observation_filter: bool, normalize_actions: bool = True, clip_actions: bool = False
-) -> dict[str, Any]:
-    """Return the arguments of `AlgorithmConfig.env_runners` that put these pieces in the place of RLlib's.
+def use_batched_connectors(config: Any, *, observation_filter: bool) -> None:
+    """Put these pieces in the place of RLlib's in an `AlgorithmConfig`.
 
-    `normalize_actions` and `clip_actions` mean what they do in RLlib, and have its defaults.
+    `observation_filter` is whether observations go through a MeanStdFilter. Connectors of the configuration's own are
+    replaced. How actions are scaled it must say before, with `environment(normalize_actions=..., clip_actions=...)`.
     """
+    scaling = {"normalize_actions": config.normalize_actions, "clip_actions": config.clip_actions}
 
     def before(_env: Any, _spaces: Any, device: Any) -> ConnectorV2:
         return MeanStdFilter(device=device) if observation_filter else BatchedObservations(device=device)
 
     def after(_env: Any, _spaces: Any) -> ConnectorV2:
-        return NormalizeAndClipActions(normalize_actions=normalize_actions, clip_actions=clip_actions)
+        return NormalizeAndClipActions(**scaling)
 
-    return {
-        "env_to_module_connector": before,
-        "module_to_env_connector": after,
-        "add_default_connectors_to_env_to_module_pipeline": False,
-        "add_default_connectors_to_module_to_env_pipeline": False,
-    }
+    config.env_runners(
+        env_to_module_connector=before,
+        module_to_env_connector=after,
+        add_default_connectors_to_env_to_module_pipeline=False,
+        add_default_connectors_to_module_to_env_pipeline=False,
+    )
 
 
-def fit(observation_space: Any, action_space: Any) -> bool:
+def supports(observation_space: Any, action_space: Any) -> bool:
     """Whether these pieces do for an agent with such spaces, if its network has no memory."""
     return isinstance(observation_space, Box) and isinstance(action_space, Box | Discrete | MultiDiscrete)
 
@@ -83,9 +85,7 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
         super().__init__(
             input_observation_space=input_observation_space, input_action_space=input_action_space, **kwargs
         )
-        if missing := [name for name in ("_filters", "_update_stats") if not hasattr(self, name)]:
-            lacks = " and no ".join(missing)
-            raise UsageError(f"Ray {ray.__version__}'s filter has no {lacks}: use RLlib's own connectors")
+        _check_filter()
         self._device = device
 
     def recompute_output_observation_space(self, input_observation_space: Any, input_action_space: Any) -> Any:
@@ -195,6 +195,25 @@ def _push(stats: RunningStat, row: Any) -> None:
     delta *= row - stats.mean_array
     stats.sum_sq_diff_array += delta
     stats.sum_sq_diff_delta_array += delta
+
+
+@functools.cache
+def _check_filter() -> None:
+    """Raise UsageError where this Ray's filter does not do what is written here, bit by bit."""
+    theirs: Any = RunningFilter((3,))
+    ours: Any = RunningFilter((3,))
+    try:
+        for row in np.random.default_rng(0).normal(2.0, 5.0, (9, 3)).astype(np.float32):
+            _push(ours.running_stats, row)
+            same = theirs(row).tobytes() == _filtered(row, ours).tobytes()
+            stats, own = theirs.running_stats.to_state(), ours.running_stats.to_state()
+            if not same or stats != own:
+                raise ValueError
+        for name in ("_filters", "_update_stats"):
+            if not hasattr(env_to_module.MeanStdFilter(), name):
+                raise AttributeError(name)
+    except (AttributeError, TypeError, ValueError):
+        raise UsageError(f"Ray {ray.__version__} filters observations in another way: use its own connectors") from None
 
 
 def _filtered(row: Any, running: Any) -> Any:

@@ -348,8 +348,9 @@ def start(
     with ThreadPoolExecutor(1) as pool:
         proxies = pool.submit(serve.start, http_options=HTTPOptions(host=host, port=port), grpc_options=grpc_options)
         find_client = ray_parts.find("ray.serve.context:_get_global_client")
-        while find_client(raise_if_no_controller_running=False) is None and not proxies.done():
+        while not proxies.done() and find_client(raise_if_no_controller_running=False) is None:
             time.sleep(0.02)
-        if not proxies.done():
-            serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)
+        if proxies.done():
+            proxies.result()  # raises what kept them from starting
+        serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)
         proxies.result()

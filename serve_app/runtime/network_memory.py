@@ -7,6 +7,7 @@ hash was checked then. A network that computes is in nobody's way: who runs it h
 from __future__ import annotations
 
 import ctypes
+import math
 import threading
 import time
 import weakref
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     import onnxruntime
 
 M_MMAP_THRESHOLD = -3  # of glibc's malloc.h
+RETRY_S = 1.0  # [s] until a network that could not be opened is tried again: each time reads the whole file
 LARGE_BYTES = 128 << 10  # [bytes] glibc's own threshold, before it adapts
 
 
@@ -87,6 +89,8 @@ class DroppableNetwork:
         self._threads = threads
         self._ort_session: onnxruntime.InferenceSession | None = ort_session
         self._opening = threading.Lock()
+        self._failed_at = -math.inf
+        self._failure = ""
         self.size = size
         """[bytes] of the graph's file; onnxruntime takes up to twice of it."""
         self.used_at = time.monotonic()
@@ -97,6 +101,10 @@ class DroppableNetwork:
     def what(self) -> str:
         """Policy and version, for a sentence."""
         return f"policy '{self._bundle.contract.name}' version {self._bundle.contract.version}"
+
+    @property
+    def version(self) -> str:
+        return self._bundle.contract.version
 
     @property
     def is_in_memory(self) -> bool:
@@ -115,17 +123,20 @@ class DroppableNetwork:
         with self._opening:
             ort_session = self._ort_session
             if ort_session is None:
-                self._memory.make_room(self)  # first, so that its memory is there to be used again
+                if time.monotonic() - self._failed_at < RETRY_S:
+                    raise UnavailableError(self._failure)
                 try:
                     ort_session = open_graph(self._bundle, self._threads)
                 except BundleError as error:
-                    raise UnavailableError(
+                    self._failed_at = time.monotonic()
+                    self._failure = (
                         f"{self.what} is not in memory (network_bytes), and cannot be opened again: {error.message}"
-                    ) from error
+                    )
+                    raise UnavailableError(self._failure) from error
+                self.used_at = time.monotonic()  # before it can be dropped again
                 self._ort_session = ort_session
-                self.used_at = time.monotonic()
                 self.restores += 1
-                self._memory.make_room(self)  # others may have been opened meanwhile
+                self._memory.make_room(self)  # only now: one that cannot be opened costs nobody else's
             return ort_session
 
     def drop(self) -> None:

@@ -34,14 +34,14 @@ from rlservo.export.contract.errors import (
 from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import Request, check_deadline
-from rlservo.serve_app.episodes.shared_sessions import SharedSessions, without_policy
-from rlservo.serve_app.runtime.network_memory import DroppableNetwork, NetworkDroppedError
+from rlservo.serve_app.episodes.shared_sessions import HOP_TIMEOUT_S, SharedSessions, without_policy
+from rlservo.serve_app.runtime.network_memory import NetworkDroppedError
 from rlservo.serve_app.server.loop_clock import LoopClock
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
 from rlservo.serve_app.server.request_metrics import Metrics
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.network_restorer import NetworkRestorer
-from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blamed_version
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blame, blamed_version
 from rlservo.serve_app.versions.shadow import Shadows
 from rlservo.serve_app.wire.request_stamp import clock_id
 
@@ -252,6 +252,7 @@ class RequestPath:
         single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
         if (len(obs) if single else most_rows(obs)) > self._max_batch:
             self._check_batch(store, request)
+        began, version = time.perf_counter(), request.version
         while True:
             try:
                 if request.episode is not None or request.stream is not None:
@@ -261,15 +262,18 @@ class RequestPath:
                     else:
                         decision = self.episodes.act(store, request)
                 elif store.batches and not request.explore:
-                    check = partial(_check_again, request, time.perf_counter(), self.admission.max_wait_s)
-                    decision = await store.act_together(name, request.version, obs, label=request.label, check=check)
+                    check = partial(_check_again, request, began, self.admission.max_wait_s)
+                    decision = await store.act_together(name, version, obs, label=request.label, check=check)
                 else:
                     decision = store.act(
-                        name, request.version, obs, explore=request.explore, seed=request.seed, label=request.label
+                        name, version, obs, explore=request.explore, seed=request.seed, label=request.label
                     )
                 break
             except NetworkDroppedError as dropped:  # nothing was computed, and nobody's state has moved on
-                await self._restore(dropped.network, request)
+                await self._restore(dropped, request, self.admission.max_wait_s)
+                before, store = store, self.store()
+                # A canary is not drawn again: it would lose most of its requests whenever it was dropped.
+                version = dropped.network.version if store is before else request.version
         shadow = store.shadow(name)
         if shadow is not None and decision.version == shadow.of and not request.explore:
             self.shadows.offer(shadow, obs, decision)
@@ -277,20 +281,20 @@ class RequestPath:
 
     async def answer_peer(self, method: str, *arguments: Any) -> Any:
         """Answer another replica's `SharedSessions`; what a request is refused with is returned."""
-        shared, store = self.shared_sessions, self.store()
+        shared = self.shared_sessions
         assert shared is not None
         if method != "act":
-            return shared.adopt(store, *arguments) if method == "adopt" else shared.forget(*arguments)
+            return shared.adopt(self.store(), *arguments) if method == "adopt" else shared.forget(*arguments)
         request, token = arguments
         request.received = time.perf_counter()
         try:
             self.admission.enter()
             while True:
                 try:
-                    decision = await shared.act_here(store, request, token)
+                    decision = await shared.act_here(self.store(), request, token)
                     break
-                except NetworkDroppedError as dropped:
-                    await self._restore(dropped.network, request)
+                except NetworkDroppedError as dropped:  # the other replica waits no longer than a hop may take
+                    await self._restore(dropped, request, min(self.admission.max_wait_s, HOP_TIMEOUT_S / 2))
         except RlservoError as error:
             return error
         if decision is None:
@@ -299,13 +303,17 @@ class RequestPath:
             self.recorder.note_answer(request, decision, time.perf_counter() - request.received)
         return without_policy(decision)
 
-    async def _restore(self, network: DroppableNetwork, request: Request) -> None:
-        """Wait for a network that was dropped, for as long as a request may wait.
+    async def _restore(self, dropped: NetworkDroppedError, request: Request, wait_s: float) -> None:
+        """Wait for a network that was dropped, until `wait_s` after the request came.
 
         Raises UnavailableError and DeadlineError.
         """
-        left_s = self.admission.max_wait_s - (time.perf_counter() - request.received)
-        await self._restorer.restore(network, max(left_s, 0.0))
+        left_s = wait_s - (time.perf_counter() - request.received)
+        try:
+            await self._restorer.restore(dropped.network, max(left_s, 0.0))
+        except UnavailableError as error:
+            blame(error, dropped.network.version)
+            raise
         if request.deadline_ms is not None:
             check_deadline(request)
 

@@ -10,6 +10,9 @@ from rlservo.export.contract.errors import UnavailableError
 from rlservo.serve_app.runtime.network_memory import DroppableNetwork
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 
+MOST = 64
+"""Networks that are being opened or wait for it, at once."""
+
 
 class NetworkRestorer:
     """Opens networks again for the requests of one event loop."""
@@ -22,6 +25,8 @@ class NetworkRestorer:
         """Return when the network is in memory. Raises UnavailableError; after `patience_s` the opening goes on."""
         task = self._tasks.get(network)
         if task is None:
+            if len(self._tasks) >= MOST:  # nobody's turn comes after hundreds that nobody waits for any more
+                raise UnavailableError(f"{network.what} is not in memory (network_bytes), and {MOST} others come first")
             # Where files hang its thread does, however long anybody waits: one for a network is enough.
             opened = self._calls.run(network.restore, timeout_s=None, what=f"opening {network.what} again")
             task = self._tasks[network] = asyncio.create_task(opened)

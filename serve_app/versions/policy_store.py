@@ -250,7 +250,7 @@ class PolicyStore:
             started = time.perf_counter()
             action = policy.build_action(computed.outputs, batch=batch)
         except Exception as error:
-            blame(error, policy)
+            blame(error, policy.contract.version)
             raise
         infer_ms = parse_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
         version, size, sharers = policy.contract.version, rows if batch else None, computed.requests
@@ -307,7 +307,7 @@ def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision,
     try:
         step = policy.step(obs, **given)
     except Exception as error:
-        blame(error, policy)
+        blame(error, policy.contract.version)
         raise
     infer_ms = (time.perf_counter() - started) * 1e3
     name, version = policy.contract.name, policy.contract.version
@@ -316,9 +316,9 @@ def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision,
     return decision, step
 
 
-def blame(error: Exception, policy: Policy) -> None:
+def blame(error: Exception, version: str) -> None:
     """Write the version that was asked on its error: where a canary runs, nobody else knows which one it was."""
-    error.policy_version = policy.contract.version  # type: ignore[attr-defined]
+    error.policy_version = version  # type: ignore[attr-defined]
 
 
 def blamed_version(error: Exception) -> str | None:

@@ -29,8 +29,8 @@ ONCE_IN = 10_000
 LARGEST = 750_000  # bytes of a folder
 
 
-def load_evaluate_shipped() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("evaluate_shipped", EXAMPLES / "evaluate_shipped.py")
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
@@ -38,7 +38,7 @@ def load_evaluate_shipped() -> ModuleType:
     return module
 
 
-evaluate_shipped = load_evaluate_shipped()
+evaluate_shipped = load("evaluate_shipped")
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +101,20 @@ def test_each_acts_as_well_as_its_card_says(name: str, bundles: dict[str, Path])
     if bounds:
         successes = sum(ours.successes for ours in measured)
         assert successes >= fewest_successes(sum(bounds) / len(bounds), episodes * len(bounds)), measured
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")  # RLlib registers all its algorithms, with environments of theirs
+def test_each_can_be_trained_from_its_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+
+    monkeypatch.syspath_prepend(EXAMPLES)
+    train_shipped = load("train_shipped")
+    for name in NAMES:
+        settings = evaluate_shipped.load_settings(name) | {"envs": 1}
+        runner = SingleAgentEnvRunner(config=train_shipped.algorithm_config(settings, 0), worker_index=0)
+        assert sum(map(len, runner.sample(num_timesteps=2, explore=False))) == 2, name
+        runner.stop()
 
 
 def test_the_recurrent_policy_needs_its_memory(bundles: dict[str, Path]) -> None:

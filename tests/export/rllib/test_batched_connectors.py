@@ -13,13 +13,18 @@ from ray.rllib.algorithms import DQNConfig, PPOConfig, SACConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+from ray.rllib.utils.filter import RunningStat
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.export.rllib.batched_connectors import batched_connectors, fit
+from rlservo.export.rllib.batched_connectors import _check_filter, supports, use_batched_connectors
 
 
-def runner(config: Any, env: str, envs: int, **connectors: Any) -> Any:
-    config.environment(env).env_runners(num_env_runners=0, num_envs_per_env_runner=envs, **connectors).debugging(seed=3)
+def runner(config: Any, env: str, envs: int, *, batched: bool, filtered: bool = False) -> Any:
+    config.environment(env).env_runners(num_env_runners=0, num_envs_per_env_runner=envs).debugging(seed=3)
+    if batched:
+        use_batched_connectors(config, observation_filter=filtered)
+    elif filtered:
+        config.env_runners(env_to_module_connector=lambda *_: MeanStdFilter())
     for seed in (random.seed, np.random.seed, torch.manual_seed):
         seed(3)
     return SingleAgentEnvRunner(config=config, worker_index=0)
@@ -57,33 +62,43 @@ def in_bytes(tree: Any) -> Any:
     ],
 )
 def test_a_runner_samples_the_same_bit_by_bit(kind: Any, env: str, envs: int, filtered: bool, explore: bool) -> None:
-    rllib: dict[str, Any] = {"env_to_module_connector": lambda *_: MeanStdFilter()} if filtered else {}
-    theirs = sampled(runner(kind(), env, envs, **rllib), explore)
-    ours = sampled(runner(kind(), env, envs, **batched_connectors(observation_filter=filtered)), explore)
+    theirs, ours = (
+        sampled(runner(kind(), env, envs, batched=batched, filtered=filtered), explore) for batched in (False, True)
+    )
     assert in_bytes(ours) == in_bytes(theirs)
     assert filtered == ("MeanStdFilter" in ours[-1])
 
 
 def test_actions_are_clipped_where_they_are_not_scaled() -> None:
-    settings = {"normalize_actions": False, "clip_actions": True}
-    theirs = sampled(runner(PPOConfig().environment(**settings), "Pendulum-v1", 2), True)
-    ours = batched_connectors(observation_filter=False, **settings)
-    assert in_bytes(sampled(runner(PPOConfig(), "Pendulum-v1", 2, **ours), True)) == in_bytes(theirs)
+    theirs, ours = (
+        sampled(
+            runner(
+                PPOConfig().environment(normalize_actions=False, clip_actions=True), "Pendulum-v1", 2, batched=batched
+            ),
+            True,
+        )
+        for batched in (False, True)
+    )
+    assert in_bytes(ours) == in_bytes(theirs)
 
 
 def test_what_does_not_fit_is_refused_by_name() -> None:
     spaces = gymnasium.spaces
-    assert fit(spaces.Box(-1, 1, (3,)), spaces.Discrete(2))
-    assert not fit(spaces.Dict(), spaces.Discrete(2)) and not fit(spaces.Box(-1, 1, (3,)), spaces.Dict())
-    own = batched_connectors(observation_filter=True)
+    assert supports(spaces.Box(-1, 1, (3,)), spaces.Discrete(2))
+    assert not supports(spaces.Dict(), spaces.Discrete(2)) and not supports(spaces.Box(-1, 1, (3,)), spaces.Dict())
     with pytest.raises(UsageError, match=r"observations are Discrete\(16\): the batched connectors take a Box"):
-        runner(PPOConfig(), "FrozenLake-v1", 1, **own)
+        runner(PPOConfig(), "FrozenLake-v1", 1, batched=True, filtered=True)
     memory = PPOConfig().rl_module(model_config=DefaultModelConfig(use_lstm=True, max_seq_len=4))
     with pytest.raises(UsageError, match="has a memory"):
-        runner(memory, "CartPole-v1", 1, **own).sample(num_timesteps=2)
+        runner(memory, "CartPole-v1", 1, batched=True).sample(num_timesteps=2)
 
 
-def test_a_ray_whose_filter_is_another_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(MeanStdFilter, "__init__", lambda self, **_: None)
-    with pytest.raises(UsageError, match=r"^Ray [\d.]+'s filter has no _filters and no _update_stats: use RLlib's"):
-        runner(PPOConfig(), "Pendulum-v1", 1, **batched_connectors(observation_filter=True))
+@pytest.mark.parametrize("change", ["push", "std"])
+def test_a_ray_that_filters_in_another_way_is_refused(change: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RunningStat, change, lambda *_: 1.0)
+    _check_filter.cache_clear()
+    try:
+        with pytest.raises(UsageError, match=r"^Ray [\d.]+ filters observations in another way"):
+            runner(PPOConfig(), "Pendulum-v1", 1, batched=True, filtered=True)
+    finally:
+        _check_filter.cache_clear()

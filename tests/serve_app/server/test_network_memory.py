@@ -144,7 +144,9 @@ def test_without_the_bound_a_policy_has_onnxruntimes_own_run(folder: Path) -> No
     assert "rlservo_network" not in exposition(Core(lambda: store, ServerSettings())).decode()
 
 
-def test_a_network_that_cannot_be_opened_again_is_a_sentence_and_others_go_on(folder: Path, tmp_path: Path) -> None:
+def test_a_network_that_cannot_be_opened_again_is_a_sentence_and_others_go_on(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     root = Path(shutil.copytree(folder, tmp_path / "copy"))
     core = core_of(root)
     graph = root / "c" / "1" / "policy.onnx"
@@ -155,6 +157,13 @@ def test_a_network_that_cannot_be_opened_again_is_a_sentence_and_others_go_on(fo
         with pytest.raises(UnavailableError, match=r"^policy 'c' version 1 is not in memory \(network_bytes\), and"):
             asyncio.run(core.decide(request("c", OBS[0])))
         assert asyncio.run(core.decide(request("d", OBS[0]))).name == "d"
+        before = {name for name in NAMES if network_of(core, name).is_in_memory}
+        with pytest.raises(UnavailableError), monkeypatch.context() as patch:
+            patch.setattr(network_memory, "RETRY_S", 60.0)
+            patch.setattr(network_memory, "open_graph", None)  # not read again so soon
+            asyncio.run(core.decide(request("c", OBS[0])))
+        assert before == {name for name in NAMES if network_of(core, name).is_in_memory}
+        monkeypatch.setattr(network_memory, "RETRY_S", 0.0)
         graph.write_bytes(content)
         assert asyncio.run(core.decide(request("c", OBS[0]))).name == "c"
 
