@@ -121,6 +121,7 @@ class PolicyApp(FastAPI):
             await super().__call__(scope, receive, send)
             return
         self._mount = scope.get("root_path", "")
+        scope[REPLY_HEADERS] = self.offer  # also to a stream that began before the prefix was known
         await self.answer(scope, receive, send)
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:

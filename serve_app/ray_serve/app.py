@@ -9,9 +9,11 @@ serve` comes here through `cluster_process.py`. A replica imports neither torch 
 
 import asyncio
 import gc
+import http.client
 import logging
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from typing import Any, cast
 
 import ray
@@ -21,7 +23,7 @@ from ray.exceptions import ActorDiedError, RayError
 from ray.serve import Application, Deployment
 from ray.serve.config import HTTPOptions, gRPCOptions
 
-from rlservo.export.contract.errors import PartlyAppliedError, RlservoError
+from rlservo.export.contract.errors import PartlyAppliedError, RlservoError, UnavailableError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import InferenceService
@@ -39,7 +41,7 @@ from rlservo.serve_app.server.start_check import version_loader
 from rlservo.serve_app.versions.object_storage import place_of
 from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
-from rlservo.serve_app.wire.direct_offer import OFFER, make_offer
+from rlservo.serve_app.wire.direct_offer import EVERYWHERE, OFFER, make_offer
 from rlservo.serve_app.wire.loopback import is_loopback
 
 logger = logging.getLogger(__name__)
@@ -49,6 +51,8 @@ DEPLOYMENT = "PolicyServer"
 SPARE = 64  # health, metrics, documentation
 GRPC_SERVICE = "rlservo.serve_app.ray_serve.grpc_ingress:add_service"
 SWEEP_PERIOD_S = 300.0  # [s] between looks for records of sessions that are no more
+ANSWERED = 10  # connections in a row, until a start is over
+ANSWER_TIMEOUT_S = 60.0
 FOLLOW_TIMEOUT_S = 45.0  # [s] for every replica to load and prove what a change brought
 
 
@@ -354,3 +358,31 @@ def start(
             proxies.result()  # raises what kept them from starting
         serve.run(app, name=APPLICATION, route_prefix="/", _local_testing_mode=False)
         proxies.result()
+    _wait_until_answered(host, port)
+
+
+def _wait_until_answered(host: str, port: int) -> None:
+    """Return when new connections reach a replica, several in a row. Raises UnavailableError.
+
+    Serve takes a proxy for ready when it knows the replicas that it has heard of so far, which may be none, and a
+    HAProxy that another one replaced may still take a last connection.
+    """
+    in_a_row, until = 0, time.monotonic() + ANSWER_TIMEOUT_S
+    while in_a_row < ANSWERED:
+        answer = ""
+        try:
+            with closing(http.client.HTTPConnection(EVERYWHERE.get(host, host), port, timeout=5)) as connection:
+                connection.request("GET", "/healthz")
+                status = connection.getresponse().status
+        except (OSError, http.client.HTTPException) as error:
+            status, answer = 0, repr(error)
+        if status == 200:
+            in_a_row += 1
+            continue
+        in_a_row = 0
+        if time.monotonic() > until:
+            raise UnavailableError(
+                f"the replicas run, but after {ANSWER_TIMEOUT_S:g} s the proxy at {host}:{port} still answers "
+                f"{answer or status} to GET /healthz"
+            )
+        time.sleep(0.05)

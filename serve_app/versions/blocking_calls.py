@@ -60,14 +60,18 @@ class BlockingCalls:
         loop = asyncio.get_running_loop()
 
         def call() -> None:
+            result: Any = None
+            error: BaseException | None = None
             try:
                 result = function(*arguments)
-            except BaseException as error:
-                future.set_exception(error)
-            else:
-                future.set_result(result)
+            except BaseException as raised:
+                error = raised
             with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(self._free.release)
+                loop.call_soon_threadsafe(self._free.release)  # before the result, with which the loop may end
+            if error is None:
+                future.set_result(result)
+            else:
+                future.set_exception(error)
 
         # A daemon: the process can end while the thread is stuck.
         thread = threading.Thread(target=call, name="policies", daemon=True)

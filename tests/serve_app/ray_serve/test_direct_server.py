@@ -101,13 +101,14 @@ def start(app: Any, port: int) -> Iterator[Callable[[], Replica]]:
         yield start
 
 
-@pytest.fixture
-def proxied(app: Any, port: int) -> Iterator[int]:
+@pytest.fixture(params=["ahead of Serve", "by Serve"])
+def proxied(request: pytest.FixtureRequest, app: Any, port: int) -> Iterator[int]:
     """The same application where requests come by a proxy: it offers the direct port."""
     app.offer = offer_of(port)
 
     async def by_proxy(scope: Scope, receive: Receive, send: Send) -> None:
-        match = None if scope["type"] == "lifespan" else app.find_direct(scope, scope["path"])
+        is_ahead = request.param == "ahead of Serve" and scope["type"] != "lifespan"
+        match = app.find_direct(scope, scope["path"]) if is_ahead else None
         if match is None:
             await app(scope, receive, send)
         else:

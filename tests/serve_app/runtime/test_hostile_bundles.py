@@ -14,6 +14,7 @@ import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
-from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions import blocking_calls, plan_changes
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.plan import Plan, PolicyPlan, ServedConfig
 from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
@@ -403,6 +404,18 @@ def test_a_functions_own_time_out_is_not_taken_for_ours() -> None:
 
     with pytest.raises(TimeoutError, match="of a network"):
         asyncio.run(BlockingCalls().run(fail, timeout_s=5, what="test"))
+
+
+def test_threads_are_free_again_for_another_event_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Preempted(Future[int]):
+        def set_result(self, result: int) -> None:
+            super().set_result(result)
+            time.sleep(0.1)  # meanwhile the loop, which has the result, ends
+
+    monkeypatch.setattr(blocking_calls, "Future", Preempted)
+    calls = BlockingCalls(limit=1)
+    for number in range(3):
+        assert asyncio.run(asyncio.wait_for(calls.run(int, number, timeout_s=None, what="test"), 20)) == number
 
 
 LOAD = """
