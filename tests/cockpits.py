@@ -89,7 +89,14 @@ class Browser:
         mouse.up()
 
     def click(self, name: str, *, role: str = "button") -> None:
-        self.page.get_by_role(role, name=name, exact=True).first.click()
+        """Click what has this name, also where the browser draws too few pictures for it to be seen standing still."""
+        from playwright.sync_api import TimeoutError as NotInTimeError
+
+        named = self.page.get_by_role(role, name=name, exact=True).first
+        try:
+            named.click(timeout=20e3)
+        except NotInTimeError:
+            named.click(force=True)
 
     def choose(self, label: str, option: str | None) -> None:
         """Choose an option of a dropdown, by its name or the second one there is; again where the list has closed."""

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import pytest
 
+from cache import cached, versions
+
 HERE = Path(__file__).resolve().parent
 EXAMPLES = HERE.parent / "examples"
 TINY = ("--set", "train_batch_size_per_learner=400", "--hidden", "16")
@@ -77,7 +79,17 @@ IN_ONE_RAY = {
     "edges": (str(HERE / "examples" / "train_edges.py"),),
     "benchmark": (str(HERE / "benchmarks" / "measure_training.py"),),
 }  # fmt: skip
-"""Scripts of `examples/`, or of the tests' own, by the name of the folder that they run in."""
+"""Scripts of `examples/`, or of the tests' own, by name."""
+
+PRODUCT = ("export", "envs", "serve_app/runtime", "serve_app/wire", "serve_app/rollout", "serve_app/recording")
+TESTS_OWN = ("trainings.py", "train_in_one_ray.py", "examples/app", "examples/train_edges.py", "benchmarks")
+TRAINED_WITH = [
+    *(HERE.parent / name for name in ("benchmarks/training.py", "examples", *PRODUCT)),
+    *(HERE / name for name in TESTS_OWN),
+    versions("ray", "torch", "gymnasium", "numpy", "mujoco", "onnx", "onnxruntime"),
+    str(EXAMPLES), str(OFFSCREEN),
+]  # fmt: skip
+"""What those scripts run, and where: their output and what they leave names files."""
 
 
 @dataclass(frozen=True)
@@ -93,37 +105,36 @@ class Trained:
 class OneRay:
     """A process with a Ray of one core that runs scripts."""
 
-    def __init__(self, process: subprocess.Popen[str], folder: Path) -> None:
+    def __init__(self, process: subprocess.Popen[str], errors: Path) -> None:
         self._process = process
-        self._folder = folder
+        self._errors = errors
 
-    def run(self, name: str, *words: str) -> Trained:
+    def run(self, folder: Path, *words: str) -> Trained:
         """Run a script with these arguments in a new folder."""
         process = self._process
         assert process.stdin is not None and process.stdout is not None
-        folder = self._folder / name
         process.stdin.write(json.dumps([str(folder), *words]) + "\n")
         process.stdin.flush()
         for reply in process.stdout:
             one = json.loads(reply)
             if one["folder"] == str(folder):  # the others came when their test had given up
                 return Trained(Ended(one["code"], one["out"], one["err"]), folder, frozenset(one["home"]))
-        raise AssertionError((self._folder / "errors.txt").read_text()[-5000:])
+        raise AssertionError(self._errors.read_text()[-5000:])
 
 
 @pytest.fixture(scope="session")
 def one_ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OneRay]:
-    folder, home = tmp_path_factory.mktemp("one_ray"), tmp_path_factory.mktemp("home")
+    errors_file, home = tmp_path_factory.mktemp("one_ray") / "errors.txt", tmp_path_factory.mktemp("home")
     command = [sys.executable, "-W", "ignore", str(HERE / "train_in_one_ray.py")]
     with (
-        (folder / "errors.txt").open("w") as errors,
+        errors_file.open("w") as errors,
         subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment(home),
             cwd=home,
         ) as process,
     ):  # fmt: skip
         try:
-            yield OneRay(process, folder)
+            yield OneRay(process, errors_file)
         finally:
             assert process.stdin is not None
             process.stdin.close()  # the last request: it ends, and its Ray with it
@@ -134,6 +145,19 @@ def one_ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OneRay]:
 
 
 @pytest.fixture(scope="session")
-def trained(one_ray: OneRay) -> Callable[[str], Trained]:
-    """Return a function that runs a script of IN_ONE_RAY, once a session."""
-    return cache(lambda name: one_ray.run(name, *IN_ONE_RAY[name]))
+def trained(request: pytest.FixtureRequest) -> Callable[[str], Trained]:
+    """Return a function that runs a script of IN_ONE_RAY, unless the same code has run it before."""
+
+    def run(name: str) -> Trained:
+        words = IN_ONE_RAY[name]
+
+        def train(folder: Path) -> None:
+            done = request.getfixturevalue("one_ray").run(folder / "run", *words)
+            assert done.ended.code == 0, done.ended.out + done.ended.err
+            (folder / "ended.json").write_text(json.dumps([done.ended.out, done.ended.err, sorted(done.home)]))
+
+        folder = cached(f"training-{name}", [*TRAINED_WITH, *words], train)
+        out, err, home = json.loads((folder / "ended.json").read_text())
+        return Trained(Ended(0, out, err), folder / "run", frozenset(home))
+
+    return cache(run)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import runpy
 import shutil
@@ -18,7 +19,8 @@ from pathlib import Path
 
 import pytest
 
-from trainings import EXAMPLES, ON_ONE_CORE, TINY, Ended, OneRay, command, environment
+from cache import cached
+from trainings import EXAMPLES, ON_ONE_CORE, TINY, TRAINED_WITH, Ended, OneRay, command, environment
 
 
 def run_here(script: str, *arguments: str, home: Path) -> Ended:
@@ -98,9 +100,13 @@ class Job:
         return (self.stubs / "srun.log").read_text().splitlines()
 
 
+def job_folders(folder: Path) -> tuple[Path, Path, Path]:
+    return folder / "home", folder / "checkout", folder / "stubs"
+
+
 def submit(script: str, *arguments: str, folder: Path, **more: str) -> Job:
     """Run a job script as Slurm would: from a spool, in an environment of its own."""
-    job = Job(Ended(-1, "", ""), *(folder / name for name in ("home", "checkout", "stubs")))
+    job = Job(Ended(-1, "", ""), *job_folders(folder))
     for each in (job.home, job.checkout, job.stubs):
         each.mkdir()
     for name in ("examples", "deploy"):
@@ -134,17 +140,23 @@ def submit_fixture() -> Callable[..., Job]:
 
 
 @pytest.fixture(scope="session")
-def sweep(tmp_path_factory: pytest.TempPathFactory) -> Job:
+def sweep() -> Job:
     """A sweep of `simple_trainer.py` as a job of one node: two learning rates, evaluation, traces, a bundle."""
-    folder = tmp_path_factory.mktemp("sweep")
-    space = folder / "space.yaml"
-    space.write_text("gamma: {choice: [0.9]}\n")
-    return submit(
-        "one_node.sh", "--run", "PPO", "--name-env", "CartPole-v1", *TINY,
-        "--stop-iters", "2", "--sweep", "lr=1e-4,1e-3", "--search-space", str(space), "--scheduler", "asha",
-        "--evaluation-interval", "1", "--evaluation-duration", "2", "--output", "traces", "--episodes", "2",
-        folder=folder,
-    )  # fmt: skip
+
+    def run(folder: Path) -> None:
+        space = folder / "space.yaml"
+        space.write_text("gamma: {choice: [0.9]}\n")
+        ended = submit(
+            "one_node.sh", "--run", "PPO", "--name-env", "CartPole-v1", *TINY,
+            "--stop-iters", "2", "--sweep", "lr=1e-4,1e-3", "--search-space", str(space), "--scheduler", "asha",
+            "--evaluation-interval", "1", "--evaluation-duration", "2", "--output", "traces", "--episodes", "2",
+            folder=folder,
+        ).ended  # fmt: skip
+        assert ended.code == 0, ended.out + ended.err
+        (folder / "ended.json").write_text(json.dumps([ended.out, ended.err]))
+
+    folder = cached("sweep", [*TRAINED_WITH, Path(__file__), EXAMPLES.parent / "deploy" / "slurm"], run)
+    return Job(Ended(0, *json.loads((folder / "ended.json").read_text())), *job_folders(folder))
 
 
 @dataclass(frozen=True)
@@ -182,7 +194,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory, one_ray: OneRay) -> It
         stopped = Ended(started.returncode, out, err)
         left = in_session(started.pid)
         run = next(home.glob("runs/*"))
-        resumed = one_ray.run("resumed", "simple_trainer.py", "--resume", str(run)).ended
+        resumed = one_ray.run(home / "resumed", "simple_trainer.py", "--resume", str(run)).ended
         yield Interrupted(home, stopped, resumed, left)
     finally:
         if started.poll() is None:

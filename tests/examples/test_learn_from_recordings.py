@@ -53,7 +53,7 @@ def losses(out: str, name: str) -> list[float]:
 def test_bc_sees_what_the_policy_saw_and_drew(one_ray: OneRay, shipped: Path, tmp_path: Path) -> None:
     recorded = record(shipped / "ur5", tmp_path / "run.mcap", explore=True)
     done = one_ray.run(
-        "learn_bc", SCRIPT, str(tmp_path / "run.mcap"), "--run", "BC", "--from", str(UR5), "--out", "learned",
+        tmp_path / "at", SCRIPT, str(tmp_path / "run.mcap"), "--run", "BC", "--from", str(UR5), "--out", "learned",
         "--set", "lr=0.0", *WHOLE,
     )  # fmt: skip
     assert done.ended.code == 0, done.ended.out + done.ended.err
@@ -72,7 +72,7 @@ def test_marwil_values_whole_episodes(one_ray: OneRay, shipped: Path, tmp_path: 
     """Its first targets are returns of whole episodes, discounted, with the value of what follows one that was cut."""
     recorded = record(shipped / "ur5", tmp_path / "run.mcap", explore=True)
     done = one_ray.run(
-        "learn_marwil", SCRIPT, str(tmp_path / "run.mcap"), "--run", "MARWIL", "--from", str(UR5), "--out", "learned",
+        tmp_path / "at", SCRIPT, str(tmp_path / "run.mcap"), "--run", "MARWIL", "--from", str(UR5), "--out", "learned",
         "--set", "lr=0.0", "--set", "gamma=0.9", "--set", "lambda_=1.0", *WHOLE,
     )  # fmt: skip
     assert done.ended.code == 0, done.ended.out + done.ended.err
@@ -99,7 +99,7 @@ def test_a_recurrent_module_remembers_whole_episodes(
     """They are longer than the module's own sequences, whose states RLlib begins with zeros."""
     recorded = record(recurrent / "lstm_box", tmp_path / "run.mcap", explore=True, lengths=(30, 45, 60))
     done = one_ray.run(
-        "learn_lstm", SCRIPT, str(tmp_path / "run.mcap"), "--run", "BC", "--from", str(wide_zoo / "lstm_box"),
+        tmp_path / "at", SCRIPT, str(tmp_path / "run.mcap"), "--run", "BC", "--from", str(wide_zoo / "lstm_box"),
         "--out", "learned", "--set", "lr=0.0", *WHOLE,
     )  # fmt: skip
     assert done.ended.code == 0, done.ended.out + done.ended.err
@@ -111,7 +111,7 @@ def test_a_new_network_learns_ahead_of_the_latency(one_ray: OneRay, ur5: Path, t
     """Without a checkpoint, its filter has the recorded observations' statistics; only one way to end is chosen."""
     recorded = record(ur5, tmp_path / "run.mcap", explore=False, lengths=(200, 300, 50))
     done = one_ray.run(
-        "learn_anew", SCRIPT, str(tmp_path / "run.mcap"), "--run", "BC", "--out", "learned", "--status", "success",
+        tmp_path / "at", SCRIPT, str(tmp_path / "run.mcap"), "--run", "BC", "--out", "learned", "--status", "success",
         "--ahead", "2", "--hidden", "32", "--set", "lr=3e-3", "--epochs", "20", "--batch-size", "50",
     )  # fmt: skip
     assert done.ended.code == 0, done.ended.out + done.ended.err
@@ -132,7 +132,7 @@ def test_q_learners_go_on_from_sac(algorithm: str, one_ray: OneRay, zoo: Path, t
     bundle = export_checkpoint(zoo / "sac", tmp_path, name="pendulum", notify=lambda line: None)
     record(bundle.path, tmp_path / "run.mcap", explore=True)
     done = one_ray.run(
-        f"learn_{algorithm}", SCRIPT, str(tmp_path / "run.mcap"), "--run", algorithm, "--from", str(zoo / "sac"),
+        tmp_path / "at", SCRIPT, str(tmp_path / "run.mcap"), "--run", algorithm, "--from", str(zoo / "sac"),
         "--out", "learned", "--epochs", "2", "--batch-size", "32",
     )  # fmt: skip
     assert done.ended.code == 0, done.ended.out + done.ended.err
@@ -161,7 +161,7 @@ def test_wrong_arguments_are_refused_in_a_sentence(
 ) -> None:
     record(ur5, tmp_path / "run.mcap", explore=False)
     out = () if "--out" in words else ("--out", "learned")
-    done = one_ray.run(f"refused {' '.join(words)}".replace("/", ""), SCRIPT, str(tmp_path / "run.mcap"), *words, *out)
+    done = one_ray.run(tmp_path / "refused", SCRIPT, str(tmp_path / "run.mcap"), *words, *out)
     assert done.ended.code in (1, 2)
     assert sentence in done.ended.err
     assert "Traceback" not in done.ended.err
