@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import gc
+import inspect
 import os
 import sys
 from typing import Any
@@ -128,4 +130,14 @@ def pytest_configure(config: pytest.Config) -> None:
     # A collection walks all that torch and RLlib have made, and by Python's own threshold one comes every 700 objects:
     # a quarter of the time of their import.
     gc.set_threshold(100_000, 20, 20)
+    # For each connector RLlib (ray 2.60) asks for the whole stack, by default with the source around all of its lines:
+    # a fifth of what the tests themselves took.
+    stack = pytest.MonkeyPatch()
+    stack.setattr(inspect, "stack", functools.partial(inspect.stack, context=0))
+    config.add_cleanup(stack.undo)
     config.pluginmanager.register(SharedFixtures())
+
+
+def pytest_collection_finish() -> None:
+    """Leave all that was imported so far out of further collections, of which pytest makes ten in the end."""
+    gc.freeze()
