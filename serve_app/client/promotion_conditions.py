@@ -24,7 +24,8 @@ FEWEST_DIFFERENCES = 30  # for the mean of differences, whose interval takes the
 CLIENTS_OWN = frozenset(  # failures that say nothing of the version that was asked
     {
         *("bad-request", "wrong-media-type", "too-large", "unauthenticated", "forbidden", "rate-limited", "idle"),
-        *("session-conflict", "session-lost", "late", "over-capacity", "deadline-passed", "unavailable"),
+        *("bad-observation", "session-conflict", "session-lost", "late", "over-capacity", "deadline-passed"),
+        "unavailable",
     }
 )
 UNITS = {"%": 0.01, "us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0}

@@ -12,6 +12,7 @@ queue, its beginning when each of them had arrived at the latest. That is known 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Callable
@@ -52,6 +53,8 @@ logger = logging.getLogger(__name__)
 
 HURRY_S = 0.05  # [s] for a body when too many are half sent
 LEAST_WAIT_S = 0.01  # that counts against a deadline: stamps are milliseconds, and so is the way from the proxy
+STRICTER = "stricter-than-production"
+"""Counted for `bad-observation` where the version that production leads to takes the observation."""
 BUG = "the server failed on this request; its log says how"
 
 StoreProvider = Callable[[], PolicyStore | None]
@@ -223,7 +226,8 @@ class RequestPath:
         except ClientGoneError:
             raise
         except RlservoError as error:
-            self.record_failure(request, error.code, error.message, asked=blamed_version(error))
+            asked, counted_as = blamed_version(error), self._counted_as(request, error)
+            self.record_failure(request, error.code, error.message, asked=asked, counted_as=counted_as)
             if self.recorder is not None:
                 self.recorder.note_failure(request, self._store_provider(), error)
             raise
@@ -311,19 +315,26 @@ class RequestPath:
         left_s = wait_s - (time.perf_counter() - request.received)
         try:
             await self._restorer.restore(dropped.network, max(left_s, 0.0))
-        except UnavailableError as error:
+        except Exception as error:
             blame(error, dropped.network.version)
             raise
         if request.deadline_ms is not None:
             check_deadline(request)
 
     def record_failure(
-        self, request: Request, code: str, sentence: str, *, peer: str | None = None, asked: str | None = None
+        self,
+        request: Request,
+        code: str,
+        sentence: str,
+        *,
+        peer: str | None = None,
+        asked: str | None = None,
+        counted_as: str | None = None,
     ) -> None:
         """Count and log a request that got no action; names that are not loaded are not told apart.
 
         `peer` is the address it came from, for the log of what was refused before it was routed; `asked` is the version
-        that was asked and failed, where it came so far.
+        that was asked and failed, where it came so far; `counted_as` is the code in the metrics, where it is another.
         """
         name, version = request.policy, request.version
         store = self._store_provider()
@@ -333,7 +344,7 @@ class RequestPath:
             version = asked
         else:  # an alias is counted as the version it leads to, no version as the default
             version = store.default(name) if version is None else store.version_of(name, version)
-        self.metrics.count_failure(request.protocol, name, version, code)
+        self.metrics.count_failure(request.protocol, name, version, counted_as or code)
         self.log.write_failure(request, code, sentence, peer=peer)
 
     def record_bug(self, request: Request, *, asked: str | None = None) -> None:
@@ -373,6 +384,22 @@ class RequestPath:
         request.received = min(request.received, self.admission.enter(request.waited))
         if request.waited is not None and request.waited > LEAST_WAIT_S:
             request.received -= request.waited
+
+    def _counted_as(self, request: Request, error: RlservoError) -> str:
+        """Return what a failure is counted as: its code, and STRICTER where only the version that was asked is at fault.
+
+        Most observations that a version refuses every version would, and they say nothing of it. One that production
+        takes does, even where the refusal is what the version's contract says.
+        """
+        version, store = blamed_version(error), self._store_provider()
+        if version is None or store is None or not isinstance(error, ObservationError):
+            return error.code
+        with contextlib.suppress(RlservoError):
+            production = store.get(request.policy)
+            if production.contract.version != version:
+                production.parse(request.obs)
+                return STRICTER
+        return error.code
 
     async def _decide_non_finite(self, request: Request) -> Decision:
         """Refuse what JSON does not have, by the sentence of the element where it is one of the observation's."""
