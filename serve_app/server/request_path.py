@@ -29,12 +29,14 @@ from rlservo.export.contract.errors import (
     OverloadedError,
     RequestError,
     RlservoError,
+    SessionError,
     TooLargeError,
     UnavailableError,
 )
 from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import Request, check_deadline
+from rlservo.serve_app.episodes.sessions import Session
 from rlservo.serve_app.episodes.shared_sessions import HOP_TIMEOUT_S, SharedSessions, without_policy
 from rlservo.serve_app.runtime.network_memory import NetworkDroppedError
 from rlservo.serve_app.server.loop_clock import LoopClock
@@ -247,8 +249,8 @@ class RequestPath:
     async def decide(self, request: Request) -> Decision:
         """Decide, unless its deadline has passed; a network that was dropped from memory is opened again first.
 
-        Raises DeadlineError, LateError, TooLargeError, UnavailableError and what `PolicyStore.act` and `Episodes.act`
-        raise.
+        Raises DeadlineError, LateError, SessionError, TooLargeError, UnavailableError and what `PolicyStore.act` and
+        `Episodes.act` raise.
         """
         store, name, obs = self.store(), request.policy, request.obs
         if request.deadline_ms is not None:
@@ -310,9 +312,12 @@ class RequestPath:
     async def _restore(self, dropped: NetworkDroppedError, request: Request, wait_s: float) -> None:
         """Wait for a network that was dropped, until `wait_s` after the request came.
 
-        Raises UnavailableError and DeadlineError.
+        Raises UnavailableError, DeadlineError, and SessionError where its session went on meanwhile: a client that gave
+        up and asked again would have moved the memory twice.
         """
         left_s = wait_s - (time.perf_counter() - request.received)
+        session = self._session_of(request)
+        steps = 0 if session is None else session.steps
         try:
             await self._restorer.restore(dropped.network, max(left_s, 0.0))
         except Exception as error:
@@ -320,6 +325,21 @@ class RequestPath:
             raise
         if request.deadline_ms is not None:
             check_deadline(request)
+        if session is None or request.seq is not None:
+            return
+        if self._session_of(request) is not session or session.steps != steps:
+            raise SessionError(
+                "while this request waited for its network, another one of its session was answered: wait for each "
+                "answer, or number the requests ('seq')"
+            )
+
+    def _session_of(self, request: Request) -> Session | None:
+        """Return the memory that a request goes on from, of those under ids here."""
+        episode = request.episode
+        if episode is None or episode.session_id is None or episode.reset:
+            return None
+        session = self.episodes.sessions.peek(request.policy, episode.session_id)
+        return session if session is not None and session.policy.is_stateful else None
 
     def record_failure(
         self,
@@ -386,7 +406,7 @@ class RequestPath:
             request.received -= request.waited
 
     def _counted_as(self, request: Request, error: RlservoError) -> str:
-        """Return what a failure is counted as: its code, and STRICTER where only the version that was asked is at fault.
+        """Return what a failure is counted as: its code, or STRICTER where the version that was asked is at fault.
 
         Most observations that a version refuses every version would, and they say nothing of it. One that production
         takes does, even where the refusal is what the version's contract says.
