@@ -116,6 +116,16 @@ def test_versions_are_immutable_and_the_next_number_is_found(made: Path, storage
     put(made, storage.uri, "1")  # the same bundle goes on where it was left
 
 
+def test_an_empty_file_of_a_bundle_is_published_with_it(made: Path, storage: Storage, cache: Path) -> None:
+    folder = Path(shutil.copytree(made / "ur5" / "1", cache.parent / "ur5" / "1"))
+    (folder / "notes.txt").touch()
+    with (folder / "SHA256SUMS").open("a") as sums:
+        sums.write(f"{hashlib.sha256().hexdigest()}  notes.txt\n")
+    publish(load_bundle(folder), storage.uri)
+    fetched = fetch(repository(storage, cache))
+    assert (fetched / "notes.txt").read_bytes() == b"" and load_bundle(fetched).digest == load_bundle(folder).digest
+
+
 def test_of_two_publishers_at_once_one_wins_and_what_is_there_is_whole(
     made: Path, storage: Storage, cache: Path
 ) -> None:
