@@ -266,7 +266,8 @@ def wilson(successes: float, trials: float, z: float = Z) -> tuple[float, float]
     share = successes / trials
     centre = (successes + z * z / 2) / (trials + z * z)
     width = z / (trials + z * z) * math.sqrt(trials * share * (1 - share) + z * z / 4)
-    return max(centre - width, 0.0), min(centre + width, 1.0)
+    low = max(centre - width, 0.0) if successes else 0.0  # exactly: the difference leaves 1e-17, which nobody reads
+    return low, min(centre + width, 1.0)
 
 
 def newcombe(
