@@ -392,8 +392,9 @@ def controlled() -> Callable[..., AbstractContextManager[ReplicaVersions]]:
     """Control over what is served of some folders, for an application that can be administered."""
 
     @contextlib.contextmanager
-    def control_of(*folders: Path, config: Any = None) -> Iterator[ReplicaVersions]:
-        control = ReplicaVersions(VersionLoader(Repository(list(folders))), MemoryLedger(), replica="only")
+    def control_of(*folders: Path, config: Any = None, **loader: Any) -> Iterator[ReplicaVersions]:
+        loads = VersionLoader(Repository(list(folders)), **loader)
+        control = ReplicaVersions(loads, MemoryLedger(), replica="only")
         asyncio.run(control.configure({} if config is None else config))
         yield control
 

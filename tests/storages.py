@@ -22,6 +22,9 @@ Lie = Callable[[str, int, dict[str, str], bytes], tuple[int, dict[str, str], byt
 """From a path and what the storage replied to what is sent; None: the connection is closed without a word."""
 
 # Checksums are left out: botocore would see a lie before we do, and not every storage sends them.
+ENDLESS = bytes(1 << 16)
+"""As a reply's body: it is sent again and again, until the client hangs up."""
+MOST_SENT = 96 << 20  # [bytes] and then it ends after all, so that a client without a bound fills no machine's memory
 DROPPED = {"content-length", "connection", "transfer-encoding", "date", "server", "x-amz-checksum-crc32"}
 _buckets = itertools.count(1)
 
@@ -62,6 +65,7 @@ class _Proxy(http.server.ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.upstream = upstream
         self.requests: list[str] = []
+        self.sent = 0  # [bytes] of replies without an end
         self.stopped = threading.Event()
 
     def handle_error(self, *_: Any) -> None:
@@ -86,9 +90,16 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         for name, value in headers.items():
             if name.lower() not in DROPPED:
                 self.send_header(name, value)
-        self.send_header("content-length", str(len(body)))
+        if body is not ENDLESS:
+            self.send_header("content-length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+            return
+        self.close_connection = True  # which is the only end of such a reply
         self.end_headers()
-        self.wfile.write(body)
+        while self.server.sent < MOST_SENT:
+            self.wfile.write(ENDLESS)
+            self.server.sent += len(ENDLESS)
 
     do_GET = do_PUT = do_HEAD = do_POST = do_DELETE = _pass_on
 

@@ -67,6 +67,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "mcap": ("serve_app/recording/log_file.py", "serve_app/recording/reader.py"),
     "pyarrow": ("serve_app/recording/parquet_export.py", "serve_app/recording/lerobot_export.py", "export/"),
     "fsspec": ("serve_app/versions/object_storage.py", "export/checkpoints/remote.py"),
+    "aiohttp": ("serve_app/versions/reply_bound.py",),
     "minari": ("serve_app/recording/minari_export.py",),
     "httpx": (),
     "httpcore": ("serve_app/client/deadline_backend.py", "serve_app/client/http_transport.py"),

@@ -25,6 +25,7 @@ them to exit codes.
     ├── SessionError              session-conflict         a session's requests contradict each other
     │   └── SessionLostError      session-lost             the server has no such session (any more)
     ├── UnavailableError          unavailable              not ready, or the server cannot be reached
+    │   ├── NetworkAwayError      network-away             a version's network is not in memory, nor soon enough
     │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
     │   ├── RateLimitError        rate-limited             the API key asked more often than it may
     │   ├── LateError             late                     the observation waited too long: send a newer one
@@ -182,6 +183,12 @@ class UnavailableError(RlservoError):
 
     code = "unavailable"
     retry_after_s: float | None = None  # [s] after which the server wants to be asked again, where it said so
+
+
+class NetworkAwayError(UnavailableError):
+    """The network of the version that was asked is not in memory, and was not opened, or not in time."""
+
+    code = "network-away"
 
 
 class OverloadedError(UnavailableError):

@@ -336,7 +336,7 @@ class Promotion:
         self._tell(f"{_duration(remaining)} left, {answered}; " + "; ".join(figure.sentence() for figure in figures))
         if certain:
             return Outcome(ROLLED_BACK, "; ".join(certain))
-        if remaining > 0:
+        if remaining > 0 or served.behind:  # what a replica refuses is not promoted: `_watch` has the patience
             return None
         return self._decide(figures, evidence.candidate.asked)
 

@@ -24,7 +24,8 @@ FEWEST_DIFFERENCES = 30  # for the mean of differences, whose interval takes the
 CLIENTS_OWN = frozenset(  # failures that say nothing of the version that was asked
     {
         *("bad-request", "wrong-media-type", "too-large", "unauthenticated", "forbidden", "rate-limited", "idle"),
-        *("session-conflict", "session-lost", "late", "over-capacity", "deadline-passed", "unavailable"),
+        *("bad-observation", "session-conflict", "session-lost", "late", "over-capacity", "deadline-passed"),
+        "unavailable",
     }
 )
 UNITS = {"%": 0.01, "us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0}
@@ -265,7 +266,8 @@ def wilson(successes: float, trials: float, z: float = Z) -> tuple[float, float]
     share = successes / trials
     centre = (successes + z * z / 2) / (trials + z * z)
     width = z / (trials + z * z) * math.sqrt(trials * share * (1 - share) + z * z / 4)
-    return max(centre - width, 0.0), min(centre + width, 1.0)
+    low = max(centre - width, 0.0) if successes else 0.0  # exactly: the difference leaves 1e-17, which nobody reads
+    return low, min(centre + width, 1.0)
 
 
 def newcombe(

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from rlservo.export.contract.bundle import Bundle
-from rlservo.export.contract.errors import BundleError, UnavailableError
+from rlservo.export.contract.errors import BundleError, NetworkAwayError
 from rlservo.serve_app.runtime.loading import open_graph
 
 if TYPE_CHECKING:
@@ -119,12 +119,12 @@ class DroppableNetwork:
         return ort_session.run(names, feed)
 
     def restore(self) -> onnxruntime.InferenceSession:
-        """Open the network unless it is in memory; blocks. Raises UnavailableError."""
+        """Open the network unless it is in memory; blocks. Raises NetworkAwayError."""
         with self._opening:
             ort_session = self._ort_session
             if ort_session is None:
                 if time.monotonic() - self._failed_at < RETRY_S:
-                    raise UnavailableError(self._failure)
+                    raise NetworkAwayError(self._failure)
                 try:
                     ort_session = open_graph(self._bundle, self._threads)
                 except BundleError as error:
@@ -132,7 +132,7 @@ class DroppableNetwork:
                     self._failure = (
                         f"{self.what} is not in memory (network_bytes), and cannot be opened again: {error.message}"
                     )
-                    raise UnavailableError(self._failure) from error
+                    raise NetworkAwayError(self._failure) from error
                 self.used_at = time.monotonic()  # before it can be dropped again
                 self._ort_session = ort_session
                 self.restores += 1

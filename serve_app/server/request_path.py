@@ -12,6 +12,7 @@ queue, its beginning when each of them had arrived at the latest. That is known 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Callable
@@ -28,12 +29,14 @@ from rlservo.export.contract.errors import (
     OverloadedError,
     RequestError,
     RlservoError,
+    SessionError,
     TooLargeError,
     UnavailableError,
 )
 from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import Request, check_deadline
+from rlservo.serve_app.episodes.sessions import Session
 from rlservo.serve_app.episodes.shared_sessions import HOP_TIMEOUT_S, SharedSessions, without_policy
 from rlservo.serve_app.runtime.network_memory import NetworkDroppedError
 from rlservo.serve_app.server.loop_clock import LoopClock
@@ -52,6 +55,8 @@ logger = logging.getLogger(__name__)
 
 HURRY_S = 0.05  # [s] for a body when too many are half sent
 LEAST_WAIT_S = 0.01  # that counts against a deadline: stamps are milliseconds, and so is the way from the proxy
+STRICTER = "stricter-than-production"
+"""Counted for `bad-observation` where the version that production leads to takes the observation."""
 BUG = "the server failed on this request; its log says how"
 
 StoreProvider = Callable[[], PolicyStore | None]
@@ -223,7 +228,8 @@ class RequestPath:
         except ClientGoneError:
             raise
         except RlservoError as error:
-            self.record_failure(request, error.code, error.message, asked=blamed_version(error))
+            asked, counted_as = blamed_version(error), self._counted_as(request, error)
+            self.record_failure(request, error.code, error.message, asked=asked, counted_as=counted_as)
             if self.recorder is not None:
                 self.recorder.note_failure(request, self._store_provider(), error)
             raise
@@ -243,8 +249,8 @@ class RequestPath:
     async def decide(self, request: Request) -> Decision:
         """Decide, unless its deadline has passed; a network that was dropped from memory is opened again first.
 
-        Raises DeadlineError, LateError, TooLargeError, UnavailableError and what `PolicyStore.act` and `Episodes.act`
-        raise.
+        Raises DeadlineError, LateError, SessionError, TooLargeError, UnavailableError and what `PolicyStore.act` and
+        `Episodes.act` raise.
         """
         store, name, obs = self.store(), request.policy, request.obs
         if request.deadline_ms is not None:
@@ -306,24 +312,49 @@ class RequestPath:
     async def _restore(self, dropped: NetworkDroppedError, request: Request, wait_s: float) -> None:
         """Wait for a network that was dropped, until `wait_s` after the request came.
 
-        Raises UnavailableError and DeadlineError.
+        Raises UnavailableError, DeadlineError, and SessionError where its session went on meanwhile: a client that gave
+        up and asked again would have moved the memory twice.
         """
         left_s = wait_s - (time.perf_counter() - request.received)
+        session = self._session_of(request)
+        steps = 0 if session is None else session.steps
         try:
             await self._restorer.restore(dropped.network, max(left_s, 0.0))
-        except UnavailableError as error:
+        except Exception as error:
             blame(error, dropped.network.version)
             raise
         if request.deadline_ms is not None:
             check_deadline(request)
+        if session is None or request.seq is not None:
+            return
+        if self._session_of(request) is not session or session.steps != steps:
+            raise SessionError(
+                "while this request waited for its network, another one of its session was answered: wait for each "
+                "answer, or number the requests ('seq')"
+            )
+
+    def _session_of(self, request: Request) -> Session | None:
+        """Return the memory that a request goes on from, of those under ids here."""
+        episode = request.episode
+        if episode is None or episode.session_id is None or episode.reset:
+            return None
+        session = self.episodes.sessions.peek(request.policy, episode.session_id)
+        return session if session is not None and session.policy.is_stateful else None
 
     def record_failure(
-        self, request: Request, code: str, sentence: str, *, peer: str | None = None, asked: str | None = None
+        self,
+        request: Request,
+        code: str,
+        sentence: str,
+        *,
+        peer: str | None = None,
+        asked: str | None = None,
+        counted_as: str | None = None,
     ) -> None:
         """Count and log a request that got no action; names that are not loaded are not told apart.
 
         `peer` is the address it came from, for the log of what was refused before it was routed; `asked` is the version
-        that was asked and failed, where it came so far.
+        that was asked and failed, where it came so far; `counted_as` is the code in the metrics, where it is another.
         """
         name, version = request.policy, request.version
         store = self._store_provider()
@@ -333,7 +364,7 @@ class RequestPath:
             version = asked
         else:  # an alias is counted as the version it leads to, no version as the default
             version = store.default(name) if version is None else store.version_of(name, version)
-        self.metrics.count_failure(request.protocol, name, version, code)
+        self.metrics.count_failure(request.protocol, name, version, counted_as or code)
         self.log.write_failure(request, code, sentence, peer=peer)
 
     def record_bug(self, request: Request, *, asked: str | None = None) -> None:
@@ -373,6 +404,22 @@ class RequestPath:
         request.received = min(request.received, self.admission.enter(request.waited))
         if request.waited is not None and request.waited > LEAST_WAIT_S:
             request.received -= request.waited
+
+    def _counted_as(self, request: Request, error: RlservoError) -> str:
+        """Return what a failure is counted as: its code, or STRICTER where the version that was asked is at fault.
+
+        Most observations that a version refuses every version would, and they say nothing of it. One that production
+        takes does, even where the refusal is what the version's contract says.
+        """
+        version, store = blamed_version(error), self._store_provider()
+        if version is None or store is None or not isinstance(error, ObservationError):
+            return error.code
+        with contextlib.suppress(RlservoError):
+            production = store.get(request.policy)
+            if production.contract.version != version:
+                production.parse(request.obs)
+                return STRICTER
+        return error.code
 
     async def _decide_non_finite(self, request: Request) -> Decision:
         """Refuse what JSON does not have, by the sentence of the element where it is one of the observation's."""

@@ -6,7 +6,7 @@ import asyncio
 from functools import partial
 from typing import Any
 
-from rlservo.export.contract.errors import UnavailableError
+from rlservo.export.contract.errors import NetworkAwayError, UnavailableError
 from rlservo.serve_app.runtime.network_memory import DroppableNetwork
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 
@@ -22,7 +22,11 @@ class NetworkRestorer:
         self._tasks: dict[DroppableNetwork, asyncio.Task[Any]] = {}
 
     async def restore(self, network: DroppableNetwork, patience_s: float) -> None:
-        """Return when the network is in memory. Raises UnavailableError; after `patience_s` the opening goes on."""
+        """Return when the network is in memory.
+
+        Raises NetworkAwayError; after `patience_s`, when the opening goes on, too. Raises UnavailableError where too
+        many others come first.
+        """
         task = self._tasks.get(network)
         if task is None:
             if len(self._tasks) >= MOST:  # nobody's turn comes after hundreds that nobody waits for any more
@@ -33,7 +37,7 @@ class NetworkRestorer:
             task.add_done_callback(partial(self._end, network))
         done, _ = await asyncio.wait([task], timeout=patience_s)
         if not done:
-            raise UnavailableError(
+            raise NetworkAwayError(
                 f"{network.what} was not in memory (network_bytes), and is being opened again: try again shortly"
             )
         task.result()

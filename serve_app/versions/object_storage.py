@@ -16,10 +16,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from rlservo.export.contract.errors import UnavailableError, UsageError, first_line
+from rlservo.export.contract.errors import BundleError, UnavailableError, UsageError, first_line
+from rlservo.serve_app.versions.reply_bound import bound_aiohttp, bounded_replies
 
 logger = logging.getLogger(__name__)
 
+BESIDE = 1 << 16  # [bytes] that a call's replies may bring beside what was asked for: metadata, errors
+LISTING = 32 << 20  # [bytes] of a folder's list: S3 describes 70,000 versions of a policy in it
 BLOCK = 8 << 20  # [bytes] asked for at once; each has the time-out for itself
 SLOWEST = 256 << 10  # [bytes/s] by which a larger block may take longer than the time-out
 SILENCE_S = 10.0  # [s] after which it is said what is waited for
@@ -77,23 +80,32 @@ class ObjectStorage:
         filesystem, _ = self._open()
         filesystem.invalidate_cache()
         try:
-            entries = self._call(name, "ls", self._path(name) + "/" * self.is_read_only, detail=True)
+            entries = self._call(name, "ls", self._path(name) + "/" * self.is_read_only, detail=True, most=LISTING)
         except FileNotFoundError:
             return {}
         return {entry["name"].rstrip("/").rpartition("/")[2]: _stamp(entry) for entry in entries}
 
     def read(self, name: str, most: int) -> bytes:
-        """Return at most `most` bytes of an object. Raises FileNotFoundError, UnavailableError."""
-        content: bytes = self._call(name, "cat_file", self._path(name), start=0, end=most, size=most)
+        """Return at most `most` bytes of an object.
+
+        Raises FileNotFoundError, UnavailableError, and BundleError where the storage sends more.
+        """
+        content: bytes = self._call(name, "cat_file", self._path(name), start=0, end=most, size=most, most=most)
         return content[:most]
 
     def blocks(self, name: str, size: int) -> Iterator[bytes]:
-        """Yield the `size` bytes that an object should have. Raises FileNotFoundError, UnavailableError."""
+        """Yield the `size` bytes that an object should have.
+
+        Raises FileNotFoundError, UnavailableError, and BundleError where the storage sends more.
+        """
         done = 0
         while done < size:
             wanted = min(BLOCK, size - done)
-            block = self._call(name, "cat_file", self._path(name), start=done, end=done + wanted, size=wanted)
-            if done == 0 and len(block) >= size:  # the server knows no ranges
+            most = wanted if done else size  # a server that knows no ranges sends all of it at once
+            block = self._call(
+                name, "cat_file", self._path(name), start=done, end=done + wanted, size=wanted, most=most
+            )
+            if done == 0 and len(block) >= size:
                 block = block[:size]
             elif len(block) != wanted:
                 raise UnavailableError(f"{self.uri}/{name} ends after {done + len(block):,} of {size:,} bytes")
@@ -133,21 +145,31 @@ class ObjectStorage:
                     f"{self.uri} cannot be opened here: pip install 'rlservo[remote]' for s3:// and http(s)://; other "
                     f"protocols need fsspec's package for them ({first_line(error)})"
                 ) from None
+            bound_aiohttp()
             self._opened = filesystem, root.rstrip("/")
         return self._opened
 
-    def _call(self, name: str, method: str, *arguments: Any, size: int = 0, **options: Any) -> Any:
+    def _call(self, name: str, method: str, *arguments: Any, size: int = 0, most: int = 0, **options: Any) -> Any:
+        """Call the file system, which may send or get `size` bytes and read `most`."""
         filesystem, _ = self._open()
         timeout_s = self._timeout_s + size / SLOWEST
         if filesystem.async_impl:
             options["timeout"] = timeout_s
         place = f"{self.uri}/{name}".rstrip("/")
-        try:
-            return getattr(filesystem, method)(*arguments, **options)
-        except (FileNotFoundError, FileExistsError):
-            raise
-        except Exception as error:  # each file system has errors of its own
-            raise UnavailableError(f"{place} {_reason(error, timeout_s)}") from None
+        with bounded_replies(most + BESIDE) as bound:
+            try:
+                reply = getattr(filesystem, method)(*arguments, **options)
+            except (FileNotFoundError, FileExistsError):
+                if not bound.is_exceeded:
+                    raise
+            except Exception as error:  # each file system has errors of its own
+                if not bound.is_exceeded:
+                    raise UnavailableError(f"{place} {_reason(error, timeout_s)}") from None
+            else:
+                if not bound.is_exceeded:
+                    return reply
+        kind = BundleError if method == "cat_file" else UnavailableError
+        raise kind(f"{place}: the storage sends more than the {most:,} bytes that it may")
 
 
 def _reason(error: Exception, timeout_s: float) -> str:

@@ -96,6 +96,9 @@ def _publish_to_storage(
             progress(f"{storage.uri}/{folder}/{name}")
             content = (bundle.path / name).read_bytes()
             written = f"{folder}/{name}"
+            if not content:  # storages refuse to read a range of nothing, and whoever fetches does not ask for it
+                storage.create(written, content)
+                continue
             there = _is_there(storage, written, content)
             if there is None:
                 storage.create(written, content)

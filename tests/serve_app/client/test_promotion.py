@@ -6,12 +6,14 @@ import errno
 import http.client
 import itertools
 import json
+import math
 import os
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import register, registry
 
-from rlservo.export.contract.errors import UnavailableError, UsageError
+from rlservo.export.contract.errors import BundleError, ObservationError, UnavailableError, UsageError
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.promotion import (
@@ -38,11 +40,13 @@ from rlservo.serve_app.client.promotion_counts import Counts
 from rlservo.serve_app.client.promotion_log import PromotionLog
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.rollout.control_loop import rollout
+from rlservo.serve_app.runtime import network_memory
+from rlservo.serve_app.runtime.network_memory import NetworkMemory
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions, VersionState
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 KEY, LINE = new_key("boss", admin=True)
@@ -89,7 +93,7 @@ def running(
     root = tmp_path_factory.mktemp("promotion")
     for version, seed, scale in (("1", 0, 1.0), ("2", 0, 1.0), ("3", 0, 400.0), ("4", 7, 1.0)):
         box_policy(root, version=version, seed=seed, action_scale=scale)
-    with controlled(root, config=CONFIG) as control:
+    with controlled(root, config=CONFIG, load=partial(Policy.load, memory=NetworkMemory(1 << 30))) as control:
         settings = ServerSettings(operator_key=LINE.split()[-1])
         app = create_app(lambda: control.store, settings, replica="only", control=control)
         with served(app) as port:
@@ -397,6 +401,76 @@ def test_a_bug_in_a_canary_is_its_own(server: Server, monkeypatch: pytest.Monkey
     monkeypatch.setattr(Policy, "step", lambda *_, **__: 1 / 0)
     server.ask(3)
     assert server.core.metrics.counts("ur5")["2"].failed["internal"] == failed + 3
+
+
+def test_a_canary_whose_network_cannot_be_opened_is_rolled_back(
+    run: Any, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> Any:
+        raise BundleError("policy.onnx is gone")
+
+    monkeypatch.setattr(network_memory, "open_graph", fail)
+    assert server.control.store is not None
+    network = server.control.store.get("ur5", "2").droppable
+    assert network is not None
+    promotion = run("2", seconds=1000 * EVERY_S)
+    try:
+        outcome = promotion(network.drop, lambda: server.ask(20))
+    finally:
+        monkeypatch.undo()
+        monkeypatch.setattr(network_memory, "RETRY_S", 0.0)
+        network.restore()
+    assert outcome.outcome == ROLLED_BACK and "requests failed by network-away" in outcome.why, outcome
+
+
+def test_what_robots_send_wrong_is_not_the_canarys(run: Any, server: Server) -> None:
+    def ask_wrongly() -> None:
+        server.ask(20, obs=OBS[1:])
+        server.ask(20, obs=[*OBS[1:], math.nan])
+        server.ask(20, obs=OBS, no_such_field=1)
+        server.ask(20, obs=OBS, deadline_ms=1e-6)
+
+    outcome = run("2", share=1.0)(lambda: server.ask(40), ask_wrongly)
+    assert outcome.outcome == PROMOTED, outcome
+    failed = server.core.metrics.counts("ur5")["2"].failed
+    assert failed["bad-observation"] >= 20  # it is counted, and not held against it
+
+
+def test_a_canary_that_refuses_what_production_takes_is_rolled_back(
+    run: Any, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = Policy.step
+
+    def refuse(policy: Policy, *given: Any, **named: Any) -> Any:
+        if policy.contract.version == "2":
+            raise ObservationError("element 0 is outside the observation space")
+        return step(policy, *given, **named)
+
+    monkeypatch.setattr(Policy, "step", refuse)
+    outcome = run("2", seconds=1000 * EVERY_S)(lambda: server.ask(20))
+    assert outcome.outcome == ROLLED_BACK and "requests failed by stricter-than-production" in outcome.why, outcome
+
+
+@pytest.mark.parametrize("follows", [True, False])
+def test_what_a_replica_cannot_serve_is_not_promoted(
+    follows: bool, run: Any, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = server.control.states
+
+    def states() -> Any:
+        return {"ur5": {**own()["ur5"], "2": VersionState("failed", "its golden vectors differ")}}
+
+    def fall_behind() -> None:
+        server.ask(60)
+        monkeypatch.setattr(server.control, "states", states)
+
+    waits: list[Callable[[], object]] = [lambda: None] * 4  # one more than the time that it has
+    outcome = run("2")(fall_behind, *waits, *([monkeypatch.undo] if follows else []))
+    if follows:
+        assert outcome.outcome == PROMOTED, outcome
+    else:
+        assert (outcome.outcome, server.plan.default) == (ROLLED_BACK, "1"), outcome
+        assert "not every replica can serve it: replica only: version 2: its golden vectors differ" in outcome.why
 
 
 def test_a_policy_that_is_unloaded_stops_it(run: Any, server: Server) -> None:

@@ -94,6 +94,10 @@ def test_intervals_are_those_of_the_papers() -> None:
     )  # fmt: skip
 
 
+def test_of_no_failures_the_interval_begins_at_zero() -> None:
+    assert "99.7% interval 0% to" in figure("error_rate>1%", latency=[766, 0, 0, 0, 0, 0]).sentence()
+
+
 def test_a_single_failure_decides_nothing_and_many_decide_at_once() -> None:
     one = figure("error_rate>0.1%", latency=[4, 0, 0, 0, 0, 0], failed={"unsafe-action": 1})
     assert one.is_beyond and not one.is_certain and not one.is_enough

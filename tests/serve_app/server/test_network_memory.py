@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import UnavailableError
+from rlservo.export.contract.errors import SessionError, UnavailableError
 from rlservo.serve_app.episodes.request import Episode, Request
 from rlservo.serve_app.runtime import network_memory
 from rlservo.serve_app.runtime.network_memory import DroppableNetwork
@@ -201,6 +201,47 @@ def test_files_that_hang_hold_up_only_those_who_wait_for_them(folder: Path, monk
                 assert time.monotonic() < deadline
 
     assert asyncio.run(run()).name == "c" and len(calls) == 1
+
+
+@pytest.mark.parametrize("shared", [False, True], ids=["alone", "another replica's"])
+@pytest.mark.parametrize("again", ["step", "reset"])
+def test_of_requests_of_a_session_that_wait_for_a_network_one_moves_its_memory(
+    shared: bool, again: str, core: Core, folder: Path
+) -> None:
+    """A client gives up while its step waits, and asks again: with a number the same answer, without one a refusal."""
+    if shared:
+        cluster = Cluster()
+        core.share_sessions(cluster, cluster)
+
+    async def ask(row: int, **more: Any) -> Any:
+        step = request(LIMITED, OBS[row], episode=Episode(session_id="arm", reset=more.pop("reset", False)), **more)
+        session = core.episodes.sessions.peek(LIMITED, "arm")
+        if not shared or session is None or step.episode is None or step.episode.reset:
+            return await core.decide(step)
+        answer = await core.answer_peer("act", step, session.token)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    async def run() -> None:
+        await ask(0, reset=True)
+        drop(core, LIMITED)
+        told = await asyncio.gather(ask(1, seq=1), ask(1, seq=1))
+        np.testing.assert_array_equal(told[0].action, told[1].action)
+        drop(core, LIMITED)
+        if again == "step":
+            first, second = await asyncio.gather(ask(2), ask(2), return_exceptions=True)
+        else:
+            first, second = await asyncio.gather(ask(3, reset=True), ask(3), return_exceptions=True)
+        assert isinstance(second, SessionError) and "another one of its session was answered" in second.message
+        answer = await ask(4)
+        with Policy.load(folder / LIMITED / "1", options=OPTIONS[LIMITED]) as alone:
+            for row in (0, 1, 2) if again == "step" else (3,):
+                expected = alone.act(OBS[row])
+            np.testing.assert_array_equal(first.action, expected)
+            np.testing.assert_array_equal(answer.action, alone.act(OBS[4]))
+
+    asyncio.run(run())
 
 
 class Cluster:

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ from rlservo.serve_app.versions.publication import next_version, publish
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
-from storages import SECRET, Lie, Storage, late, only
+from storages import ENDLESS, MOST_SENT, SECRET, Lie, Storage, late, only
 from stores import MemoryLedger
 
 ALL = ServedConfig()
@@ -115,6 +116,16 @@ def test_versions_are_immutable_and_the_next_number_is_found(made: Path, storage
     put(made, storage.uri, "1")  # the same bundle goes on where it was left
 
 
+def test_an_empty_file_of_a_bundle_is_published_with_it(made: Path, storage: Storage, cache: Path) -> None:
+    folder = Path(shutil.copytree(made / "ur5" / "1", cache.parent / "ur5" / "1"))
+    (folder / "notes.txt").touch()
+    with (folder / "SHA256SUMS").open("a") as sums:
+        sums.write(f"{hashlib.sha256().hexdigest()}  notes.txt\n")
+    publish(load_bundle(folder), storage.uri)
+    fetched = fetch(repository(storage, cache))
+    assert (fetched / "notes.txt").read_bytes() == b"" and load_bundle(fetched).digest == load_bundle(folder).digest
+
+
 def test_of_two_publishers_at_once_one_wins_and_what_is_there_is_whole(
     made: Path, storage: Storage, cache: Path
 ) -> None:
@@ -156,6 +167,10 @@ def truncated(_path: str, status: int, headers: dict[str, str], body: bytes) -> 
     return status, headers, body[: len(body) // 2]
 
 
+def endless(*_: Any) -> Any:
+    return 200, {}, ENDLESS
+
+
 def busy(*_: Any) -> Any:
     return (
         503,
@@ -183,6 +198,19 @@ LIES: dict[str, tuple[Lie, str]] = {
         r"/policies/ur5/2 lacks a file that its manifest lists",
     ),
     "garbled manifest": (only("2.json", lambda p, s, h, b: (s, h, b[:100])), r"/policies/ur5/2\.json is no manifest"),
+    "endless object": (
+        only("2/policy.onnx", endless),
+        r"/policies/ur5/2/policy\.onnx: the storage sends more than the [\d,]+ bytes that it may$",
+    ),
+    "endless manifest": (only("2.json", endless), r"/policies/ur5/2\.json: the storage sends more than the 65,537 b"),
+    "endless refusal": (
+        only("2/policy.onnx", lambda *reply: (403, *endless(*reply)[1:])),
+        r"/policies/ur5/2/policy\.onnx: the storage sends more than",
+    ),
+    "endless list": (
+        lambda path, *reply: endless(path, *reply) if "list-type" in path else reply,
+        r"/policies: the storage sends more than the 33,554,432 bytes that it may$",
+    ),
     "list is 503": (lambda path, *r: busy() if "list-type" in path else r, r"/policies cannot be reached or read"),
 }
 
@@ -203,6 +231,7 @@ def test_a_storage_that_lies_is_told_in_a_sentence_and_what_runs_goes_on(
             await control.load("ur5", "2", what="load")
         assert "xxxx" not in caught.value.message and "AKIA" not in caught.value.message
         assert SECRET not in caught.value.message
+        assert storage.proxy.sent < MOST_SENT  # who asked has hung up
         assert control.store is not None and control.store.versions("ur5") == ("1",)
         storage.tell(None)
         await control.load("ur5", "2", what="load")
@@ -556,6 +585,45 @@ def shown(folder: Path) -> Iterator[str]:
     finally:
         server.shutdown()
         server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("place", "is_packed"), [("/ur5/", True), ("/ur5/1.json", False), ("/ur5/1/policy.onnx", False)]
+)
+def test_a_web_server_that_sends_more_than_it_may_is_left(
+    place: str, is_packed: bool, made: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = cache.parent / "published"
+    put(made, str(folder), "1")
+    digest = load_bundle(made / "ur5" / "1").digest
+    page = zlib.compress(bytes(MOST_SENT), 1)
+
+    def do_get(self: http.server.SimpleHTTPRequestHandler) -> None:
+        if self.path != place:
+            honest(self)
+            return
+        self.send_response(200)
+        self.send_header("content-type", "text/html")
+        if is_packed:
+            self.send_header("content-encoding", "deflate")
+        self.end_headers()
+        with contextlib.suppress(ConnectionError):
+            for _ in range(1 if is_packed else MOST_SENT // len(ENDLESS)):
+                self.wfile.write(page if is_packed else ENDLESS)
+            ended.append(self.path)
+
+    honest, ended = http.server.SimpleHTTPRequestHandler.do_GET, list[str]()
+    monkeypatch.setattr(http.server.SimpleHTTPRequestHandler, "do_GET", do_get)
+    with shown(folder) as url:
+        held = Repository([url], cache=cache, storage_timeout_s=10)
+        what = f"{place.rstrip('/')}: the storage sends more than"
+        if place.endswith("onnx"):
+            with pytest.raises(BundleError, match=what):
+                held.fetch("ur5", "1", digest)
+        else:
+            digests, errors = held.look()
+            assert digests == {} and what in str(errors[0])
+    assert is_packed or not ended
 
 
 async def until(condition: Callable[[], bool]) -> None:
