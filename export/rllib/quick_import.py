@@ -101,7 +101,8 @@ class _Finder:
         spec = PathFinder.find_spec(name, path, target)
         if spec is None or spec.loader is None or not spec.has_location or spec.submodule_search_locations is None:
             return spec  # a module, not a package
-        spec.loader = _Loader(spec.loader, self)
+        loader: Any = _Loader(spec.loader, self)
+        spec.loader = loader
         return spec
 
 
@@ -121,7 +122,7 @@ class _Loader:
         assert spec is not None
         spec.loader = module.__loader__ = self._loader
         spec.loader_state = self._finder
-        module.__class__ = _DeferredPackage
+        _set_class(module, _DeferredPackage)
 
 
 class _DeferredPackage(ModuleType):
@@ -152,10 +153,14 @@ def _run_above(name: str) -> None:
 def _run(package: ModuleType) -> None:
     if not isinstance(package, _DeferredPackage):
         return
-    package.__class__ = ModuleType
+    _set_class(package, ModuleType)
     spec: Any = package.__spec__
     try:
         spec.loader.exec_module(package)
     except BaseException:
-        package.__class__ = _DeferredPackage  # whoever asks next sees the reason as well
+        _set_class(package, _DeferredPackage)  # whoever asks next sees the reason as well
         raise
+
+
+def _set_class(module: Any, kind: type[ModuleType]) -> None:
+    module.__class__ = kind
