@@ -5,6 +5,7 @@ Heavy libraries are imported by the command that needs them, so that `rlservo in
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import sys
@@ -42,6 +43,8 @@ def main() -> None:
     # By Python's own threshold a collection comes every 700 new objects and walks all that torch and RLlib have made:
     # an eighth of the time of an export.
     gc.set_threshold(100_000, 20, 20)
+    # And as Python ends, collections walk all of it again to free what ends with the process: half a second.
+    atexit.register(gc.freeze)
     try:
         app()
     except RlservoError as error:

@@ -51,6 +51,9 @@ def export(
         raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
     with terminal.errors().status("importing") as status, ExitStack() as fetching:
         with needs_extra("train"):
+            from rlservo.export.rllib import quick_import
+
+            quick_import.prepare()
             from rlservo.export.checkpoints.experiment import best_checkpoint
             from rlservo.export.checkpoints.remote import fetch
             from rlservo.export.commands.export import LOADING_RUNS_CODE, export_all_modules, export_checkpoint

@@ -19,7 +19,6 @@ import numpy as np
 import ray
 import torch
 from numpy.typing import NDArray
-from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.connectors.env_to_module.env_to_module_pipeline import EnvToModulePipeline
 from ray.rllib.connectors.module_to_env.module_to_env_pipeline import ModuleToEnvPipeline
 from ray.rllib.core.columns import Columns
@@ -254,6 +253,9 @@ def _build_pipelines(files: CheckpointFiles, module: Any, notify: Callable[[str]
 
     From the algorithm's configuration; of a module alone, RLlib's default ones around the module's own spaces.
     """
+    # Here and not at the top: it imports every algorithm, and few checkpoints need it.
+    from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+
     config: Any = AlgorithmConfig()
     if files.alone:
         notify(

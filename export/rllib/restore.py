@@ -8,6 +8,7 @@ from pathlib import Path
 from rlservo.export.checkpoints.location import Files
 from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.recipe.describe import unexpected_steps
+from rlservo.export.rllib import quick_import
 from rlservo.export.rllib.restored_policy import RestoredPolicy
 
 
@@ -23,6 +24,7 @@ def restore(files: Files, app_dir: Path, notify: Callable[[str], None], *, value
 
         restored = restore_old_stack(files, app_dir, notify, value=value)
     else:
+        quick_import.import_needed()
         from rlservo.export.rllib.new_stack import restore_new_stack
 
         restored = restore_new_stack(files, notify, value=value)

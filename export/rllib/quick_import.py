@@ -1,0 +1,166 @@
+"""Imports of torch and RLlib in less time, for a process that only restores a checkpoint.
+
+The `__init__` of nearly every package of Ray's imports all modules below it, so that one RLModule brings Tune, Train,
+Data, pandas and every algorithm (ray 2.60): 1.2 s of processor time for nothing. While this module imports what any
+checkpoint of the new API stack needs, such packages are made without running their `__init__`. It runs later, before
+those below it as usual, when a name of the package or another module below it is asked for: nothing is left out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+DEFERRED = ("ray.rllib", "ray.tune", "ray.train", "ray.data", "ray.air")
+"""These packages, and those below them, are deferred."""
+AT_ONCE = ("ray.rllib.connectors", "ray.rllib.core")
+"""But not these: a checkpoint's pipelines and networks name any module of theirs."""
+ELSEWHERE = {
+    ("ray.train", "Checkpoint"): "ray.train._checkpoint",
+    ("ray.tune", "Checkpoint"): "ray.tune.trainable.trainable_fn_utils",
+}
+"""The modules that define names which RLlib asks deferred packages for, to tell a checkpoint from a path (ray 2.60)."""
+NEEDED = (
+    "rlservo.export.rllib.new_stack",  # and what it imports of RLlib's
+    "ray.rllib.connectors.env_to_module",
+    "ray.rllib.connectors.module_to_env",
+    "ray.rllib.core.models.torch.encoder",
+    "ray.rllib.core.models.torch.heads",
+    "ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module",
+)
+"""Imported while packages are deferred: what a checkpoint of PPO's default module names, or its pipelines."""
+_TORCH_LIBRARY = "lib/libtorch_python.so"
+
+
+def prepare() -> None:
+    """Let this process import less from now on; for a program of ours, as it changes how Ray's packages load.
+
+    torch's shared libraries are mapped beside whatever is imported next, which takes none of Python's lock: a quarter
+    of a second of torch's import.
+    """
+    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Finder())
+    if "torch" not in sys.modules:
+        # Not a daemon: a process that ends at once, for a wrong path, must not end in the middle of this.
+        threading.Thread(target=_load_torch_library, name="torch-library").start()
+
+
+def _load_torch_library() -> None:
+    """Map torch's libraries. Where they are elsewhere or cannot be loaded, torch's own import finds out and says so."""
+    spec = find_spec("torch")
+    for folder in (spec and spec.submodule_search_locations) or ():
+        with contextlib.suppress(OSError):
+            ctypes.CDLL(str(Path(folder, _TORCH_LIBRARY)))
+
+
+def import_needed() -> None:
+    """Import what restoring takes, and little else, in a process that was prepared for it.
+
+    Where another version of RLlib cannot be imported so, it is imported as usual.
+    """
+    finder = next((finder for finder in sys.meta_path if isinstance(finder, _Finder)), None)
+    if finder is None or "ray.rllib" in sys.modules:
+        return
+    with finder.deferring(), contextlib.suppress(ImportError):
+        for name in NEEDED:
+            importlib.import_module(name)
+
+
+class _Finder:
+    """Finds Ray's packages as Python does, and defers them; later, runs what was deferred above a module first."""
+
+    def __init__(self) -> None:
+        self.is_deferring = False
+
+    @contextlib.contextmanager
+    def deferring(self) -> Iterator[None]:
+        """Defer packages that are found meanwhile."""
+        self.is_deferring = True
+        try:
+            yield
+        finally:
+            self.is_deferring = False
+
+    def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        if not name.startswith(DEFERRED):
+            return None
+        if not self.is_deferring:
+            _run_above(name)
+            return None
+        if name.startswith(AT_ONCE):
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is None or spec.loader is None or not spec.has_location or spec.submodule_search_locations is None:
+            return spec  # a module, not a package
+        loader: Any = _Loader(spec.loader, self)
+        spec.loader = loader
+        return spec
+
+
+class _Loader:
+    """Makes a package's module and leaves running its `__init__` to the first use."""
+
+    def __init__(self, loader: Any, finder: _Finder) -> None:
+        self._loader = loader
+        self._finder = finder
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        module: ModuleType | None = self._loader.create_module(spec)
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        spec = module.__spec__
+        assert spec is not None
+        spec.loader = module.__loader__ = self._loader
+        spec.loader_state = self._finder
+        _set_class(module, _DeferredPackage)
+
+
+class _DeferredPackage(ModuleType):
+    """A package whose `__init__` has not run: it does when a name is asked for that no import has set."""
+
+    def __getattr__(self, name: str) -> Any:
+        spec: Any = self.__spec__
+        if spec.loader_state.is_deferring:
+            if home := ELSEWHERE.get((self.__name__, name)):
+                return getattr(importlib.import_module(home), name)
+        elif name == "__warningregistry__":  # unittest and others ask every module there is
+            raise AttributeError(name)
+        else:
+            _run_above(self.__name__)
+        _run(self)
+        return getattr(self, name)
+
+
+def _run_above(name: str) -> None:
+    """Run what was deferred above a module, outermost first, as importing it does otherwise."""
+    parts = name.split(".")
+    for count in range(1, len(parts)):
+        package = sys.modules.get(".".join(parts[:count]))
+        if isinstance(package, _DeferredPackage):
+            _run(package)
+
+
+def _run(package: ModuleType) -> None:
+    if not isinstance(package, _DeferredPackage):
+        return
+    _set_class(package, ModuleType)
+    spec: Any = package.__spec__
+    try:
+        spec.loader.exec_module(package)
+    except BaseException:
+        _set_class(package, _DeferredPackage)  # whoever asks next sees the reason as well
+        raise
+
+
+def _set_class(module: Any, kind: type[ModuleType]) -> None:
+    module.__class__ = kind
