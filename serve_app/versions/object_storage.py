@@ -156,7 +156,7 @@ class ObjectStorage:
         if filesystem.async_impl:
             options["timeout"] = timeout_s
         place = f"{self.uri}/{name}".rstrip("/")
-        with bounded_replies(most + BESIDE) as bound:
+        with bounded_replies(most + BESIDE, of_all=method == "ls") as bound:  # of which pages may come without end
             try:
                 reply = getattr(filesystem, method)(*arguments, **options)
             except (FileNotFoundError, FileExistsError):
