@@ -22,7 +22,7 @@ from rlservo.serve_app.versions.reply_bound import bound_aiohttp, bounded_replie
 logger = logging.getLogger(__name__)
 
 BESIDE = 1 << 16  # [bytes] that a call's replies may bring beside what was asked for: metadata, errors
-LISTING = 32 << 20  # [bytes] of a folder's list: S3 describes 70,000 versions of a policy in it
+LISTING = 32 << 20  # [bytes] of a folder's list: S3 sends some 324 for each version of a policy
 BLOCK = 8 << 20  # [bytes] asked for at once; each has the time-out for itself
 SLOWEST = 256 << 10  # [bytes/s] by which a larger block may take longer than the time-out
 SILENCE_S = 10.0  # [s] after which it is said what is waited for
@@ -156,7 +156,7 @@ class ObjectStorage:
         if filesystem.async_impl:
             options["timeout"] = timeout_s
         place = f"{self.uri}/{name}".rstrip("/")
-        with bounded_replies(most + BESIDE) as bound:
+        with bounded_replies(most + BESIDE, of_all=method == "ls") as bound:  # of which pages may come without end
             try:
                 reply = getattr(filesystem, method)(*arguments, **options)
             except (FileNotFoundError, FileExistsError):

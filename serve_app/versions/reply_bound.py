@@ -20,20 +20,22 @@ class TooMuchError(Exception):
 
 
 class ReplyBound:
-    """Bytes that the replies of one call may still bring."""
+    """Bytes that each reply of a call may bring (it may be asked again, after a connection broke), or all together."""
 
-    def __init__(self, most: int) -> None:
-        self._left = most
-
-    @property
-    def is_exceeded(self) -> bool:
+    def __init__(self, most: int, *, of_all: bool) -> None:
+        self._most = self._left = most
+        self._of_all = of_all
+        self._reader: object = None
+        self.is_exceeded = False
         """Whether more came; the error itself may have been wrapped by whoever read."""
-        return self._left < 0
 
-    def spend(self, size: int) -> None:
-        """Count bytes that came. Raises TooMuchError."""
+    def spend(self, reader: object, size: int) -> None:
+        """Count bytes of a reply. Raises TooMuchError."""
+        if reader is not self._reader and not self._of_all:
+            self._reader, self._left = reader, self._most
         self._left -= size
         if self._left < 0:
+            self.is_exceeded = True
             raise TooMuchError
 
 
@@ -41,9 +43,9 @@ _bound: ContextVar[ReplyBound | None] = ContextVar("reply_bound", default=None)
 
 
 @contextlib.contextmanager
-def bounded_replies(most: int) -> Iterator[ReplyBound]:
+def bounded_replies(most: int, *, of_all: bool) -> Iterator[ReplyBound]:
     """Bound what is read inside, in this thread and in the tasks that fsspec begins for it."""
-    bound = ReplyBound(most)
+    bound = ReplyBound(most, of_all=of_all)
     token = _bound.set(bound)
     try:
         yield bound
@@ -66,7 +68,7 @@ def bound_aiohttp() -> None:
             return await read_of_aiohttp(self, n)
         pieces = []
         while piece := await read_of_aiohttp(self, PIECE if n < 0 else n):
-            bound.spend(len(piece))
+            bound.spend(self, len(piece))
             pieces.append(piece)
             if n >= 0:
                 break

@@ -44,7 +44,7 @@ from rlservo.serve_app.versions.publication import next_version, publish
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
-from storages import ENDLESS, MOST_SENT, SECRET, Lie, Storage, late, only
+from storages import ENDLESS, MOST_SENT, SECRET, Cut, Lie, Storage, late, only
 from stores import MemoryLedger
 
 ALL = ServedConfig()
@@ -114,6 +114,14 @@ def test_versions_are_immutable_and_the_next_number_is_found(made: Path, storage
     with pytest.raises(ConflictError, match=r"ur5/1/SHA256SUMS holds another file than .* published by somebody else"):
         publish(load_bundle(made / "other" / "ur5" / "1"), storage.uri)
     put(made, storage.uri, "1")  # the same bundle goes on where it was left
+
+
+def test_an_object_is_read_again_after_its_connection_broke(made: Path, storage: Storage, cache: Path) -> None:
+    put(made, storage.uri, "1")
+    replies = iter([True, True])
+    storage.tell(only("1/policy.onnx", lambda _, status, heads, b: (status, heads, Cut(b) if next(replies, 0) else b)))
+    assert load_bundle(fetch(repository(storage, cache))).digest == load_bundle(made / "ur5" / "1").digest
+    assert next(replies, None) is None
 
 
 def test_an_empty_file_of_a_bundle_is_published_with_it(made: Path, storage: Storage, cache: Path) -> None:
