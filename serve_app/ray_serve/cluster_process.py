@@ -7,6 +7,7 @@ everything down when its standard input ends: because the launcher closed it, or
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import os
@@ -29,6 +30,7 @@ CHECK_PERIOD_S = 0.5  # between checks of whether Ray's own processes live
 ORDERLY_END_S = 25.0  # [s] less than the launcher waits
 LOG_CHECK_PERIOD_S = 60.0
 AGENT_PORT = re.compile(r"(--runtime[-_]env[-_]agent[-_]port)=0\b")
+REGISTRATION_S = 10.0  # [s] to look often for the raylet; then Ray looks once a second, as it does without us
 OBJECT_STORE_BYTES = 80 << 20  # Ray's least is 75 MiB; requests do not go through it
 
 
@@ -49,6 +51,7 @@ def main() -> int:
         from rlservo.serve_app.ray_serve import app
 
         _leave_out_extras()
+        _poll_for_node()
         ray.init(
             address="local",  # whatever RAY_ADDRESS or a running cluster says
             num_cpus=max(1, plan["replicas"]),
@@ -107,7 +110,31 @@ def _leave_out_extras() -> None:
     services = ray_parts.find("ray._private.services")
     if ray_parts.is_there("ray._private.services:start_api_server"):
         services.start_api_server = lambda *_, **__: ("", None)  # address and process of none
+    if ray_parts.is_there("ray._private.utils:get_dashboard_dependency_error"):
+        # It imports aiohttp, OpenCensus and more to see whether the agent could be complete.
+        ray_parts.find("ray._private.utils").get_dashboard_dependency_error = lambda: None
     leave_out_agent()
+
+
+def _poll_for_node() -> None:
+    """Let `ray.init` find its raylet when it is there: Ray (2.60) looks after 0.1 s, often in vain, and then 1 s later.
+
+    Where these private names have moved (`ray_parts.SPARED`), that second stays.
+    """
+    if not ray_parts.is_there("ray._private.services:get_node"):
+        return
+    services = ray_parts.find("ray._private.services")
+    get_node: Any = services.get_node
+
+    def poll(address: str, node: str) -> Any:
+        until = time.monotonic() + REGISTRATION_S
+        with contextlib.suppress(Exception):  # Ray's own look finds out what is wrong
+            client = ray_parts.find("ray._raylet:GcsClient")(address=address)
+            while node not in {one.hex() for one in client.get_all_node_info(timeout=1)} and time.monotonic() < until:
+                time.sleep(0.02)
+        return get_node(address, node)
+
+    services.get_node = poll
 
 
 def leave_out_agent() -> None:

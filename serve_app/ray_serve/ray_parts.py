@@ -42,6 +42,8 @@ SPARED = (
     "ray.serve._private.replica:Replica._stop_accepting_direct_ingress",
     "ray._private.parameter:RayParams",
     "ray._private.services:start_api_server",
+    "ray._private.utils:get_dashboard_dependency_error",
+    "ray._private.services:get_node",
 )
 """Without one of these the server is slower or larger, and as correct."""
 

@@ -66,6 +66,23 @@ def test_without_the_switches_of_what_nobody_uses_everything_starts(monkeypatch:
     assert started == [["gcs_server"]]
 
 
+def test_the_raylet_is_looked_for_until_it_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    services: Any = importlib.import_module("ray._private.services")
+    looks: list[dict[Any, str]] = [{}, {}, {bytes.fromhex("a1"): "another"}, {bytes.fromhex("b2"): "this one"}]
+
+    class Client:
+        def __init__(self, address: str) -> None:
+            assert address == "127.0.0.1:1"
+
+        def get_all_node_info(self, timeout: float) -> dict[Any, str]:
+            return looks.pop(0)
+
+    monkeypatch.setattr("ray._raylet.GcsClient", Client)
+    monkeypatch.setattr(services, "get_node", lambda address, node: (address, node, len(looks)))
+    cluster_process._poll_for_node()
+    assert services.get_node("127.0.0.1:1", "b2") == ("127.0.0.1:1", "b2", 0)  # Ray's own look comes last
+
+
 def test_serve_handles_every_request_where_its_replicas_do_not_wait_for_their_http_servers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
