@@ -309,12 +309,12 @@ def ask(port: int, method: str, path: str, body: Any = None, key: str = "") -> t
         connection.close()
 
 
-def wait_until_served(run: Run, timeout_s: float = 180) -> None:
-    """Wait until a server answers that it is ready."""
+def wait_until_served(run: Run, output: Sequence[str] = (), timeout_s: float = 180) -> None:
+    """Wait until a server answers that it is ready; `output` is what it has said until then."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline and run.process.poll() is None:
         with contextlib.suppress(OSError, http.client.HTTPException):
             if ask(run.port, "GET", "/v2/health/ready")[0] == 200:
                 return
         time.sleep(0.2)
-    raise AssertionError("the server did not become ready")
+    raise AssertionError(f"the server did not become ready: {''.join(output)[-5000:]}")

@@ -67,6 +67,26 @@ def test_a_server_ended_while_it_starts_leaves_nothing(policies: Path, number: s
 def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
     policies: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
+    for _ in range(3):
+        ray_folder = Path(tempfile.mkdtemp(prefix="r"))
+        try:
+            serve_run(policies, tmp_path / "serve.yaml", ray_folder, number)
+            return
+        except AssertionError:
+            if not raylet_gave_up(ray_folder):
+                raise
+        finally:
+            shutil.rmtree(ray_folder, ignore_errors=True)
+    pytest.fail("Ray's agents have not chosen their ports within 15 s, three times")
+
+
+def raylet_gave_up(ray_folder: Path) -> bool:
+    """Whether the machine was too busy for Ray's own command (docs/operations.md, "On a slow or busy machine")."""
+    logs = ray_folder.glob("ray/session_2*/logs/raylet.*")
+    return any("Timed out waiting for file" in log.read_text(errors="replace") for log in logs)
+
+
+def serve_run(policies: Path, file: Path, ray_folder: Path, number: signal.Signals) -> None:
     import grpc
     import yaml
 
@@ -75,9 +95,7 @@ def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
     configuration["http_options"]["port"] = port
     configuration["grpc_options"]["port"] = grpc_port
     configuration["applications"][0]["args"]["policies"] = [str(policies)]
-    file = tmp_path / "serve.yaml"
     file.write_text(yaml.safe_dump(configuration))
-    ray_folder = Path(tempfile.mkdtemp(prefix="r"))
     environment = {
         **cluster_environment(ray_folder),
         **proxy_ports(),
@@ -86,22 +104,19 @@ def test_serve_run_with_the_shipped_configuration_answers_and_ends_clean(
         "RAY_TMPDIR": str(ray_folder),
         "RAY_enable_worker_prestart": "0",  # a process for each core, beside those that Serve starts
     }
-    try:
-        program = str(Path(sys.executable).with_name("serve"))
-        with running([program, "run", str(file)], port, **environment) as run:
-            output: list[str] = []
-            assert run.process.stdout is not None
-            # Read on, so that the pipe never fills.
-            drain = threading.Thread(target=output.extend, args=(run.process.stdout,), daemon=True)
-            drain.start()
-            wait_until_served(run)
-            status, reply = ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})
-            assert status == 200, "".join(output)
-            assert len(reply["action"]) == 6
-            with grpc.insecure_channel(f"127.0.0.1:{grpc_port}") as channel:
-                live = channel.unary_unary("/inference.GRPCInferenceService/ServerLive")
-                assert live(b"", timeout=20, wait_for_ready=True) == b"\x08\x01"  # field 1, true
-            run.end(number, folders=False)  # Ray's dashboard leaves an empty one
-            drain.join()
-    finally:
-        shutil.rmtree(ray_folder, ignore_errors=True)
+    program = str(Path(sys.executable).with_name("serve"))
+    with running([program, "run", str(file)], port, **environment) as run:
+        output: list[str] = []
+        assert run.process.stdout is not None
+        # Read on, so that the pipe never fills.
+        drain = threading.Thread(target=output.extend, args=(run.process.stdout,), daemon=True)
+        drain.start()
+        wait_until_served(run, output)
+        status, reply = ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})
+        assert status == 200, "".join(output)
+        assert len(reply["action"]) == 6
+        with grpc.insecure_channel(f"127.0.0.1:{grpc_port}") as channel:
+            live = channel.unary_unary("/inference.GRPCInferenceService/ServerLive")
+            assert live(b"", timeout=20, wait_for_ready=True) == b"\x08\x01"  # field 1, true
+        run.end(number, folders=False)  # Ray's dashboard leaves an empty one
+        drain.join()
