@@ -15,6 +15,7 @@ import re
 import shlex
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -26,6 +27,7 @@ from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, free
 from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, cut_log, error_line
 from rlservo.serve_app.server.admin_key import remove_key
 
+CLEAN_UP = "--clean-up"
 CHECK_PERIOD_S = 0.5  # between checks of whether Ray's own processes live
 ORDERLY_END_S = 25.0  # [s] less than the launcher waits
 LOG_CHECK_PERIOD_S = 60.0
@@ -35,7 +37,10 @@ OBJECT_STORE_BYTES = 80 << 20  # Ray's least is 75 MiB; requests do not go throu
 
 
 def main() -> int:
-    plan: dict[str, Any] = json.loads(sys.argv[1])
+    plan: dict[str, Any] = json.loads(sys.argv[-1])
+    if CLEAN_UP in sys.argv:
+        _leave_nothing(plan)
+        return 0
     # A terminal's Ctrl-C reaches the whole process group. What to do about it is the launcher's decision.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     stop = threading.Event()
@@ -192,7 +197,8 @@ def _watch_input(stop: threading.Event, started: threading.Event, plan: dict[str
     if started.is_set():
         time.sleep(ORDERLY_END_S)  # a daemon thread: an end in time ends this sleep, too
     # Otherwise nothing has been served yet, so there is nothing to drain; a half-started cluster has no orderly end.
-    _leave_nothing(plan)
+    # In a process of its own: Ray's library ends this one as soon as the GCS or the raylet is gone.
+    subprocess.run([sys.executable, "-m", __spec__.name, CLEAN_UP, json.dumps(plan)], check=False)
     os._exit(0)
 
 
