@@ -106,8 +106,8 @@ class Browser:
         wanted = options.nth(1) if option is None else options.get_by_text(option, exact=True).first
         deadline = time.monotonic() + PATIENCE_S
         while True:
-            self.page.get_by_label(label, exact=True).first.click()
             try:
+                self.page.get_by_label(label, exact=True).first.click(timeout=20e3)
                 return wanted.click(timeout=20e3)
             except NotInTimeError:
                 assert time.monotonic() < deadline, f"{option or 'its second'} cannot be chosen as {label}"

@@ -113,6 +113,18 @@ def drag(window: Browser, cockpit: Cockpit, start: Any, end: Any, has_moved: Cal
     raise AssertionError("it is not where it was dragged to")
 
 
+def scrub(window: Browser, number: int) -> None:
+    """Type a decision's number; again where what was still playing put another one in its place."""
+    for patience_s in (10.0, 20.0, PATIENCE_S):
+        window.fill("Decision", str(number))
+        deadline = time.monotonic() + patience_s
+        while time.monotonic() < deadline:
+            if f"Decision {number}" in window.text():
+                return
+            time.sleep(0.25)
+    raise AssertionError(f"decision {number} is not shown: {window.text()}")
+
+
 # These come first: they have windows of their own, and each one that is open is drawn by the processors.
 
 
@@ -163,11 +175,9 @@ def test_a_recording_scrubs_and_jumps_to_the_worst_moment(two_versions: Path, wi
         window = windows(1000, 560)
         window.open(cockpit.address)
         window.click("Pause")
-        window.fill("Decision", "7")
-        window.wait_for("Decision 7")
+        scrub(window, 7)
         first = window.scene()
-        window.fill("Decision", "20")
-        window.wait_for("Decision 20")
+        scrub(window, 20)
         wait_for(lambda: np.abs(window.scene().astype(int) - first).max() > 30, "the arm is elsewhere")
         number, _ = tape.find(tape.moments[0])
         window.choose("Worst moments", None)
