@@ -317,4 +317,6 @@ def wait_until_served(run: Run, output: Sequence[str] = (), timeout_s: float = 1
             if ask(run.port, "GET", "/v2/health/ready")[0] == 200:
                 return
         time.sleep(0.2)
+    if not output and run.process.poll() is not None and run.process.stdout is not None:
+        output = [run.process.stdout.read()]
     raise AssertionError(f"the server did not become ready: {''.join(output)[-5000:]}")
