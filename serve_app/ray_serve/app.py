@@ -376,7 +376,7 @@ def _wait_until_answered(host: str, port: int) -> None:
                 status = connection.getresponse().status
         except (OSError, http.client.HTTPException) as error:
             status, answer = 0, repr(error)
-        if status == 200:
+        if status in (200, 429):  # 429: the proxy counts the last connection still, of the few that an address may have
             in_a_row += 1
             continue
         in_a_row = 0
