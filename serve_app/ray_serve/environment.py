@@ -16,7 +16,7 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.ray_serve import loopback_ports
 from rlservo.serve_app.ray_serve.haproxy.configuration import CHECK_SECRET
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary, install_wrapper
-from rlservo.serve_app.ray_serve.processes import MARK, free_ports, is_free
+from rlservo.serve_app.ray_serve.processes import MARK, claim_port, free_ports, is_free
 from rlservo.serve_app.ray_serve.server_log import LOG_BYTES
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
 
@@ -181,5 +181,6 @@ def _ranges(number: int) -> dict[str, int]:
 
 
 def _is_unused(number: int) -> bool:
-    """Whether nobody listens on any of a server's ports."""
-    return all(is_free(first + more) for first in _ranges(number).values() for more in range(PORTS_PER_SERVER))
+    """Whether nobody listens on any of a server's ports, nor has another that is starting chosen them."""
+    ports = [first + more for first in _ranges(number).values() for more in range(PORTS_PER_SERVER)]
+    return claim_port(ports[0]) and all(is_free(port) for port in ports)

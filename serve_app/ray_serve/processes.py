@@ -25,6 +25,7 @@ MARK = "RLSERVO_LAUNCH"
 # Where `free_ports` looks: above those Ray gives its workers, below those of replicas (`launcher.py`, 30000 and up)
 # and those of outgoing connections (Linux: 32768 and up).
 PORTS = range(20_000, 30_000)
+_claims: dict[int, socket.socket] = {}  # by port, while this process lives: what it means to listen on
 QUIET_S = 0.3  # without any marked process, before the last of them counts as gone
 
 
@@ -89,7 +90,7 @@ def port_holder(port: int) -> tuple[int, str] | None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Return ports free at the moment of asking, all different. Raises UnavailableError where there are too few.
+    """Return ports that nobody has, all different, and claimed. Raises UnavailableError where there are too few.
 
     The system's own choice (port 0) would be one of those it also gives to outgoing connections, of which Ray makes
     hundreds before its last server listens.
@@ -100,11 +101,34 @@ def free_ports(count: int) -> list[int]:
     for port in candidates:
         if len(found) == count:
             break
-        if is_free(port):
+        if port not in _claims and claim_port(port):
             found.append(port)
     if len(found) < count:
         raise UnavailableError(f"{len(found)} of the ports {PORTS[0]} to {PORTS[-1]} are free: {count} are needed")
     return found
+
+
+def claim_port(port: int) -> bool:
+    """Whether a TCP port is free and ours to take: no other process that asks here gets it while this one lives.
+
+    Seconds pass between the choice of a port and whoever listens there, and another server may be starting meanwhile.
+    The claim is a socket's name in the same network namespace as the port, which goes with its process.
+    """
+    if port in _claims:
+        return is_free(port)
+    claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        claim.bind(f"\0rlservo-port-{port}")
+    except OSError as error:
+        claim.close()
+        if error.errno != errno.EADDRINUSE:
+            raise
+        return False
+    if not is_free(port):
+        claim.close()
+        return False
+    _claims[port] = claim
+    return True
 
 
 def is_free(port: int) -> bool:

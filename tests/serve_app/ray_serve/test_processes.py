@@ -12,7 +12,15 @@ import time
 import pytest
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.ray_serve.processes import MARK, check_port, end_marked, find_marked, free_ports
+from rlservo.serve_app.ray_serve.processes import (
+    MARK,
+    check_port,
+    claim_port,
+    end_marked,
+    find_marked,
+    free_ports,
+    is_free,
+)
 
 
 def test_a_port_in_use_names_its_holder() -> None:
@@ -42,6 +50,23 @@ def test_free_ports_are_different_and_can_be_listened_on() -> None:
     assert len(set(ports)) == 5
     for port in ports:
         check_port("127.0.0.1", port)
+
+
+def test_a_port_chosen_by_another_process_is_not_ours_until_that_process_ends() -> None:
+    choose = (
+        "from rlservo.serve_app.ray_serve.processes import free_ports; print(free_ports(1)[0], flush=True); input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", choose], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        port = int(other.stdout.readline())
+        assert is_free(port)
+        assert not claim_port(port)
+        other.communicate("\n")
+    assert claim_port(port)
+    assert claim_port(port)  # ours: asked again it still is
+    assert not {port, *free_ports(3)} & {*free_ports(3)}  # but what was chosen once is not chosen again
 
 
 def test_marked_processes_are_ended_with_their_children_and_others_are_left() -> None:
