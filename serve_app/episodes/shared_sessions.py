@@ -1,11 +1,14 @@
 """Sessions by id where several replicas serve: each memory is in one replica, and a record that all share says where.
 
 Why no step is ever computed from an old memory. An episode has a *token* that no other has. Its memory is kept under
-the token, by one replica at a time. The record of an id is one entry in a store that all replicas share, and whose
-reads see the last write that was acknowledged. `reset` is answered only after its token stands in the record; a step
-reads the record after it has arrived, and is computed with the memory of that token or not at all. So once a `reset`
-was answered, no later step finds the episode before, wherever its memory may still be, and whoever cannot reach the
-store computes nothing. Nothing depends on clocks, or on who is believed to be alive.
+the token, by one replica at a time. The store that all replicas share has a record for each id, which leads to an
+episode of it, and for each episode that another one followed a *link*, under its token, to that one. A link is created
+and never overwritten, so of two requests that would begin after the same episode one does, however late the other's
+write arrives, and the episodes of an id are one chain. `reset` is answered only after its link stands; a step follows
+the links, the last of which its owner looks for after the step has arrived, and is computed with the memory of the
+chain's last episode or not at all. So once a `reset` was answered, no later step finds the episode before, wherever its
+memory may still be, and whoever cannot reach the store computes nothing. Nothing depends on clocks, or on who is
+believed to be alive, except how long what leads nowhere is kept: longer than any write can be under way.
 
 Why no step moves a memory twice. A proxy that saw a replica die sends the request on to another one, with the stamp it
 gave it: the memory remembers the last stamps. Where a replica does not hear from the owner whether a step was done, the
@@ -35,8 +38,10 @@ from rlservo.serve_app.wire.request_stamp import STAMP
 logger = logging.getLogger(__name__)
 
 MOVED = "moved-"  # before an episode's token: the key of the record of who took it over
+AFTER = "after-"  # before an episode's token: the key of the link to the one begun after it
 STAMP_HEADER = STAMP.encode()
 HOP_TIMEOUT_S = 4.0  # [s] less than HAProxy gives an action
+BEGIN_S = 4.0  # [s] likewise, after which no episode is begun any more
 
 
 class Record(NamedTuple):
@@ -46,6 +51,13 @@ class Record(NamedTuple):
     token: str
     identity: str
     """Of the policy that it is of."""
+    key: str
+    """Of its id's record."""
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether it is a link to nothing: no episode can follow, and its id's record leads nowhere any more."""
+        return not self.token
 
 
 class RecordStore(Protocol):
@@ -53,6 +65,7 @@ class RecordStore(Protocol):
 
     async def get(self, key: str) -> bytes | None: ...
     async def put(self, key: str, value: bytes) -> None: ...
+    async def create(self, key: str, value: bytes) -> bool: ...  # False where there is one
     async def delete(self, key: str) -> None: ...
     async def keys(self) -> Sequence[str]: ...
 
@@ -89,7 +102,7 @@ class SharedSessions:
         self._replica = replica
         self._leaving: asyncio.Event | None = None
         self._tasks: set[asyncio.Task[None]] = set()  # asyncio itself forgets those that nobody waits for
-        self._doubtful: set[str] = set()  # records that led nowhere when they were last looked at
+        self._unneeded: set[str] = set()  # records and links that nobody needed when they were last looked at
         self.hops = 0
         """Steps that another replica was asked to take, since it has the memory."""
         self.unreachable = 0
@@ -106,63 +119,80 @@ class SharedSessions:
         if not any(store.get(name, version).is_stateful for version in store.versions(name)):
             return self._episodes.act(store, request)  # the id is a label
         key = key_of(name, request.episode.session_id)
-        record = await self._find(key)
         if request.episode.reset:
-            return await self._begin(store, request, key, record)
+            return await self._begin(store, request, key)
+        record = await self._find(key)
         if record is None:
             raise self._lost(request)
-        decision = await self._step(store, request, key, record)
-        if request.episode.end:
-            with contextlib.suppress(UnavailableError):  # a record of nothing leads nowhere
-                await self._delete(key)
-        return decision
+        return await self._step(store, request, record)
 
-    async def _begin(self, store: PolicyStore, request: Request, key: str, before: Record | None) -> Decision:
+    async def _begin(self, store: PolicyStore, request: Request, key: str) -> Decision:
         """Begin an episode here, and say so to all before anybody is answered."""
         assert request.episode is not None and request.episode.session_id is not None
-        name, session_id = request.policy, request.episode.session_id
-        check_deadline(request)
-        decision = self._episodes.act(store, request)
-        session = self._episodes.sessions.peek(name, session_id)
-        if session is not None and not session.token:
-            token = session.token = secrets.token_hex(12)
-            record = Record(self._replica, token, session.policy.identity)
-            try:
-                await self._put(key, record)
-            except UnavailableError:
-                self.forget(name, session_id, token)
-                raise
-        else:  # there is nothing to remember of this one; of the one before there may be
+        name, session_id, sessions = request.policy, request.episode.session_id, self._episodes.sessions
+        chain = await self._chain(key)
+        if chain and chain[-1].is_closed:
             await self._delete(key)
-        if before is not None and before.replica != self._replica:
-            task = asyncio.create_task(self._tell_forget(before, name, session_id))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            chain = []
+        before = chain[-1] if chain else None
+        _check_time(request)
+        decision = self._episodes.act(store, request)
+        session = sessions.peek(name, session_id)  # None: there is nothing to remember
+        record = Record(self._replica, secrets.token_hex(12), decision.policy.identity, key)
+        try:
+            is_first = await self._create(key if before is None else AFTER + before.token, record)
+            _check_time(request)
+            if not is_first:
+                raise UnavailableError(
+                    f"another request began session '{shorten(session_id)}' of policy '{name[:64]}' at the same time: "
+                    "try again"
+                )
+        except RlservoError:
+            if session is not None and sessions.peek(name, session_id) is session:
+                sessions.end(name, session_id)
+            raise
+        if session is not None:
+            session.token = record.token  # from now on there are steps
+        if before is not None:
+            with contextlib.suppress(UnavailableError):  # the link leads here, too
+                await self._put(key, record)
+            if before.replica != self._replica:
+                task = asyncio.create_task(self._tell_forget(before, name, session_id))
+                self._tasks.add(task)
+                task.add_done_callback(self._tasks.discard)
         return decision
 
-    async def _step(self, store: PolicyStore, request: Request, key: str, record: Record) -> Decision:
+    async def _step(self, store: PolicyStore, request: Request, record: Record) -> Decision:
         """Take a step where the memory is: in the replica that began it, or the one that took it over."""
         while True:
             if record.replica == self._replica:
                 found = await self.act_here(store, request, record.token)
             else:
-                found = await self._ask(store, request, key, record)
+                found = await self._ask(store, request, record)
             if found is not None:
                 return found
-            moved = await self._find(MOVED + record.token)
-            if moved is None or moved.replica == record.replica:
+            after = await self._find(MOVED + record.token)
+            if after is None or after.replica == record.replica:
+                after = await self._find(AFTER + record.token)
+            if after is None or after.is_closed:
                 raise self._lost(request)
-            record = moved
+            record = after
 
     async def act_here(self, store: PolicyStore, request: Request, token: str) -> Decision | None:
-        """Take a step with a memory of this replica; None where it has none under this token (any more)."""
+        """Take a step with a memory of this replica; None where it has none under this token, or another one follows.
+
+        Raises UnavailableError where the store does not say whether one does.
+        """
         if self._leaving is not None:
             await self._leaving.wait()
         assert request.episode is not None and request.episode.session_id is not None
-        session = self._episodes.sessions.peek(request.policy, request.episode.session_id)
-        if session is None or session.token != token:
+        if self._memory(request, token) is None or await self._find(AFTER + token) is not None:
             return None
-        stamp = request.headers.get(STAMP_HEADER) if request.stream_id is None else None
+        session = self._memory(request, token)
+        if session is None:
+            return None
+        is_stamped = request.stream_id is None and request.seq is None  # otherwise `seq` says which request it is
+        stamp = request.headers.get(STAMP_HEADER) if is_stamped else None
         if stamp is not None and stamp in session.stamps:
             if session.stamps[-1] == stamp and session.stamped is not None:
                 return session.stamped
@@ -174,7 +204,12 @@ class SharedSessions:
             session.stamped = replace(decision, inputs={}, is_repeat=True)
         return decision
 
-    async def _ask(self, store: PolicyStore, request: Request, key: str, record: Record) -> Decision | None:
+    def _memory(self, request: Request, token: str) -> Session | None:
+        assert request.episode is not None and request.episode.session_id is not None
+        session = self._episodes.sessions.peek(request.policy, request.episode.session_id)
+        return session if session is not None and session.token == token else None
+
+    async def _ask(self, store: PolicyStore, request: Request, record: Record) -> Decision | None:
         """Let the owner take the step; None where it has no such memory. Raises what it raises."""
         policy = store.find(request.policy, record.identity)
         if policy is None:  # its action could not be written down
@@ -192,8 +227,8 @@ class SharedSessions:
             logger.debug("the replica %s did not answer for a session: %s", record.replica, error)
             if request.seq is not None:
                 raise UnavailableError("the replica that has this session does not answer: try again") from None
-            with contextlib.suppress(UnavailableError):
-                await self._delete(key)  # the step may have been taken: nobody can go on from here
+            with contextlib.suppress(UnavailableError):  # the step may have been taken: nobody can go on from here
+                await self._create(AFTER + record.token, closed(record.key))
             raise self._lost(request) from None
         if isinstance(found, RlservoError):
             raise found
@@ -232,7 +267,11 @@ class SharedSessions:
     async def _send(self, other: str, part: list[HandedOver]) -> None:
         try:
             adopted = await asyncio.wait_for(self._peers.call(other, "adopt", part), HOP_TIMEOUT_S)
-            records = [Record(other, one.session.token, one.identity) for one in part if one.session.token in adopted]
+            records = [
+                Record(other, one.session.token, one.identity, key_of(one.name, one.session_id))
+                for one in part
+                if one.session.token in adopted
+            ]
             await asyncio.gather(*(self._put(MOVED + record.token, record) for record in records))
         except Exception as error:
             logger.warning("%d sessions end with this replica: %s", len(part), error)
@@ -255,20 +294,51 @@ class SharedSessions:
         return adopted
 
     async def sweep(self) -> None:
-        """Delete records that lead nowhere: of what was forgotten here, and of replicas that have ended."""
+        """Delete records and links that nobody needs: of what ended here, and of replicas that have ended.
+
+        They go when two looks in a row found so. Between these lies longer than a write may be under way, so that none
+        arrives late for what was deleted.
+        """
         running = await self._peers.running()
-        doubtful: set[str] = set()
-        for key in await self._records.keys():
-            record = await self._find(key)
-            if record is None or (record.replica != self._replica and record.replica in running):
-                continue  # the other replica's own
-            if record.replica == self._replica and record.token in self._episodes.sessions.tokens():
-                continue
-            if key.startswith(MOVED) or await self._find(MOVED + record.token) is None:
-                doubtful.add(key)
-        for key in doubtful & self._doubtful:  # twice in a row: not one that is just being begun, or handed over
+        unneeded = {key for key in await self._records.keys() if await self._is_unneeded(key, running)}
+        for key in unneeded & self._unneeded:
+            if not key.startswith((MOVED, AFTER)):
+                record = await self._find(key)
+                if record is None or not await self._create(AFTER + record.token, closed(key)):
+                    continue  # an episode is begun just now
             await self._delete(key)
-        self._doubtful = doubtful
+        self._unneeded = unneeded
+
+    async def _is_unneeded(self, key: str, running: Sequence[str]) -> bool:
+        record = await self._find(key)
+        if record is None or (record.replica != self._replica and record.replica in running):
+            return False  # the other replica's own
+        has_memory = record.replica == self._replica and record.token in self._episodes.sessions.tokens()
+        if key.startswith(MOVED) or (has_memory and not key.startswith(AFTER)):
+            return not has_memory
+        chain = await self._chain(record.key)
+        if key.startswith(AFTER):
+            is_passed = all(key != AFTER + each.token for each in chain)
+        else:
+            is_passed = len(chain) == 1 and await self._find(MOVED + record.token) is None
+        if not is_passed and len(chain) > 1:
+            await self._shorten(record.key, chain)
+        return is_passed
+
+    async def _chain(self, key: str) -> list[Record]:
+        """Return the episodes to which an id's record leads, in the order in which they began."""
+        chain, record = [], await self._find(key)
+        while record is not None:
+            chain.append(record)
+            record = None if record.is_closed else await self._find(AFTER + record.token)
+        return chain
+
+    async def _shorten(self, key: str, chain: Sequence[Record]) -> None:
+        """Let an id's record lead to its last episode at once."""
+        if chain[-1].is_closed:
+            await self._delete(key)
+        else:
+            await self._put(key, chain[-1])
 
     # The store's errors are of its own kind, and what they mean is always the same.
 
@@ -284,6 +354,14 @@ class SharedSessions:
             await self._records.put(key, json.dumps(record).encode())
         except Exception as error:
             raise self._count_unreachable(error) from None
+
+    async def _create(self, key: str, record: Record) -> bool:
+        """Write a record that is not there; return whether this one is."""
+        try:
+            is_written = await self._records.create(key, json.dumps(record).encode())
+        except Exception as error:
+            raise self._count_unreachable(error) from None
+        return is_written or await self._find(key) == record  # written, and then tried again by Ray
 
     async def _delete(self, key: str) -> None:
         try:
@@ -308,6 +386,18 @@ class SharedSessions:
             "was idle for too long, or ended with its replica or its version: begin an episode",
             {"session_id": shown, "policy": request.policy[:64]},
         )
+
+
+def _check_time(request: Request) -> None:
+    """Raise DeadlineError or UnavailableError for a `reset` whose client has given up: it may have sent the next."""
+    check_deadline(request)
+    if time.perf_counter() - request.received > BEGIN_S:
+        raise UnavailableError(f"beginning the session took longer than {BEGIN_S:g} s: try again")
+
+
+def closed(key: str) -> Record:
+    """Return the link that ends the episodes to which an id's record leads."""
+    return Record("", "", "", key)
 
 
 def without_policy(decision: Decision) -> Decision:

@@ -36,6 +36,11 @@ class GcsRecords:
         """Write a record over any other."""
         await self._within(self._client.async_internal_kv_put(self._key(key), value, True, self._namespace))
 
+    async def create(self, key: str, value: bytes) -> bool:
+        """Write a record where there is none; return False where there is one."""
+        put = self._client.async_internal_kv_put(self._key(key), value, False, self._namespace)
+        return bool(await self._within(put))
+
     async def delete(self, key: str) -> None:
         """Delete a record; nothing happens where there is none."""
         await self._within(self._client.async_internal_kv_del(self._key(key), False, self._namespace))

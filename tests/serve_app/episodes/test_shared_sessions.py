@@ -8,9 +8,11 @@ with the same policy's in process.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import pickle
 import random
 import secrets
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,7 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import SessionError, SessionLostError, UnavailableError
+from rlservo.export.contract.errors import DeadlineError, SessionError, SessionLostError, UnavailableError
 from rlservo.serve_app.episodes.request import Episode, Request
 from rlservo.serve_app.episodes.shared_sessions import SharedSessions, key_of
 from rlservo.serve_app.runtime.policy import Policy
@@ -34,17 +36,23 @@ NAME = "lstm_box"
 AT_ONCE = 10  # clients that ask
 
 
+class GivenUpError(Exception):
+    """The client waits no longer for its answer."""
+
+
 @dataclass
 class World:
     """What replicas share, and what can happen between them."""
 
     policies: PolicyStore
     draw: random.Random
+    lost: float = 0.0  # of what is sent
     records: dict[str, bytes] = field(default_factory=dict)
     replicas: dict[str, Replica] = field(default_factory=dict)
     dead: set[str] = field(default_factory=set)
     cut: set[frozenset[str]] = field(default_factory=set)  # pairs that do not hear each other; "" is the store
-    later: list[asyncio.Task[None]] = field(default_factory=list)
+    deleted: int = 0  # records and links
+    later: list[asyncio.Task[Any]] = field(default_factory=list)
 
     def add(self) -> Replica:
         name = secrets.token_hex(4)
@@ -55,7 +63,7 @@ class World:
         """Take a while; fail where the way is cut, now or on arrival."""
         for _ in range(self.draw.randrange(4)):
             await asyncio.sleep(0)
-        if frozenset((one, other)) in self.cut:
+        if frozenset((one, other)) in self.cut or self.draw.random() < self.lost:
             raise TimeoutError("nobody answers")
 
     def kill(self, name: str) -> None:
@@ -96,7 +104,12 @@ class Replica:
     async def put(self, key: str, value: bytes) -> None:
         await self._write(lambda: self.world.records.__setitem__(key, value))
 
+    async def create(self, key: str, value: bytes) -> bool:
+        await self._write(lambda: self.world.records.setdefault(key, value))
+        return self.world.records.get(key) == value
+
     async def delete(self, key: str) -> None:
+        self.world.deleted += key in self.world.records
         await self._write(lambda: self.world.records.pop(key, None))
 
     async def keys(self) -> Sequence[str]:
@@ -167,7 +180,7 @@ class Client:
             except UnavailableError:  # nothing was computed, or the client counts
                 self.seen["unavailable"] += 1
                 continue
-            except ConnectionError:  # whether it was computed nobody knows
+            except (ConnectionError, GivenUpError):  # whether it was computed nobody knows
                 self.seen["broken"] += 1
                 if not self.counts:
                     reset = True
@@ -192,7 +205,7 @@ class Client:
             return
         try:
             decision = await self._send(obs, False, b"")
-        except (SessionError, UnavailableError, ConnectionError):
+        except (SessionError, UnavailableError, ConnectionError, GivenUpError):
             self.seen["lost, and refused again"] += 1
             return
         self.seen["lost, and gone on"] += 1
@@ -208,12 +221,12 @@ class Client:
         for retry in range(3):
             replica = self.draw.choice(list(self.world.replicas.values()))
             request = Request(
-                "json", NAME, None, 0.0, obs=obs, seq=self.seq if self.counts else None,
+                "json", NAME, None, time.perf_counter(), obs=obs, seq=self.seq if self.counts else None,
                 headers={STAMP.encode(): stamp} if stamp else {},
                 episode=Episode(session_id=self.session_id, reset=reset),
             )  # fmt: skip
             try:
-                return await replica.act(request)
+                return await self._wait_for(replica, request)
             except ConnectionError:
                 self.seen["retried by the proxy"] += 1
             except UnavailableError:
@@ -221,6 +234,20 @@ class Client:
                     raise
                 break  # the replica that died may have had an answer
         raise ConnectionError
+
+    async def _wait_for(self, replica: Replica, request: Request) -> Decision:
+        """Wait for an answer, or give up: the request goes on without its client, who said by when it needs it."""
+        assert request.episode is not None
+        answering = asyncio.create_task(replica.act(request))
+        if (request.episode.reset or self.counts) and self.draw.random() < 0.1:
+            for _ in range(self.draw.randrange(15)):
+                await asyncio.sleep(0)
+            if not answering.done():
+                request.deadline_ms = 0.0
+                self.world.later.append(answering)
+                self.seen["given up"] += 1
+                raise GivenUpError
+        return await answering
 
     @property
     def policy(self) -> Policy:
@@ -241,9 +268,11 @@ def lstm(recurrent: Path) -> PolicyStore:
 def test_no_interleaving_gives_an_action_of_another_memory(
     lstm: PolicyStore, seed: int, sessions: int, steps: int
 ) -> None:
-    seen = asyncio.run(_play(World(lstm, random.Random(seed)), sessions, steps))
+    world = World(lstm, random.Random(seed), lost=0.01)
+    seen = asyncio.run(_play(world, sessions, steps))
     assert seen["right"] > sessions * steps / 2, seen
-    harm = ("lost", "unavailable", "retried by the proxy", "handed over", "join", "kill", "cut")
+    harm = ["lost", "unavailable", "retried by the proxy", "given up", "handed over", "join", "kill", "cut"]
+    assert world.deleted
     assert all(seen[each] > 0 for each in harm), seen
 
 
@@ -259,19 +288,20 @@ async def _play(world: World, sessions: int, steps: int) -> Counter[str]:
             await world.draw.choice(some).step()
 
     playing = [asyncio.create_task(play(clients[first::AT_ONCE])) for first in range(AT_ONCE)]
-    harm = asyncio.create_task(_harm(world, seen))
+    harm = asyncio.create_task(_harm(world, seen, playing))
     try:
         await asyncio.gather(*playing)
     finally:
-        harm.cancel()
-        await asyncio.gather(harm, *world.later, *playing, return_exceptions=True)
+        await asyncio.gather(*playing, return_exceptions=True)
+        await harm
+        await asyncio.gather(*world.later, return_exceptions=True)
     return seen
 
 
-async def _harm(world: World, seen: Counter[str]) -> None:
+async def _harm(world: World, seen: Counter[str], playing: Sequence[asyncio.Task[None]]) -> None:
     """Let replicas join, drain, die, be cut off from each other and from the store, and be heard again."""
-    draw = world.draw
-    while True:
+    draw, sweeping = world.draw, list[asyncio.Task[None]]()
+    while not all(task.done() for task in playing):
         for _ in range(draw.randint(1, 100)):
             await asyncio.sleep(0)
         names = list(world.replicas)
@@ -296,18 +326,24 @@ async def _harm(world: World, seen: Counter[str]) -> None:
             case "mend":
                 world.cut.clear()
             case "sweep":
-                sweep = world.replicas[draw.choice(names)].shared.sweep
-                if len(world.later) < 20:
-                    world.later += [asyncio.create_task(sweep()), asyncio.create_task(sweep())]
+                sweeping.append(asyncio.create_task(_sweep_twice(world, world.replicas[draw.choice(names)])))
             case _:
                 continue
         seen[kind] += 1
 
 
+async def _sweep_twice(world: World, replica: Replica) -> None:
+    """Look at the records twice: between the looks of a replica everything arrives that was on its way."""
+    with contextlib.suppress(UnavailableError, TimeoutError):
+        await replica.shared.sweep()
+        await asyncio.gather(*world.later, return_exceptions=True)
+        await replica.shared.sweep()
+
+
 def request(session_id: str, obs: Any, *, reset: bool = False, end: bool = False, stamp: bytes = b"") -> Request:
     headers = {STAMP.encode(): stamp} if stamp else {}
     episode = Episode(session_id=session_id, reset=reset, end=end)
-    return Request("json", NAME, None, 0.0, obs=obs, headers=headers, episode=episode)
+    return Request("json", NAME, None, time.perf_counter(), obs=obs, headers=headers, episode=episode)
 
 
 @pytest.fixture
@@ -331,6 +367,150 @@ def test_an_episode_begun_anew_elsewhere_ends_the_old_one_also_where_nobody_hear
         world.cut.clear()
         with pytest.raises(SessionLostError):  # the one who could not ask has ended it for all
             await new.act(request("s", obs))
+
+    asyncio.run(run())
+
+
+class SlowCreate:
+    """A replica whose next link or record is created, or acknowledged, only when it is told so."""
+
+    def __init__(self, replica: Replica, *, is_acknowledged_late: bool = False) -> None:
+        self.arrives = asyncio.Event()
+        create = replica.create
+
+        async def create_late(key: str, value: bytes) -> bool:
+            if not is_acknowledged_late:
+                await self.arrives.wait()
+                return await create(key, value)
+            is_written = await create(key, value)
+            await self.arrives.wait()
+            return is_written
+
+        replica.create = create_late  # type: ignore[method-assign]
+
+
+async def steps_are_of(replicas: Sequence[Replica], obs: Any, first: Decision, begin: Any) -> None:
+    """Check that an episode begun with an observation goes on by every replica."""
+    policy = replicas[0].world.policies.get(NAME)
+    expected, step = take_step(policy, begin, before=None, last=None)
+    np.testing.assert_array_equal(first.action, expected.action)
+    for replica in replicas:
+        decision = await replica.act(request("s", obs))
+        expected, step = take_step(policy, obs, before=step.state, last=step.leaves)
+        np.testing.assert_array_equal(decision.action, expected.action)
+
+
+@pytest.mark.parametrize("has_one", [False, True])
+@pytest.mark.parametrize("is_acknowledged_late", [False, True])
+def test_a_reset_that_was_given_up_does_not_come_back(
+    world: World, obs: Any, has_one: bool, is_acknowledged_late: bool
+) -> None:
+    async def run() -> None:
+        slow, quick = world.add(), world.add()
+        if has_one:
+            await quick.act(request("s", obs, reset=True))
+        late = SlowCreate(slow, is_acknowledged_late=is_acknowledged_late)
+        given_up = asyncio.create_task(slow.act(request("s", obs + 0.9, reset=True)))
+        for _ in range(50):
+            await asyncio.sleep(0)
+        first = await quick.act(request("s", obs - 0.9, reset=True))
+        late.arrives.set()
+        with contextlib.suppress(UnavailableError):
+            await given_up
+        await steps_are_of([quick, slow], obs + 0.3, first, obs - 0.9)
+
+    asyncio.run(run())
+
+
+def test_a_reset_held_up_while_its_record_is_swept_begins_nothing(world: World, obs: Any) -> None:
+    async def run() -> None:
+        slow, quick, ended = world.add(), world.add(), world.add()
+        await ended.act(request("s", obs, reset=True))
+        world.kill(ended.name)
+        late = SlowCreate(slow)
+        given_up = asyncio.create_task(slow.act(request("s", obs + 0.9, reset=True)))
+        for _ in range(50):
+            await asyncio.sleep(0)
+        for _ in range(2):
+            await quick.shared.sweep()
+        first = await quick.act(request("s", obs - 0.9, reset=True))
+        late.arrives.set()
+        with pytest.raises(UnavailableError, match="at the same time"):
+            await given_up
+        await steps_are_of([quick, slow], obs + 0.3, first, obs - 0.9)
+
+    asyncio.run(run())
+
+
+def test_a_reset_whose_deadline_passes_while_it_is_written_leaves_no_memory(world: World, obs: Any) -> None:
+    async def run() -> None:
+        slow = world.add()
+        late = SlowCreate(slow, is_acknowledged_late=True)
+        sent = request("s", obs, reset=True)
+        given_up = asyncio.create_task(slow.act(sent))
+        for _ in range(50):
+            await asyncio.sleep(0)
+        sent.deadline_ms = 0.0
+        late.arrives.set()
+        with pytest.raises(DeadlineError):
+            await given_up
+        with pytest.raises(SessionLostError):
+            await slow.act(request("s", obs))
+
+    asyncio.run(run())
+
+
+def test_a_link_that_is_the_only_way_to_an_episode_stays_until_the_record_leads_there(world: World, obs: Any) -> None:
+    async def run() -> None:
+        old, new = world.add(), world.add()
+        await old.act(request("s", obs, reset=True))
+        world.cut.add(frozenset((old.name, new.name)))
+        put = new.put
+
+        async def fail(key: str, value: bytes) -> None:
+            raise TimeoutError
+
+        new.put = fail  # type: ignore[method-assign]
+        first = await new.act(request("s", obs - 0.9, reset=True))
+        for _ in range(2):
+            with contextlib.suppress(UnavailableError):
+                await new.shared.sweep()
+        world.cut.clear()
+        assert len(world.records) == 2
+        await steps_are_of([old, new], obs + 0.3, first, obs - 0.9)
+        new.put = put  # type: ignore[method-assign]
+        for _ in range(4):
+            await new.shared.sweep()
+        assert list(world.records) == [key_of(NAME, "s")]
+        assert (await old.act(request("s", obs))).episode.step == 4  # type: ignore[union-attr]
+
+    asyncio.run(run())
+
+
+def test_a_reset_that_took_too_long_begins_nothing(world: World, obs: Any) -> None:
+    async def run() -> None:
+        owner = world.add()
+        await owner.act(request("s", obs, reset=True))
+        late = request("s", obs, reset=True)
+        late.received = time.perf_counter() - 5.0
+        with pytest.raises(UnavailableError, match="took longer than 4 s"):
+            await owner.act(late)
+        assert (await owner.act(request("s", obs))).episode.step == 2  # type: ignore[union-attr]
+
+    asyncio.run(run())
+
+
+def test_links_go_once_the_record_leads_past_them(world: World, obs: Any) -> None:
+    async def run() -> None:
+        one, other = world.add(), world.add()
+        for replica in (one, other, one, one):
+            await replica.act(request("s", obs, reset=True))
+        assert len(world.records) == 4
+        for _ in range(2):
+            await one.shared.sweep()
+            await other.shared.sweep()
+        assert list(world.records) == [key_of(NAME, "s")]
+        assert (await other.act(request("s", obs))).episode.step == 2  # type: ignore[union-attr]
 
     asyncio.run(run())
 
@@ -372,14 +552,23 @@ def test_an_end_and_a_dead_owner_leave_nothing_behind(world: World, obs: Any) ->
         owner, other = world.add(), world.add()
         await owner.act(request("ended", obs, reset=True))
         await other.act(request("ended", obs, end=True))
-        assert not world.records and not len(owner.path.episodes.sessions)
+        assert not len(owner.path.episodes.sessions)
+        with pytest.raises(SessionLostError):
+            await other.act(request("ended", obs))
+        for _ in range(2):
+            await owner.shared.sweep()
+        assert not any(key_of(NAME, "ended") in key for key in world.records)
+        for _ in range(2):
+            await owner.shared.sweep()
+        assert not world.records
         await owner.act(request("orphan", obs, reset=True))
         world.kill(owner.name)
         with pytest.raises(SessionLostError, match="no replica has the session 'orphan'"):
             await other.act(request("orphan", obs, stamp=b"1"))
         await other.shared.sweep()
         assert key_of(NAME, "orphan") in world.records  # it could be one that is just being begun
-        await other.shared.sweep()
+        for _ in range(3):
+            await other.shared.sweep()
         assert not world.records
 
     asyncio.run(run())
