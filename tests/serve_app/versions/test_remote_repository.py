@@ -75,8 +75,9 @@ def repository(storage: Storage, cache: Path, **more: Any) -> Repository:
     return Repository([storage.uri], cache=cache, **{"storage_timeout_s": 10, **more})
 
 
-def replica(*places: str, cache: Path, timeout_s: float = 10) -> ReplicaVersions:
-    loader = VersionLoader(Repository(places, cache=cache, storage_timeout_s=timeout_s))
+def replica(*places: str, cache: Path, timeout_s: float = 10, load_timeout_s: float = 30) -> ReplicaVersions:
+    held = Repository(places, cache=cache, storage_timeout_s=timeout_s)
+    loader = VersionLoader(held, load_timeout_s=load_timeout_s)
     return ReplicaVersions(loader, MemoryLedger(), replica="only")
 
 
@@ -547,7 +548,7 @@ def test_a_served_version_stays_in_the_cache_until_it_is_let_go(made: Path, stor
     async def run() -> None:
         control = ReplicaVersions(VersionLoader(held), MemoryLedger(), replica="only")
         await control.configure({"policies": {"ur5": {"versions": ["1"]}}})
-        with pytest.raises(RefusedError, match="are in use"):
+        with pytest.raises(UnavailableError, match="are in use"):
             await control.load("ur5", "2", what="load")
         await control.change(lambda plan: plan_changes.unload(plan, "ur5", None), what="unload")
         await control.load("ur5", "2", what="load")
@@ -670,6 +671,32 @@ def test_polling_loads_what_is_newer_and_says_once_that_the_storage_is_away(
         asyncio.run(run())
     told = [line for line in caplog.messages if line.startswith("looking for new versions")]
     assert len(told) == len(set(told))
+
+
+@pytest.mark.parametrize(
+    ("lie", "sentence"),
+    [(late(9), "took longer than 6 s and was given up"), (None, "policy.onnx cannot be reached or")],
+)
+def test_polling_tries_again_what_could_not_be_read_for_a_while(
+    lie: Lie | None, sentence: str, made: Path, storage: Storage, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    put(made, storage.uri, "1")
+
+    async def run() -> None:
+        control = replica(storage.uri, cache=cache, timeout_s=30, load_timeout_s=6 if lie is not None else 30)
+        await control.configure({})
+        await asyncio.to_thread(put, made, storage.uri, "2")
+        storage.tell(only("2/policy.onnx", lie or busy))
+        poll = asyncio.create_task(control.poll_repository(0.05))
+        await until(lambda: sentence in caplog.text)
+        assert control.store is not None and control.store.versions("ur5") == ("1",)
+        assert control.plan is not None and control.plan.refused is None
+        storage.tell(None)
+        await until(lambda: control.store is not None and control.store.versions("ur5") == ("1", "2"))
+        poll.cancel()
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(run())
 
 
 def test_polling_leaves_out_what_the_configuration_pins(made: Path, cache: Path, tmp_path: Path) -> None:
