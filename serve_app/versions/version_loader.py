@@ -92,8 +92,8 @@ class VersionLoader:
     async def prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> None:
         """Load what is new or newly relied on in `policies`, and check that canary and shadow fit the default version.
 
-        Raises RefusedError with all that cannot be served, and UnavailableError where it only could not
-        be read, or not in time.
+        Raises RefusedError with all that cannot be served, and UnavailableError where it only could not be read,
+        or not in time.
         """
         failures: list[tuple[Key, RlservoError]] = []
         for name, policy in policies.items():
@@ -112,12 +112,12 @@ class VersionLoader:
                 await self._check_companions(name, policy)
         if failures:
             details = {"versions": [{"name": n, "version": v, "reason": e.message} for (n, v), e in failures]}
-            is_away = all(isinstance(error, UnavailableError) for _, error in failures)
             try:
-                raise_all([BundleError(error.message) for _, error in failures])
-            except BundleError as error:
-                kind = UnavailableError if is_away else RefusedError
-                raise kind(error.message, details) from None
+                raise_all([error for _, error in failures])
+            except UnavailableError as error:
+                raise UnavailableError(error.message, details) from None
+            except RlservoError as error:
+                raise RefusedError(error.message, details) from None
 
     def keep(self, served: Mapping[Loadable, Policy], planned: Collection[Loadable], proposed: set[Loadable]) -> None:
         """Hold what is served, keep what is proposed, and let all others go; who computes with one is not disturbed.

@@ -41,6 +41,7 @@ from rlservo.serve_app.versions.manifest import MAX_MANIFEST_BYTES, REQUIRED, Ma
 from rlservo.serve_app.versions.object_storage import announced, place_of
 from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.versions.publication import next_version, publish
+from rlservo.serve_app.versions.remote_repository import AT_ONCE
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
@@ -367,6 +368,90 @@ def test_a_server_starts_again_with_its_storage_away(
     assert "not in the cache, and left out: ur5 2" in caplog.text
     with pytest.raises(UnavailableError, match=f"policies {AWAY}"):
         repository(storage, cache.parent / "empty").available(ALL)
+
+
+@pytest.fixture
+def two(made: Path, storage: Storage, tmp_path: Path) -> dict[str, str]:
+    """The hashes of ur5 and mir, both in version 1; mir's manifest is refused."""
+    mir = load_bundle(write_box_policy(tmp_path, name="mir"))
+    put(made, storage.uri, "1")
+    publish(mir, storage.uri)
+    storage.tell(only("mir/1.json", echo))
+    return {"ur5": load_bundle(made / "ur5" / "1").digest, "mir": mir.digest}
+
+
+MIR_UNREAD = r"policies/mir/1\.json is refused with the credentials"
+
+
+def test_a_manifest_that_cannot_be_read_takes_its_own_version_away_and_no_other(
+    two: dict[str, str], storage: Storage, cache: Path
+) -> None:
+    def pinned(name: str) -> ServedConfig:
+        return ServedConfig.parse({"policies": {name: {"versions": ["1"]}}, "unlisted": "ignore"})
+
+    held = repository(storage, cache)
+    assert held.available(pinned("ur5")) == {"ur5": {"1": two["ur5"]}}
+    assert held.find_digest("ur5", None) == ("1", two["ur5"])
+    for config in (pinned("mir"), ALL):
+        with pytest.raises(UnavailableError, match=MIR_UNREAD):
+            held.available(config)
+    for version in (None, "1"):
+        with pytest.raises(UnavailableError, match=MIR_UNREAD):
+            held.find_digest("mir", version)
+    storage.tell(only("ur5/2.json", echo))
+    storage.change("PUT", "ur5/2.json")
+    assert held.find_digest("ur5", "1") == ("1", two["ur5"])
+    with pytest.raises(UnavailableError, match=r"ur5/2\.json is refused"):  # nobody knows whether it is the newest
+        held.find_digest("ur5", None)
+    storage.tell(lambda path, *reply: reply if "list-type" in path else echo(path))
+    with pytest.raises(UnavailableError, match=MIR_UNREAD):  # none can be read: the storage is away
+        repository(storage, cache.parent / "empty").available(pinned("ur5"))
+
+
+def test_what_the_cache_has_is_served_and_remembered_while_its_manifest_cannot_be_read(
+    two: dict[str, str], storage: Storage, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    storage.tell(None)
+    held = repository(storage, cache)
+    for name, digest in two.items():
+        held.find_digest(name, None)
+        held.fetch(name, "1", digest).release()
+    storage.tell(only("mir/1.json", echo))
+    everything = {name: {"1": digest} for name, digest in two.items()}
+    with caplog.at_level(logging.WARNING):
+        assert repository(storage, cache).available(ALL) == everything
+    assert "mir/1.json is refused" in caplog.text and "the copy in the cache or a folder is served" in caplog.text
+    storage.go_away()
+    assert repository(storage, cache).available(ALL) == everything
+
+
+def test_polling_reads_a_manifest_again_that_could_not_be_read(
+    made: Path, storage: Storage, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    put(made, storage.uri, "1")
+
+    async def run() -> None:
+        control = replica(storage.uri, cache=cache)
+        await control.configure({})
+        await asyncio.to_thread(put, made, storage.uri, "2")
+        storage.tell(only("ur5/2.json", echo))
+        poll = asyncio.create_task(control.poll_repository(0.05))
+        await until(lambda: "ur5/2.json is refused" in caplog.text)
+        storage.tell(None)
+        await until(lambda: control.store is not None and control.store.versions("ur5") == ("1", "2"))
+        poll.cancel()
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(run())
+
+
+def test_a_storage_that_stopped_to_answer_is_not_asked_for_every_manifest(storage: Storage, cache: Path) -> None:
+    for version in range(1, 81):
+        storage.change("PUT", f"ur5/{version}.json")
+    storage.tell(lambda path, *reply: reply if "list-type" in path else late(3)(path, *reply))
+    with pytest.raises(UnavailableError, match=r"\.json gave no answer within 1 s"):
+        repository(storage, cache, storage_timeout_s=1).available(ALL)
+    assert len({line for line in storage.proxy.requests if line.endswith(".json")}) <= 3 * AT_ONCE
 
 
 def test_wrong_and_missing_credentials_are_said(
