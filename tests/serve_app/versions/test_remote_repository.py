@@ -37,6 +37,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions.bundle_cache import MANIFEST_FILE
 from rlservo.serve_app.versions.manifest import MAX_MANIFEST_BYTES, REQUIRED, Manifest
 from rlservo.serve_app.versions.object_storage import announced, place_of
 from rlservo.serve_app.versions.plan import ServedConfig
@@ -624,6 +625,19 @@ def test_replicas_fetch_a_version_once_and_mend_a_damaged_one(made: Path, storag
     digest = load_bundle(made / "ur5" / "1").digest
     with pytest.raises(UnavailableError, match=rf"ur5/1\.json {AWAY}"):
         repository(storage, cache).fetch("ur5", "1", digest)
+
+
+@pytest.mark.parametrize("name", ["SHA256SUMS", "policy.onnx"])
+def test_an_entry_whose_manifest_lacks_a_file_is_fetched_again(
+    name: str, made: Path, storage: Storage, cache: Path
+) -> None:
+    put(made, storage.uri, "1")
+    folder = fetch(repository(storage, cache))
+    document = json.loads((folder / MANIFEST_FILE).read_text())
+    del document["files"][name]
+    (folder / MANIFEST_FILE).write_text(json.dumps(document))
+    (folder / name).unlink()
+    assert load_bundle(fetch(repository(storage, cache))).digest == load_bundle(made / "ur5" / "1").digest
 
 
 def test_a_served_version_stays_in_the_cache_until_it_is_let_go(made: Path, storage: Storage, cache: Path) -> None:
