@@ -119,6 +119,14 @@ def test_proxies_are_on_every_node_and_replicas_apart() -> None:
     assert GROUPS["head"]["rayStartParams"]["num-cpus"] == "0"
 
 
+def test_replicas_of_a_change_find_room_beside_those_they_replace() -> None:
+    (application,) = yaml.safe_load(RAY["spec"]["serveConfigV2"])["applications"]
+    (stated,) = application["deployments"]
+    replicas, surge = application["args"]["replicas"], stated.get("max_surge_percent", 100)  # as ray_serve/app.py
+    most = replicas + -(-replicas * surge // 100)
+    assert most <= GROUPS["workers"]["minReplicas"] * stated["max_replicas_per_node"]
+
+
 def test_nodes_have_the_variables_of_cluster_env(tmp_path: Path) -> None:
     stated = OBJECTS["cluster-environment.yaml:ConfigMap/rlservo-cluster-environment"]["data"]
     printed = cluster_environment(tmp_path)
