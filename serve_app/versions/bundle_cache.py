@@ -21,7 +21,7 @@ from typing import Any
 
 from rlservo.export.contract.errors import BundleError, UnavailableError, UsageError
 from rlservo.export.contract.regular_files import blocks, open_regular
-from rlservo.serve_app.versions.manifest import Manifest
+from rlservo.serve_app.versions.manifest import REQUIRED, Manifest
 
 MANIFEST_FILE = ".manifest.json"  # no bundle's file begins with a dot
 PARTIAL = ".fetching-"
@@ -234,7 +234,7 @@ def _is_same(folder: Path, descriptor: int) -> bool:
 def _is_whole(entry: Path, digest: str) -> bool:
     try:
         manifest = Manifest.model_validate_json((entry / MANIFEST_FILE).read_bytes())
-        if manifest.digest != digest:
+        if not manifest.files.keys() >= set(REQUIRED) or manifest.digest != digest:
             return False
         for name, file in manifest.files.items():
             actual = hashlib.sha256()

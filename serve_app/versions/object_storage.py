@@ -65,7 +65,7 @@ class ObjectStorage:
 
     def __init__(self, uri: str, *, timeout_s: float = 15.0) -> None:
         self.uri = place_of(uri)
-        self._timeout_s = timeout_s
+        self.timeout_s = timeout_s
         self._opened: tuple[Any, str] | None = None
 
     @property
@@ -135,7 +135,7 @@ class ObjectStorage:
         if self._opened is None:
             options: dict[str, Any] = {"skip_instance_cache": True, "use_listings_cache": False}
             if self.uri.startswith("s3://"):  # botocore would try for longer than anybody waits, and not say why
-                options["config_kwargs"] = {"connect_timeout": self._timeout_s / 2, "retries": {"max_attempts": 1}}
+                options["config_kwargs"] = {"connect_timeout": self.timeout_s / 2, "retries": {"max_attempts": 1}}
             try:
                 import fsspec
 
@@ -152,7 +152,7 @@ class ObjectStorage:
     def _call(self, name: str, method: str, *arguments: Any, size: int = 0, most: int = 0, **options: Any) -> Any:
         """Call the file system, which may send or get `size` bytes and read `most`."""
         filesystem, _ = self._open()
-        timeout_s = self._timeout_s + size / SLOWEST
+        timeout_s = self.timeout_s + size / SLOWEST
         if filesystem.async_impl:
             options["timeout"] = timeout_s
         place = f"{self.uri}/{name}".rstrip("/")

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -44,36 +45,46 @@ class RemoteRepository:
     def versions(self) -> tuple[dict[Key, str], dict[Key, RlservoError]]:
         """Return the hash of every published version, and what is wrong with those that cannot be served.
 
-        Only manifests are read, and of those that the listing tells apart, only new ones. Raises UnavailableError, and
-        BundleError where nothing is published.
+        Only manifests are read, and of those that the listing tells apart, only new ones. One that cannot be read is
+        that version's UnavailableError, until the next look reads it again; what the cache has of it is returned
+        nevertheless. Raises UnavailableError where the storage is away, and BundleError where nothing is published.
         """
         with announced(lambda: f"the list of versions in {self.uri}"):
             stamps = self._stamps()
             changed = [key for key, stamp in stamps.items() if stamp is None or self._stamp_of(key) != stamp]
-            with ThreadPoolExecutor(AT_ONCE) as pool:
-                results = dict(zip(changed, pool.map(self._try_manifest, changed), strict=True))
+            results = self._manifests(changed)
         errors = {key: result for key, result in results.items() if isinstance(result, RlservoError)}
         known = {key: each for key, each in self._known.items() if key in stamps and key not in results}
         known |= {key: (stamps[key], each) for key, each in results.items() if isinstance(each, Manifest)}
+        unread = {key: error for key, error in errors.items() if isinstance(error, UnavailableError)}
+        if unread and not known:
+            raise next(iter(unread.values()))
         self._known = known
         digests = {key: manifest.digest for key, (_, manifest) in sorted(known.items())}
-        self._cache.remember(self.uri, {"at": now(), "digests": [[*key, digest] for key, digest in digests.items()]})
-        return digests, errors
+        earlier = self._recall()[1] if unread else {}
+        unread_before = {key: earlier[key] for key in sorted(unread) if key in earlier}
+        index = {**digests, **unread_before}  # a version is not forgotten because it could not be read once
+        self._cache.remember(self.uri, {"at": now(), "digests": [[*key, digest] for key, digest in index.items()]})
+        return digests | {key: each for key, each in unread_before.items() if self._cache.holds(each)}, errors
 
     def remembered(self, error: UnavailableError) -> dict[Key, str]:
         """Return what was published when the storage last answered, as far as the cache has it, and say so.
 
         Raises the error, which says why the storage does not answer, where the cache has nothing.
         """
-        document = self._cache.recall(self.uri) or {"at": "", "digests": []}
-        digests = {(name, version): digest for name, version, digest in document["digests"]}
+        at, digests = self._recall()
         held = {key: digest for key, digest in digests.items() if self._cache.holds(digest)}
         if not held:
             raise error
         missing = [f"{name} {version}" for name, version in digests.keys() - held.keys()]
         left_out = f"; not in the cache, and left out: {listed(sorted(missing))}" if missing else ""
-        logger.warning("%s: the cache serves what was published on %s%s", error.message, document["at"], left_out)
+        logger.warning("%s: the cache serves what was published on %s%s", error.message, at, left_out)
         return held
+
+    def _recall(self) -> tuple[str, dict[Key, str]]:
+        """Return when the storage last answered, and what was published then."""
+        document = self._cache.recall(self.uri) or {"at": "", "digests": []}
+        return document["at"], {(name, version): digest for name, version, digest in document["digests"]}
 
     def fetch(self, name: str, version: str, digest: str) -> Lease:
         """Return the folder of the bundle with that hash, fetched unless the cache has it.
@@ -134,13 +145,34 @@ class RemoteRepository:
     def _stamp_of(self, key: Key) -> Any:
         return self._known[key][0] if key in self._known else None
 
-    def _try_manifest(self, key: Key) -> Manifest | RlservoError | None:
+    def _manifests(self, keys: Sequence[Key]) -> dict[Key, Manifest | RlservoError | None]:
+        """Read manifests; None is one that was deleted meanwhile. Raises UnavailableError.
+
+        A storage that stopped to answer is not asked for each of a thousand: together they wait for one time-out.
+        """
+        results: dict[Key, Manifest | RlservoError | None] = {}
+        lost_s = 0.0
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            for key, (result, took_s) in zip(keys, pool.map(self._try_manifest, keys), strict=True):
+                results[key] = result
+                if isinstance(result, UnavailableError):
+                    lost_s += took_s
+                    if lost_s > AT_ONCE * self._storage.timeout_s:
+                        pool.shutdown(wait=False, cancel_futures=True)
+                        raise result
+        return results
+
+    def _try_manifest(self, key: Key) -> tuple[Manifest | RlservoError | None, float]:
+        """Return a manifest or what is wrong with it, and how long that took [s]."""
+        began = time.monotonic()
+        result: Manifest | RlservoError | None
         try:
-            return self._manifest(key)
-        except BundleError as error:
-            return error
-        except FileNotFoundError:  # deleted meanwhile
-            return None
+            result = self._manifest(key)
+        except (BundleError, UnavailableError) as error:
+            result = error
+        except FileNotFoundError:
+            result = None
+        return result, time.monotonic() - began
 
     def _manifest(self, key: Key) -> Manifest:
         name = f"{key[0]}/{key[1]}{SUFFIX}"

@@ -143,8 +143,8 @@ class ReplicaVersions:
         """Make a change and return the plan when every replica serves it.
 
         `change` must not block. `what` is kept as who did what. Raises what `change` raises, RefusedError when a
-        version cannot be served (then nothing has changed), and PartlyAppliedError when some replicas could not follow
-        (the change stands).
+        version cannot be served and UnavailableError when it could not be read (then nothing has changed), and
+        PartlyAppliedError when some replicas could not follow (the change stands).
         """
         before = await self._ledger.newest()
         if before is None or self.store is None:
@@ -380,6 +380,6 @@ def _loadables(policies: Mapping[str, PolicyPlan]) -> set[Loadable]:
 
 
 def _refusal(change: str, error: RlservoError) -> Refusal:
-    failed = error.details.get("versions", ()) if isinstance(error, RefusedError) else ()
+    failed = error.details.get("versions", ()) if isinstance(error, (RefusedError, UnavailableError)) else ()
     versions = tuple(FailedVersion(**version) for version in failed)
     return Refusal(change=change, reason=error.message, at=now(), versions=versions)

@@ -52,6 +52,11 @@ class _Listing:
     away: dict[RemoteRepository, UnavailableError] = field(default_factory=dict)
     twice: set[Key] = field(default_factory=set)
 
+    @property
+    def unread(self) -> set[Key]:
+        """Versions that are listed, whose manifest could not be read; some of them the cache has, and are found."""
+        return {key for key, error in self.errors.items() if isinstance(error, UnavailableError)}
+
     def add(self, key: Key, digest: str, place: str) -> None:
         """Add a bundle. A copy of one that is there is the same; another one makes neither of them usable."""
         there = self.found.setdefault(key, _Found(digest, place))
@@ -95,22 +100,28 @@ class Repository:
         """Return every bundle's hash by name and version; of a storage that is away what the cache has of it.
 
         Where the configuration means all that is there, all of it has to be good: raises BundleError or UsageError, and
-        UnavailableError where a storage is away and the cache does not have what the configuration names.
+        UnavailableError where a storage, or a manifest of it, cannot be read and the cache does not have what the
+        configuration means.
         """
         listing = self._look()
         for remote, error in listing.away.items():
             for key, digest in remote.remembered(error).items():
                 listing.add(key, digest, f"{remote.uri}/{key[0]}/{key[1]}")
-        if config.wants_all:
-            raise_all(list(listing.errors.values()))
         hashes: dict[str, dict[str, str]] = {}
         found = {key: each for key, each in listing.found.items() if key not in listing.twice}
+        for key in listing.unread & found.keys():
+            logger.warning("%s: the copy in the cache or a folder is served", listing.errors.pop(key).message)
+        if config.wants_all:
+            raise_all(list(listing.errors.values()))
         for (name, version), each in sorted(found.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
             hashes.setdefault(name, {})[version] = each.digest
-        for error in listing.away.values():
-            for name, policy in config.policies.items():
-                if any(version not in hashes.get(name, {}) for version in policy.versions or ()):
-                    raise error
+        for name, policy in config.policies.items():
+            for version in policy.versions or ():
+                if version not in hashes.get(name, {}):
+                    if (name, version) in listing.unread:
+                        raise listing.errors[name, version]
+                    for error in listing.away.values():
+                        raise error
         return hashes
 
     def look(self) -> tuple[dict[Key, str], list[RlservoError]]:
@@ -129,6 +140,9 @@ class Repository:
         versions = sorted((v for n, v in listing.found if n == name and (n, v) not in listing.twice), key=version_key)
         if listing.away and (version is None or version not in versions):
             raise next(iter(listing.away.values()))
+        for key in listing.unread - listing.found.keys():  # which may be the newest
+            if version is None and key[0] == name and version_key(key[1]) > max(map(version_key, versions), default=()):
+                raise listing.errors[key]
         wanted = version if version is not None else (versions[-1] if versions else None)
         if wanted is not None and wanted in versions:
             return wanted, listing.found[name, wanted].digest
@@ -233,4 +247,5 @@ def raise_all(errors: Sequence[RlservoError]) -> None:
         raise errors[0]
     if errors:
         sentences = "; ".join(error.message for error in errors)
-        raise BundleError(f"{len(errors)} bundles cannot be served: {sentences}")
+        kind = UnavailableError if all(isinstance(error, UnavailableError) for error in errors) else BundleError
+        raise kind(f"{len(errors)} bundles cannot be served: {sentences}")

@@ -92,7 +92,8 @@ class VersionLoader:
     async def prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> None:
         """Load what is new or newly relied on in `policies`, and check that canary and shadow fit the default version.
 
-        Raises RefusedError with all that cannot be served.
+        Raises RefusedError with all that cannot be served, and UnavailableError where it only could not be read,
+        or not in time.
         """
         failures: list[tuple[Key, RlservoError]] = []
         for name, policy in policies.items():
@@ -112,8 +113,10 @@ class VersionLoader:
         if failures:
             details = {"versions": [{"name": n, "version": v, "reason": e.message} for (n, v), e in failures]}
             try:
-                raise_all([BundleError(error.message) for _, error in failures])
-            except BundleError as error:
+                raise_all([error for _, error in failures])
+            except UnavailableError as error:
+                raise UnavailableError(error.message, details) from None
+            except RlservoError as error:
                 raise RefusedError(error.message, details) from None
 
     def keep(self, served: Mapping[Loadable, Policy], planned: Collection[Loadable], proposed: set[Loadable]) -> None:

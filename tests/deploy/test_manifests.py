@@ -87,8 +87,8 @@ def test_a_misspelt_key_or_a_wrong_value_does_not_pass(break_it: Callable[[dict[
 
 def test_kustomization_names_every_file_but_the_secrets() -> None:
     (kustomization,) = documents(KUBERAY / "kustomization.yaml")
-    files = {file.name for file in KUBERAY.glob("*.yaml")} - {"kustomization.yaml", "secrets.example.yaml"}
-    assert sorted(kustomization["resources"]) == sorted(files)
+    files = {file.name for file in KUBERAY.glob("*.yaml") if not file.name.startswith("secrets")}
+    assert sorted(kustomization["resources"]) == sorted(files - {"kustomization.yaml"})
 
 
 @pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`")  # ray 2.60 under pydantic 2.14
@@ -114,9 +114,19 @@ def test_proxies_are_on_every_node_and_replicas_apart() -> None:
     configuration = yaml.safe_load(RAY["spec"]["serveConfigV2"])
     assert configuration["proxy_location"] == "EveryNode"
     (application,) = configuration["applications"]
-    assert application["args"]["replicas"] == GROUPS["workers"]["replicas"]
+    workers = GROUPS["workers"]
+    assert application["args"]["replicas"] == workers["replicas"]
+    assert workers["minReplicas"] <= workers["replicas"] <= workers["maxReplicas"]  # KubeRay keeps it between these
     assert application["deployments"][0]["max_replicas_per_node"] == 1
     assert GROUPS["head"]["rayStartParams"]["num-cpus"] == "0"
+
+
+def test_replicas_of_a_change_find_room_beside_those_they_replace() -> None:
+    (application,) = yaml.safe_load(RAY["spec"]["serveConfigV2"])["applications"]
+    (stated,) = application["deployments"]
+    replicas, surge = application["args"]["replicas"], stated.get("max_surge_percent", 100)  # as ray_serve/app.py
+    most = replicas + -(-replicas * surge // 100)
+    assert most <= GROUPS["workers"]["minReplicas"] * stated["max_replicas_per_node"]
 
 
 def test_nodes_have_the_variables_of_cluster_env(tmp_path: Path) -> None:

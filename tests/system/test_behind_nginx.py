@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import socket
 import ssl
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import grpc
+import httpx
 import numpy as np
 import pytest
 
@@ -36,6 +38,7 @@ class Behind:
     port: int
     authority: Path  # the certificate that clients are to trust
     key: str
+    log: Path
 
     @property
     def url(self) -> str:
@@ -76,6 +79,7 @@ def behind(live_server: LiveServer, tmp_path_factory: pytest.TempPathFactory) ->
         ("/run/secrets/tls_certificate;", f"{certificate};"),
         ("/run/secrets/tls_key;", f"{key};"),
         ("worker_processes auto;", "worker_processes 1;"),
+        ("access_log /dev/stdout ", f"access_log {folder}/access.log "),
     ):
         assert text.count(ours) == 1, ours
         text = text.replace(ours, theirs)
@@ -94,7 +98,7 @@ def behind(live_server: LiveServer, tmp_path_factory: pytest.TempPathFactory) ->
                 break
             except OSError:
                 time.sleep(0.05)
-        yield Behind(port, authority, live_server.key)
+        yield Behind(port, authority, live_server.key, folder / "access.log")
     finally:
         process.terminate()
         process.wait(30)
@@ -158,3 +162,28 @@ def test_a_key_is_wanted_behind_tls_too_and_old_protocols_are_refused(trusted: B
         context.minimum_version = context.maximum_version = ssl.TLSVersion.TLSv1_1
     with socket.create_connection(("127.0.0.1", trusted.port), timeout=20) as plain, pytest.raises(ssl.SSLError):
         context.wrap_socket(plain, server_hostname="localhost")
+
+
+def test_administration_is_logged_with_the_clients_address_and_nothing_else_is(trusted: Behind) -> None:
+    with PolicyClient(trusted.url, "ur5", api_key=trusted.key, timeout_s=60) as client:
+        client.act(OBS)
+    assert trusted.log.read_text() == ""
+    replies = []
+    with httpx.Client(base_url=trusted.url, headers={"Authorization": f"Bearer {trusted.key}"}, timeout=60) as client:
+        for path in ("/v1/admin/policies/none/load", "/v2/repository/models/none/load"):
+            replies.append(client.post(path, json={}))
+    deadline = time.monotonic() + 20
+    while len(lines := trusted.log.read_text().splitlines()) < len(replies) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    for line, reply in zip(lines, replies, strict=True):
+        written = json.loads(line)
+        assert reply.status_code >= 400
+        assert written.pop("time").startswith("20")
+        assert written == {
+            "logger": "nginx.administration",
+            "client": "127.0.0.1",
+            "method": "POST",
+            "path": reply.url.path,
+            "status": str(reply.status_code),
+            "request_id": reply.headers["x-request-id"],
+        }

@@ -37,10 +37,12 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions.bundle_cache import MANIFEST_FILE
 from rlservo.serve_app.versions.manifest import MAX_MANIFEST_BYTES, REQUIRED, Manifest
 from rlservo.serve_app.versions.object_storage import announced, place_of
 from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.versions.publication import next_version, publish
+from rlservo.serve_app.versions.remote_repository import AT_ONCE
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
@@ -75,8 +77,9 @@ def repository(storage: Storage, cache: Path, **more: Any) -> Repository:
     return Repository([storage.uri], cache=cache, **{"storage_timeout_s": 10, **more})
 
 
-def replica(*places: str, cache: Path, timeout_s: float = 10) -> ReplicaVersions:
-    loader = VersionLoader(Repository(places, cache=cache, storage_timeout_s=timeout_s))
+def replica(*places: str, cache: Path, timeout_s: float = 10, load_timeout_s: float = 30) -> ReplicaVersions:
+    held = Repository(places, cache=cache, storage_timeout_s=timeout_s)
+    loader = VersionLoader(held, load_timeout_s=load_timeout_s)
     return ReplicaVersions(loader, MemoryLedger(), replica="only")
 
 
@@ -368,6 +371,90 @@ def test_a_server_starts_again_with_its_storage_away(
         repository(storage, cache.parent / "empty").available(ALL)
 
 
+@pytest.fixture
+def two(made: Path, storage: Storage, tmp_path: Path) -> dict[str, str]:
+    """The hashes of ur5 and mir, both in version 1; mir's manifest is refused."""
+    mir = load_bundle(write_box_policy(tmp_path, name="mir"))
+    put(made, storage.uri, "1")
+    publish(mir, storage.uri)
+    storage.tell(only("mir/1.json", echo))
+    return {"ur5": load_bundle(made / "ur5" / "1").digest, "mir": mir.digest}
+
+
+MIR_UNREAD = r"policies/mir/1\.json is refused with the credentials"
+
+
+def test_a_manifest_that_cannot_be_read_takes_its_own_version_away_and_no_other(
+    two: dict[str, str], storage: Storage, cache: Path
+) -> None:
+    def pinned(name: str) -> ServedConfig:
+        return ServedConfig.parse({"policies": {name: {"versions": ["1"]}}, "unlisted": "ignore"})
+
+    held = repository(storage, cache)
+    assert held.available(pinned("ur5")) == {"ur5": {"1": two["ur5"]}}
+    assert held.find_digest("ur5", None) == ("1", two["ur5"])
+    for config in (pinned("mir"), ALL):
+        with pytest.raises(UnavailableError, match=MIR_UNREAD):
+            held.available(config)
+    for version in (None, "1"):
+        with pytest.raises(UnavailableError, match=MIR_UNREAD):
+            held.find_digest("mir", version)
+    storage.tell(only("ur5/2.json", echo))
+    storage.change("PUT", "ur5/2.json")
+    assert held.find_digest("ur5", "1") == ("1", two["ur5"])
+    with pytest.raises(UnavailableError, match=r"ur5/2\.json is refused"):  # nobody knows whether it is the newest
+        held.find_digest("ur5", None)
+    storage.tell(lambda path, *reply: reply if "list-type" in path else echo(path))
+    with pytest.raises(UnavailableError, match=MIR_UNREAD):  # none can be read: the storage is away
+        repository(storage, cache.parent / "empty").available(pinned("ur5"))
+
+
+def test_what_the_cache_has_is_served_and_remembered_while_its_manifest_cannot_be_read(
+    two: dict[str, str], storage: Storage, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    storage.tell(None)
+    held = repository(storage, cache)
+    for name, digest in two.items():
+        held.find_digest(name, None)
+        held.fetch(name, "1", digest).release()
+    storage.tell(only("mir/1.json", echo))
+    everything = {name: {"1": digest} for name, digest in two.items()}
+    with caplog.at_level(logging.WARNING):
+        assert repository(storage, cache).available(ALL) == everything
+    assert "mir/1.json is refused" in caplog.text and "the copy in the cache or a folder is served" in caplog.text
+    storage.go_away()
+    assert repository(storage, cache).available(ALL) == everything
+
+
+def test_polling_reads_a_manifest_again_that_could_not_be_read(
+    made: Path, storage: Storage, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    put(made, storage.uri, "1")
+
+    async def run() -> None:
+        control = replica(storage.uri, cache=cache)
+        await control.configure({})
+        await asyncio.to_thread(put, made, storage.uri, "2")
+        storage.tell(only("ur5/2.json", echo))
+        poll = asyncio.create_task(control.poll_repository(0.05))
+        await until(lambda: "ur5/2.json is refused" in caplog.text)
+        storage.tell(None)
+        await until(lambda: control.store is not None and control.store.versions("ur5") == ("1", "2"))
+        poll.cancel()
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(run())
+
+
+def test_a_storage_that_stopped_to_answer_is_not_asked_for_every_manifest(storage: Storage, cache: Path) -> None:
+    for version in range(1, 81):
+        storage.change("PUT", f"ur5/{version}.json")
+    storage.tell(lambda path, *reply: reply if "list-type" in path else late(3)(path, *reply))
+    with pytest.raises(UnavailableError, match=r"\.json gave no answer within 1 s"):
+        repository(storage, cache, storage_timeout_s=1).available(ALL)
+    assert len({line for line in storage.proxy.requests if line.endswith(".json")}) <= 3 * AT_ONCE
+
+
 def test_wrong_and_missing_credentials_are_said(
     made: Path, storage: Storage, cache: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -540,6 +627,19 @@ def test_replicas_fetch_a_version_once_and_mend_a_damaged_one(made: Path, storag
         repository(storage, cache).fetch("ur5", "1", digest)
 
 
+@pytest.mark.parametrize("name", ["SHA256SUMS", "policy.onnx"])
+def test_an_entry_whose_manifest_lacks_a_file_is_fetched_again(
+    name: str, made: Path, storage: Storage, cache: Path
+) -> None:
+    put(made, storage.uri, "1")
+    folder = fetch(repository(storage, cache))
+    document = json.loads((folder / MANIFEST_FILE).read_text())
+    del document["files"][name]
+    (folder / MANIFEST_FILE).write_text(json.dumps(document))
+    (folder / name).unlink()
+    assert load_bundle(fetch(repository(storage, cache))).digest == load_bundle(made / "ur5" / "1").digest
+
+
 def test_a_served_version_stays_in_the_cache_until_it_is_let_go(made: Path, storage: Storage, cache: Path) -> None:
     put(made, storage.uri, "1", "2")
     held = repository(storage, cache, cache_bytes=int(1.5 * size_of(made)))
@@ -547,7 +647,7 @@ def test_a_served_version_stays_in_the_cache_until_it_is_let_go(made: Path, stor
     async def run() -> None:
         control = ReplicaVersions(VersionLoader(held), MemoryLedger(), replica="only")
         await control.configure({"policies": {"ur5": {"versions": ["1"]}}})
-        with pytest.raises(RefusedError, match="are in use"):
+        with pytest.raises(UnavailableError, match="are in use"):
             await control.load("ur5", "2", what="load")
         await control.change(lambda plan: plan_changes.unload(plan, "ur5", None), what="unload")
         await control.load("ur5", "2", what="load")
@@ -670,6 +770,32 @@ def test_polling_loads_what_is_newer_and_says_once_that_the_storage_is_away(
         asyncio.run(run())
     told = [line for line in caplog.messages if line.startswith("looking for new versions")]
     assert len(told) == len(set(told))
+
+
+@pytest.mark.parametrize(
+    ("lie", "sentence"),
+    [(late(9), "took longer than 6 s and was given up"), (None, "policy.onnx cannot be reached or")],
+)
+def test_polling_tries_again_what_could_not_be_read_for_a_while(
+    lie: Lie | None, sentence: str, made: Path, storage: Storage, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    put(made, storage.uri, "1")
+
+    async def run() -> None:
+        control = replica(storage.uri, cache=cache, timeout_s=30, load_timeout_s=6 if lie is not None else 30)
+        await control.configure({})
+        await asyncio.to_thread(put, made, storage.uri, "2")
+        storage.tell(only("2/policy.onnx", lie or busy))
+        poll = asyncio.create_task(control.poll_repository(0.05))
+        await until(lambda: sentence in caplog.text)
+        assert control.store is not None and control.store.versions("ur5") == ("1",)
+        assert control.plan is not None and control.plan.refused is None
+        storage.tell(None)
+        await until(lambda: control.store is not None and control.store.versions("ur5") == ("1", "2"))
+        poll.cancel()
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(run())
 
 
 def test_polling_leaves_out_what_the_configuration_pins(made: Path, cache: Path, tmp_path: Path) -> None:
