@@ -53,6 +53,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 # The folders (or files) that may import a library, by the library's dotted name. The longest name that fits counts.
 ONLY_IN: dict[str, tuple[str, ...]] = {
     "ray": ("export/rllib/", "serve_app/ray_serve/"),
+    "ray.serve": ("serve_app/ray_serve/",),
     "ray.rllib": ("export/rllib/",),
     "ray.tune": ("export/rllib/",),
     "uvicorn": ("serve_app/ray_serve/",),
