@@ -25,20 +25,20 @@ from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.direct_routes import PostRoute, StreamRoute
 from rlservo.serve_app.protocols.http_errors import Headers, error_answer, http_error, send_error, too_large
 from rlservo.serve_app.protocols.websocket_stream import refuse_upgrade
-from rlservo.serve_app.server.api_keys import Access, access_of
-from rlservo.serve_app.server.audit import AUDIT, AuditEntry
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_checks import (
+from rlservo.serve_app.server.access_checks import (
     HEADERS,
     LABEL,
     PATH,
     REPLY_HEADERS,
     REQUEST_ID,
-    RequestChecks,
+    AccessChecks,
     check_path,
     fold_headers,
     header_text,
 )
+from rlservo.serve_app.server.api_keys import Access, access_of
+from rlservo.serve_app.server.audit import AUDIT, AuditEntry
+from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_log import FIELDS
 from rlservo.serve_app.server.request_path import ClientGoneError, Codec
 from rlservo.serve_app.wire.request_stamp import STAMP
@@ -73,7 +73,7 @@ class PolicyApp(FastAPI):
     reaches FastAPI.
     """
 
-    def __init__(self, core: Core, checks: RequestChecks, **options: Any) -> None:
+    def __init__(self, core: Core, checks: AccessChecks, **options: Any) -> None:
         super().__init__(**options)
         self._core = core
         self._checks = checks

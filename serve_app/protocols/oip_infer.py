@@ -42,9 +42,9 @@ from rlservo.serve_app.protocols.oip_tensors import (
     write_tensor,
 )
 from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.access_checks import HEADERS
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
-from rlservo.serve_app.server.request_checks import HEADERS
 from rlservo.serve_app.server.request_fields import (
     LONGEST_SESSION_ID,
     OPTIONS,

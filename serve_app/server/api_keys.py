@@ -1,4 +1,4 @@
-"""API keys, kept as hashes, and what they are for; `request_checks.py` checks requests against them.
+"""API keys, kept as hashes, and what they are for; `access_checks.py` checks requests against them.
 
 A key is 256 random bits, so its plain SHA-256 is all that needs keeping: there is no dictionary to try. A line of the
 key file, or an entry of RLSERVO_API_KEYS (separated by commas), is

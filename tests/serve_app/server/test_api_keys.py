@@ -18,9 +18,9 @@ from websockets.exceptions import InvalidStatus
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.server.access_checks import AccessChecks, Hosts, fold_headers
 from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Access, Keys, Role, check_exposure, new_key
-from rlservo.serve_app.server.request_checks import Hosts, RequestChecks, fold_headers
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
@@ -192,7 +192,7 @@ def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served
 def check(headers: list[tuple[bytes, bytes]], **settings: Any) -> None:
     """Check a request with these headers against a server on loopback that wants no key."""
     chosen = ServerSettings(**settings)
-    checks = RequestChecks(Hosts("127.0.0.1", chosen, keyed=False), CurrentKeys(chosen))
+    checks = AccessChecks(Hosts("127.0.0.1", chosen, keyed=False), CurrentKeys(chosen))
     checks.check({"type": "http", "method": "POST"}, fold_headers(headers), Access.act)
 
 

@@ -141,7 +141,7 @@ class StreamKey:
             self._keys.limits.spend(self._key, self._key.limit)
 
 
-class RequestChecks:
+class AccessChecks:
     """Refuses, by their headers, HTTP requests and WebSockets that no client of ours sends or that have no key."""
 
     def __init__(self, hosts: Hosts, keys: CurrentKeys) -> None:
@@ -195,7 +195,7 @@ def header_text(headers: Mapping[bytes, bytes], name: bytes) -> str | None:
 def mend_headers(headers: list[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
     """Return headers that Ray Serve (2.60) can read, which decodes some as UTF-8 and answers what it cannot with 500.
 
-    `RequestChecks` refuses such a request later, when it has seen the key.
+    `AccessChecks` refuses such a request later, when it has seen the key.
     """
     mended: list[tuple[bytes, bytes]] = []
     for name, value in headers:
