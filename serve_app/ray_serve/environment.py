@@ -16,7 +16,8 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.ray_serve import loopback_binding
 from rlservo.serve_app.ray_serve.haproxy.configuration import CHECK_SECRET
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary, install_wrapper
-from rlservo.serve_app.ray_serve.processes import MARK, claim_port, free_ports, is_free
+from rlservo.serve_app.ray_serve.ports import claim_port, free_ports, is_free
+from rlservo.serve_app.ray_serve.processes import MARK
 from rlservo.serve_app.ray_serve.server_log import LOG_BYTES
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
 

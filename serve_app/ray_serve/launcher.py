@@ -28,7 +28,8 @@ from rlservo.export.contract.errors import UnavailableError, UsageError
 from rlservo.serve_app.ray_serve import direct_port, loopback_binding
 from rlservo.serve_app.ray_serve.environment import ray_environment
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
-from rlservo.serve_app.ray_serve.processes import check_port, describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.ports import check_port
+from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, remove_folder
 from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, last_fault
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure

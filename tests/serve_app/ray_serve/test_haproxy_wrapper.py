@@ -31,7 +31,7 @@ from rlservo.serve_app.ray_serve.haproxy import (
     process_table,
     watcher,
 )
-from rlservo.serve_app.ray_serve.processes import free_ports, is_free
+from rlservo.serve_app.ray_serve.ports import free_ports, is_free
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire import request_stamp
 from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
