@@ -10,8 +10,8 @@ import pytest
 import typer
 
 from rlservo.deploy.cli import app
+from rlservo.serve_app.episodes.request import REQUEST_FIELDS
 from rlservo.serve_app.protocols import oip_grpc
-from rlservo.serve_app.server.request_fields import REQUEST_FIELDS
 
 ROOT = Path(__file__).resolve().parent.parent
 CARDS = ROOT / "examples" / "checkpoints"  # their tables of figures are written by evaluate_shipped.py

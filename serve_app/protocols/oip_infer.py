@@ -27,7 +27,16 @@ from starlette.types import Receive
 from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.serve_app.episodes.request import Episode, Request
+from rlservo.serve_app.episodes.request import (
+    LONGEST_SESSION_ID,
+    OPTIONS,
+    Episode,
+    Request,
+    json_type,
+    parse_episode,
+    parse_finite,
+    parse_options,
+)
 from rlservo.serve_app.episodes.sessions import SessionId
 from rlservo.serve_app.protocols.http_endpoint import Body, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, too_large
@@ -45,14 +54,6 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.access_checks import HEADERS
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
-from rlservo.serve_app.server.request_fields import (
-    LONGEST_SESSION_ID,
-    OPTIONS,
-    json_type,
-    parse_episode,
-    parse_finite,
-    parse_options,
-)
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.state_names import BELONGS_TO
 

@@ -10,6 +10,8 @@ Sources: Fetch Standard, section 3.1 (Origin); W3C Fetch Metadata Request Header
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import ipaddress
 import re
 import socket
@@ -17,7 +19,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UnauthenticatedError
-from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Role
+from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Keys, Role
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.loopback import is_loopback
 
@@ -109,7 +111,7 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     if presented is None:
         what = "administration needs an admin" if admin else "this server wants an API"
         raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
-    key = accepted.find(presented)
+    key = find_key(accepted, presented)
     if key is None:
         raise UnauthenticatedError("this API key is not known to the server")
     if key.limit is not None:
@@ -119,6 +121,16 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
             f"the key '{key.label}' may ask for actions, and this needs an admin key", {"key": key.label}
         )
     return key
+
+
+def find_key(keys: Keys, presented: bytes) -> Key | None:
+    """Return the key that was presented. Every kept digest is compared, each in constant time."""
+    digest = hashlib.sha256(presented).digest()
+    found = None
+    for key in keys.keys if keys.operator is None else (*keys.keys, keys.operator):
+        if hmac.compare_digest(digest, key.digest):
+            found = key
+    return found
 
 
 class StreamKey:
