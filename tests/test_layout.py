@@ -73,8 +73,8 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "httpx": (),
     "httpcore": ("serve_app/client/deadline_backend.py", "serve_app/client/http_transport.py"),
     "websockets": (
-        "deploy/cockpit/page.py", "serve_app/client/websocket_connection.py", "serve_app/ray_serve/http_connections.py",
-        "serve_app/ray_serve/uvicorn_parts.py",
+        "deploy/cockpit/page.py", "serve_app/client/websocket_connection.py", "serve_app/ray_serve/uvicorn_parts.py",
+        "serve_app/ray_serve/websocket_connections.py",
     ),
     "viser": ("deploy/cockpit/",),
     "trimesh": ("deploy/cockpit/meshes.py", "deploy/cockpit/scenery.py"),
