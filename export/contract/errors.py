@@ -37,7 +37,7 @@ them to exit codes.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 
@@ -252,6 +252,11 @@ class ForbiddenError(RlservoError):
 
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def quoted(names: Iterable[str]) -> str:
+    """Return names for a sentence, each in quotes."""
+    return ", ".join(f"'{name}'" for name in names)
 
 
 def first_line(error: BaseException) -> str:

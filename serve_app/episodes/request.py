@@ -17,11 +17,11 @@ from typing import Any
 
 from rlservo.export.contract.errors import DeadlineError, RequestError
 from rlservo.serve_app.episodes.sessions import Session, SessionId
+from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
 MAX_SEED = 2**63 - 1
 LONGEST_SESSION_ID = 128
 LONGEST_LABEL = LONGEST_SESSION_ID  # a header may have 16 KB
-LONGEST_STATUS = 64
 
 
 def new_episode_id(label: str | None) -> str:

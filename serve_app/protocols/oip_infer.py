@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.types import Receive
 
 from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
-from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError
+from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError, quoted
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.serve_app.episodes.request import (
     LONGEST_SESSION_ID,
@@ -436,10 +436,6 @@ def _wanted_outputs(
         chosen = parse_flag(own, "binary_data")
         wanted[name] = binary if chosen is None else chosen
     return wanted
-
-
-def quoted(names: list[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names)
 
 
 def offered_inputs(policy: Policy) -> list[TensorSpec]:

@@ -26,7 +26,7 @@ from typing import Any
 
 from rlservo.export.contract.errors import UnavailableError, UsageError
 from rlservo.serve_app.ray_serve import direct_port, loopback_binding
-from rlservo.serve_app.ray_serve.environment import ray_environment
+from rlservo.serve_app.ray_serve.environment import PROXY_SETTINGS, ray_environment
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
 from rlservo.serve_app.ray_serve.ports import check_port
 from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, remove_folder
@@ -257,7 +257,7 @@ def _child(
     if settings["direct_port"] is not None:
         environment[direct_port.VARIABLE] = str(folder / DIRECT_SOCKET)
     # The proxy is no part of the application, which is given its settings.
-    for name in ("stream_idle_s", "max_connections_per_address"):
+    for name in PROXY_SETTINGS:
         environment[PREFIX + name.upper()] = str(settings[name])
     read_fd, write_fd = os.pipe()
     (folder / RAY_FOLDER).mkdir()

@@ -22,6 +22,7 @@ from rlservo.export.contract.errors import ForbiddenError, RequestError, Unauthe
 from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Keys, Role
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.loopback import is_loopback
+from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 if TYPE_CHECKING:
     from starlette.types import Scope
@@ -41,7 +42,7 @@ TIMEOUT = b"x-request-timeout-seconds"  # Ray Serve's; infinity makes its event 
 PAGE_SCHEMES = (b"http://", b"https://")  # a proxy may have ended TLS
 HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
-LABEL = b"x-session-id"  # whose request it is, where a canary runs; Ray Serve's own routing knows the header, too
+LABEL = LABEL_HEADER.encode()
 HEADERS = "rlservo.headers"  # in a connection's scope: what `fold_headers` gave
 REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, beside the protocol's own
 ANY_HOST = "*"
