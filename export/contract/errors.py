@@ -202,6 +202,11 @@ class RateLimitError(UnavailableError):
 
     code = "rate-limited"
 
+    def __init__(self, message: str, details: Mapping[str, Any] | None = None, *, key: str = "") -> None:
+        """`key` is the label of the API key that asked, where one did."""
+        super().__init__(message, {"key": key, **(details or {})} if key else details)
+        self.key = key
+
 
 class LateError(UnavailableError):
     """The observation waited longer than the server answers as fresh; nothing was computed."""
@@ -249,6 +254,11 @@ class ForbiddenError(RlservoError):
     """The key, or the page the request comes from, may not do this."""
 
     code = "forbidden"
+
+    def __init__(self, message: str, details: Mapping[str, Any] | None = None, *, key: str = "") -> None:
+        """`key` is the label of the API key that asked, where one did."""
+        super().__init__(message, {"key": key, **(details or {})} if key else details)
+        self.key = key
 
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")

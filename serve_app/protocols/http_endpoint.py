@@ -20,7 +20,7 @@ from fastapi import FastAPI
 from starlette.routing import BaseRoute, Match
 from starlette.types import Message, Receive, Scope, Send
 
-from rlservo.export.contract.errors import RlservoError, UnknownPolicyError
+from rlservo.export.contract.errors import ForbiddenError, RateLimitError, RlservoError, UnknownPolicyError
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.direct_routes import PostRoute, StreamRoute
 from rlservo.serve_app.protocols.http_errors import Headers, error_answer, http_error, send_error, too_large
@@ -158,7 +158,9 @@ class PolicyApp(FastAPI):
                 return
             body = await receive_body(self._core, headers, receive)
         except RlservoError as error:
-            entry.code, entry.key = error.code, entry.key or str(error.details.get("key", ""))
+            entry.code = error.code
+            if isinstance(error, ForbiddenError | RateLimitError):
+                entry.key = entry.key or error.key
             await self._refuse(scope, headers, receive, send, error)
         except ClientGoneError:
             return

@@ -118,9 +118,7 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     if key.limit is not None:
         keys.limits.spend(key, key.limit)
     if admin and key.role is not Role.admin:
-        raise ForbiddenError(
-            f"the key '{key.label}' may ask for actions, and this needs an admin key", {"key": key.label}
-        )
+        raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key", key=key.label)
     return key
 
 
