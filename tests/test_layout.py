@@ -219,3 +219,12 @@ def test_every_package_folder_is_in_the_project_file() -> None:
 def test_every_folder_says_what_lives_in_it() -> None:
     for folder in sorted({path.parent for path in modules()}):
         assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), f"{folder} has no docstring"
+
+
+@pytest.mark.parametrize("folder", (*FOLDERS, "examples", "benchmarks", "tests"))
+def test_every_module_begins_with_a_noun_or_a_verb(folder: str) -> None:
+    questions = ("What ", "Who ", "How ", "Whether ", "From ", "When ", "Where ", "Which ")
+    files = sorted((ROOT / folder).rglob("*.py"))
+    assert files
+    docs = {str(path.relative_to(ROOT)): ast.get_docstring(ast.parse(path.read_text())) or "" for path in files}
+    assert {path: text.splitlines()[0] for path, text in docs.items() if text.startswith(questions)} == {}
