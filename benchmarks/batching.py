@@ -41,7 +41,7 @@ from rich.table import Table
 from rlservo.export.commands.export import export_checkpoint
 from rlservo.export.contract.bundle import ONNX_FILE, Bundle, load_bundle
 from rlservo.export.contract.ort_session import open_ort_session
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from speed.loads import wrk
 from speed.servers import Exchange, Server, running
 

@@ -30,7 +30,8 @@ from ray.util import get_node_ip_address
 
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.ray_serve.environment import cluster_environment, proxy_files, proxy_ports
-from rlservo.serve_app.ray_serve.processes import MARK, end_marked, find_marked, free_ports, remove_folder
+from rlservo.serve_app.ray_serve.ports import free_ports
+from rlservo.serve_app.ray_serve.processes import MARK, end_marked, find_marked, remove_folder
 
 NODE = "RLSERVO_BENCHMARK_NODE"  # inherited by all that a node starts
 TICKS = os.sysconf("SC_CLK_TCK")

@@ -32,7 +32,7 @@ from playwright.sync_api import sync_playwright
 from rich.console import Console
 from rich.table import Table
 
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 
 SETTLE_S = 4.0  # shaders are compiled, viser has settled on a resolution
 PATIENCE_S = 120.0

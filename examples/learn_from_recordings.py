@@ -36,6 +36,7 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from shared.help_text import DefaultsFormatter
 from shared.recorded_episodes import Choice, Recorded, RecordedEpisodes
 
+from rlservo import errors
 from rlservo.export.checkpoints.location import (
     ENV_TO_MODULE,
     MODULE_TO_ENV,
@@ -43,7 +44,6 @@ from rlservo.export.checkpoints.location import (
     CheckpointFiles,
     locate_checkpoint,
 )
-from rlservo.export.contract.errors import UsageError
 from rlservo.export.rllib import private_names
 from rlservo.serve_app.recording.conversion import gym_space
 from rlservo.serve_app.recording.reader import Recording
@@ -103,7 +103,7 @@ def start_from(checkpoint: Path, recorded: Recorded) -> Start:
     """
     files = locate_checkpoint(checkpoint)
     if not isinstance(files, CheckpointFiles) or not files.has_pipelines or files.is_one_of_several:
-        raise UsageError(
+        raise errors.UsageError(
             f"--from {checkpoint}: expected a checkpoint of RLlib's new API stack, of one agent, with its connectors"
         )
     env_to_module = EnvToModulePipeline.from_checkpoint(str(files.env_to_module))
@@ -112,9 +112,9 @@ def start_from(checkpoint: Path, recorded: Recorded) -> Start:
     ours = env_to_module.input_observation_space
     alike = ours == seen or (isinstance(ours, Box) and isinstance(seen, Box) and ours.shape == seen.shape)
     if not alike:
-        raise UsageError(f"--from {checkpoint}: it observes {ours}, and recorded is {seen}")
+        raise errors.UsageError(f"--from {checkpoint}: it observes {ours}, and recorded is {seen}")
     if module_to_env.input_action_space != done:
-        raise UsageError(
+        raise errors.UsageError(
             f"--from {checkpoint}: its actions are {module_to_env.input_action_space}, recorded are {done}"
         )
     return Start(env_to_module, module_to_env, RLModule.from_checkpoint(str(files.module)), files.module)
@@ -219,7 +219,7 @@ def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmCo
     search_space.apply(config, changes, "--set")
     search_space.validate(config)
     if cast(Any, config).num_learners:
-        raise UsageError("--set num_learners: recordings are learned from in this process, by one learner")
+        raise errors.UsageError("--set num_learners: recordings are learned from in this process, by one learner")
     return config, start, sentence
 
 
@@ -256,13 +256,15 @@ def report(recorded: Recorded) -> None:
 def main() -> None:
     args = argument_parser().parse_args()
     if args.out.exists():
-        raise UsageError(f"--out {args.out} exists: give a new folder")
+        raise errors.UsageError(f"--out {args.out} exists: give a new folder")
     if args.epochs < 1 or args.batch_size < 1:
-        raise UsageError(f"--epochs is {args.epochs} and --batch-size {args.batch_size}: expected at least 1")
+        raise errors.UsageError(f"--epochs is {args.epochs} and --batch-size {args.batch_size}: expected at least 1")
     if args.run != "BC" and (args.modes or args.ahead):
-        raise UsageError("--modes and --ahead are BC's: rewards and values belong to the actions that were executed")
+        raise errors.UsageError(
+            "--modes and --ahead are BC's: rewards and values belong to the actions that were executed"
+        )
     if args.ahead < 0:
-        raise UsageError(f"--ahead is {args.ahead}: expected 0 or more control cycles")
+        raise errors.UsageError(f"--ahead is {args.ahead}: expected 0 or more control cycles")
     training_run.pickle_by_value(sys.modules[__name__], recorded_episodes)
     torch.set_num_threads(1)
     choice = Choice(rewards=args.run != "BC", status=args.status, modes=args.modes, ahead=args.ahead)

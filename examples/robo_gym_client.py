@@ -30,8 +30,7 @@ import grpc
 import gymnasium as gym
 import numpy as np
 
-from rlservo.export.contract.errors import RlservoError, UnavailableError
-from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo import PolicyClient, errors
 
 # robo-gym's names, and the policies that examples/robo_gym.md serves for them.
 POLICIES = {
@@ -69,7 +68,7 @@ def main() -> int:
         except KeyboardInterrupt:
             print("stopped", file=sys.stderr)
             return INTERRUPTED
-        except RlservoError as error:
+        except errors.RlservoError as error:
             print(f"error: {error}", file=sys.stderr)
             return 1
     return 0
@@ -119,12 +118,12 @@ def import_robo_gym() -> None:
     try:
         importlib.import_module("robo_gym")
     except ImportError as error:
-        raise RlservoError(
+        raise errors.RlservoError(
             f"robo-gym cannot be imported in {sys.executable} ({error}): examples/robo_gym.md says how to make an "
             "environment for it"
         ) from error
     except TypeError as error:  # protobuf's "Descriptors cannot be created directly"
-        raise RlservoError(
+        raise errors.RlservoError(
             "robo-gym cannot be imported with this protobuf: it needs one below 3.21, in an environment of its own "
             "(examples/robo_gym.md)"
         ) from error
@@ -139,7 +138,7 @@ def locate_robot(args: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     if args.rs_address:
         host, _, port = args.rs_address.rpartition(":")
         if not answers(host.strip("[]"), int(port), GET_STATE):
-            raise UnavailableError(f"--rs-address {args.rs_address}: no robot server answers there")
+            raise errors.UnavailableError(f"--rs-address {args.rs_address}: no robot server answers there")
         return f"{args.task}Rob-v0", {"rs_address": args.rs_address, **ur}
     ports = MANAGER_PORTS if args.manager_port is None else (args.manager_port,)
     for port in ports:
@@ -147,7 +146,7 @@ def locate_robot(args: argparse.Namespace) -> tuple[str, dict[str, Any]]:
             bounds = {"lower_bound_port": port, "upper_bound_port": port + 1}
             return f"{args.task}Sim-v0", {"ip": args.manager, **bounds, **ur}
     where = f"{args.manager}:{ports[0]}" if len(ports) == 1 else f"{args.manager}, ports {ports[0]} to {ports[-1]}"
-    raise UnavailableError(f"no server manager answers at {where}: start one with 'rlservo server-manager'")
+    raise errors.UnavailableError(f"no server manager answers at {where}: start one with 'rlservo server-manager'")
 
 
 def answers(host: str, port: int, method: str) -> bool:
@@ -157,7 +156,7 @@ def answers(host: str, port: int, method: str) -> bool:
     except ConnectionRefusedError:
         return False
     except (OSError, UnicodeError) as error:  # the other ports of this host would tell the same, each as slowly
-        raise UnavailableError(f"{host}:{port} cannot be reached: {error}") from error
+        raise errors.UnavailableError(f"{host}:{port} cannot be reached: {error}") from error
     with grpc.insecure_channel(f"[{host}]:{port}" if ":" in host else f"{host}:{port}") as channel:
         try:
             channel.unary_unary(method)(b"", timeout=ANSWER_S)
@@ -231,10 +230,12 @@ def sentences(what: str) -> Iterator[None]:
         yield
     except grpc.RpcError as error:
         reason = error.details() if isinstance(error, grpc.Call) else str(error)
-        raise UnavailableError(f"{what}: the robot server does not answer ({reason})") from error
+        raise errors.UnavailableError(f"{what}: the robot server does not answer ({reason})") from error
     except Exception as error:  # robo-gym's own tree, AssertionError, RuntimeError, Exception
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise RlservoError(f"{what}: {reason}; the log of the server manager or robot server says why") from error
+        raise errors.RlservoError(
+            f"{what}: {reason}; the log of the server manager or robot server says why"
+        ) from error
 
 
 def end_simulator(env: Any) -> None:

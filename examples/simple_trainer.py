@@ -36,7 +36,7 @@ from shared.help_text import DefaultsFormatter
 from shared.resources import Room
 from shared.training_run import RETURN, STEPS, Run
 
-from rlservo.export.contract.errors import UsageError
+from rlservo import errors
 from rlservo.export.rllib.batched_connectors import supports, use_batched_connectors
 from rlservo.serve_app.rollout.environment import make_env
 
@@ -298,7 +298,9 @@ def observation_steps(space: Any, kind: str) -> Any:
     flatten = is_flattened(space)
     has_filter = kind == "MeanStdFilter"
     if has_filter and (not isinstance(space, Box) or np.dtype(space.dtype).kind != "f"):
-        raise UsageError(f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, {space} is none")
+        raise errors.UsageError(
+            f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, {space} is none"
+        )
     if not (flatten or has_filter):
         return None
 
@@ -336,7 +338,7 @@ def inspect_environment(args: argparse.Namespace, env_config: Mapping[str, Any])
     kinds = ACTIONS.get(args.run)
     if kinds and not isinstance(spaces[1], kinds):
         fit = "PPO, APPO, IMPALA or SAC" if isinstance(spaces[1], Box) else "PPO, APPO or IMPALA"
-        raise UsageError(
+        raise errors.UsageError(
             f"--run {args.run}: it needs {' or '.join(kind.__name__ for kind in kinds)} actions, {args.name_env} takes "
             f"{spaces[1]}; use --run {fit}"
         )
@@ -356,7 +358,7 @@ def set_up(args: argparse.Namespace) -> tuple[AlgorithmConfig, Run, list[str]]:
     config = algorithm_config(args, inspect_environment(args, env_config), env_config)
     constants = search_space.parse_settings(args.set, "--set")
     if several := [name for name, values in constants.items() if len(values) > 1]:
-        raise UsageError(f"--set {several[0]}: expected one value; --sweep {several[0]}=... tries several")
+        raise errors.UsageError(f"--set {several[0]}: expected one value; --sweep {several[0]}=... tries several")
     search_space.apply(config, {name: values[0] for name, values in constants.items()}, "--set")
     search_space.validate(config)
     grid = {
@@ -364,7 +366,7 @@ def set_up(args: argparse.Namespace) -> tuple[AlgorithmConfig, Run, list[str]]:
     }
     space = search_space.load_search_space(args.search_space) if args.search_space else {}
     if twice := sorted((set(grid) | set(space)) & set(constants)) or sorted(set(grid) & set(space)):
-        raise UsageError(f"{twice[0]} is given twice, by --set, --sweep or --search-space: once is enough")
+        raise errors.UsageError(f"{twice[0]} is given twice, by --set, --sweep or --search-space: once is enough")
     search_space.apply(config, grid, "--sweep")
     search_space.apply(config, space, "--search-space")
     combinations = search_space.check_combinations(config, grid | space) or [config]
@@ -418,7 +420,9 @@ def main() -> None:
     training_run.pickle_by_value(sys.modules[__name__], episode_traces)
     if args.resume:
         if more := sorted(explicit(sys.argv[1:]) - set(AFTER_RESUME)):
-            raise UsageError(f"--resume goes on with the run as it was set up: leave --{more[0].replace('_', '-')} out")
+            raise errors.UsageError(
+                f"--resume goes on with the run as it was set up: leave --{more[0].replace('_', '-')} out"
+            )
         run, _ = training_run.load_run(args.resume)
         if args.address is None and run.request:  # runs of before have none
             check_machine(run)

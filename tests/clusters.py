@@ -22,7 +22,8 @@ import yaml
 
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.ray_serve.environment import cluster_environment, proxy_files, proxy_ports
-from rlservo.serve_app.ray_serve.processes import MARK, end_marked, free_ports, remove_folder
+from rlservo.serve_app.ray_serve.ports import free_ports
+from rlservo.serve_app.ray_serve.processes import MARK, end_marked, remove_folder
 from rlservo.serve_app.server.api_keys import new_key
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -1,4 +1,4 @@
-"""How the tests are spread over pytest-xdist's processes. What they share is in the plugins below."""
+"""Distribution of the tests over pytest-xdist's processes. What they share is in the plugins below."""
 
 from __future__ import annotations
 

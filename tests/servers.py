@@ -25,7 +25,7 @@ import pytest
 import uvicorn
 
 from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.processes import check_port, free_ports, port_holder
+from rlservo.serve_app.ray_serve.ports import check_port, free_ports, port_holder
 from rlservo.serve_app.server.api_keys import new_key
 
 ROOT = Path(__file__).resolve().parents[1]

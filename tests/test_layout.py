@@ -53,6 +53,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 # The folders (or files) that may import a library, by the library's dotted name. The longest name that fits counts.
 ONLY_IN: dict[str, tuple[str, ...]] = {
     "ray": ("export/rllib/", "serve_app/ray_serve/"),
+    "ray.serve": ("serve_app/ray_serve/",),
     "ray.rllib": ("export/rllib/",),
     "ray.tune": ("export/rllib/",),
     "uvicorn": ("serve_app/ray_serve/",),
@@ -72,8 +73,8 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "httpx": (),
     "httpcore": ("serve_app/client/deadline_backend.py", "serve_app/client/http_transport.py"),
     "websockets": (
-        "deploy/cockpit/page.py", "serve_app/client/websocket_connection.py", "serve_app/ray_serve/http_connections.py",
-        "serve_app/ray_serve/uvicorn_parts.py",
+        "deploy/cockpit/page.py", "serve_app/client/websocket_connection.py", "serve_app/ray_serve/uvicorn_parts.py",
+        "serve_app/ray_serve/websocket_connections.py",
     ),
     "viser": ("deploy/cockpit/",),
     "trimesh": ("deploy/cockpit/meshes.py", "deploy/cockpit/scenery.py"),
@@ -218,3 +219,12 @@ def test_every_package_folder_is_in_the_project_file() -> None:
 def test_every_folder_says_what_lives_in_it() -> None:
     for folder in sorted({path.parent for path in modules()}):
         assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), f"{folder} has no docstring"
+
+
+@pytest.mark.parametrize("folder", (*FOLDERS, "examples", "benchmarks", "tests"))
+def test_every_module_begins_with_a_noun_or_a_verb(folder: str) -> None:
+    questions = ("What ", "Who ", "How ", "Whether ", "From ", "When ", "Where ", "Which ")
+    files = sorted((ROOT / folder).rglob("*.py"))
+    assert files
+    docs = {str(path.relative_to(ROOT)): ast.get_docstring(ast.parse(path.read_text())) or "" for path in files}
+    assert {path: text.splitlines()[0] for path, text in docs.items() if text.startswith(questions)} == {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 import textwrap
@@ -46,6 +47,15 @@ def test_public_names_are_all_there_and_nothing_else() -> None:
     assert isinstance(rlservo.__version__, str) and rlservo.__version__[0].isdigit()
     with pytest.raises(AttributeError, match="module 'rlservo' has no attribute 'Polcy'"):
         rlservo.Polcy  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_examples_take_public_names_from_rlservo_itself() -> None:
+    inside = {f"{module}.{name}" for name, module in rlservo._MODULES.items()}
+    for file in sorted((ROOT / "examples").rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                names = {node.module, *(f"{node.module}.{each.name}" for each in node.names)}
+                assert not names & inside, f"{file.relative_to(ROOT)}, line {node.lineno}"
 
 
 @pytest.mark.parametrize("folder", [ROOT, Path("/")], ids=["in the checkout", "elsewhere"])

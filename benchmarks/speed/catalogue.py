@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.bundle import ONNX_FILE, Bundle, load_bundle
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.wire.msgpack_arrays import pack
 from speed.environments import InstallError, node_modules_of, python_of
 from speed.servers import Exchange, Server

@@ -18,7 +18,7 @@ from typing import Any
 import yaml
 
 from rlservo.serve_app.ray_serve.environment import cluster_environment, proxy_files, proxy_ports
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from speed.catalogue import Case, asked
 from speed.servers import Server, environment
 

@@ -25,7 +25,7 @@ import yaml
 
 from rlservo.serve_app.ray_serve.environment import cluster_environment, proxy_files, proxy_ports
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.server.api_keys import new_key
 from speed.catalogue import Case, asked
 from speed.cluster import SHIPPED, Cluster, replica_ports

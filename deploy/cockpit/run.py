@@ -17,8 +17,8 @@ from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
 from rlservo.deploy.cockpit.policies import Choice, PolicySource
 from rlservo.deploy.cockpit.watch import WatchPanel
 from rlservo.export.contract.errors import UnknownPolicyError, UsageError
+from rlservo.serve_app.versions.plan import PRODUCTION
 
-PRODUCTION = "production"
 OnReady = Callable[[str], None]
 
 

@@ -27,7 +27,7 @@ from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.interface import ActingPolicy, Observation
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.rollout.control_loop import rollout
 
 FIRST_SEED = 10_000  # not among the seeds the policies were trained with

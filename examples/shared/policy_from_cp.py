@@ -17,11 +17,10 @@ import numpy as np
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
+from rlservo import Policy, errors
 from rlservo.export.commands.export import LOADING_RUNS_CODE
-from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.rollout.environment import check_fit, make_env
 from rlservo.serve_app.rollout.episode import success_of
-from rlservo.serve_app.runtime.policy import Policy
 from shared.help_text import DefaultsFormatter
 
 Act = Callable[[Any, bool], tuple[NDArray[Any], bool]]
@@ -99,7 +98,7 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
         ("action", recipe.action_space, env.action_space),
     ):
         if not isinstance(ours, Box) or ours.shape != theirs.shape:
-            raise UsageError(
+            raise errors.UsageError(
                 f"the policy in {path} has {_space_name(ours)} for its {side} space, {env.spec.id} has "
                 f"{_space_name(theirs)}: it was trained for another environment"
             )

@@ -21,7 +21,7 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.offline.offline_data import OfflineData
 from ray.rllib.utils import flatten_dict
 
-from rlservo.export.contract.errors import UsageError
+from rlservo import errors
 from rlservo.export.contract.nested import build_action
 from rlservo.export.rllib import private_names
 from rlservo.export.rllib.new_connectors import PLUMBING
@@ -93,7 +93,7 @@ def read_recordings(recording: Recording, choice: Choice | None = None, *, name:
     assert recorded is not None, "episodes_of_one raises where there are none"
     if not recorded.episodes:
         reasons = ", ".join(f"{count} {reason}" for reason, count in recorded.not_used.items())
-        raise UsageError(f"no recorded episode can be learned from: {reasons}")
+        raise errors.UsageError(f"no recorded episode can be learned from: {reasons}")
     return recorded
 
 
@@ -155,7 +155,7 @@ def through_connectors(
     pieces = [piece for piece in env_to_module.connectors if type(piece).__name__ not in PLUMBING]
     for piece in pieces:
         if type(piece).__name__ in CANNOT_LEARN:
-            raise UsageError(f"policies behind {type(piece).__name__} cannot be learned from recordings")
+            raise errors.UsageError(f"policies behind {type(piece).__name__} cannot be learned from recordings")
         if type(piece).__name__ == "MeanStdFilter":
             private_names.replace(piece, "_update_stats", learn)
     done: list[SingleAgentEpisode] = []

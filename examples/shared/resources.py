@@ -20,7 +20,7 @@ import ray
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.util import placement_group_table
 
-from rlservo.export.contract.errors import UsageError
+from rlservo import errors
 
 assert ray_settings
 Bundle = Mapping[str, float]  # resource -> amount, of one process
@@ -58,7 +58,7 @@ def request_of(config: AlgorithmConfig) -> list[dict[str, float]]:
     try:
         factory = cast(Any, config.algo_class).default_resource_request(config.copy(copy_frozen=False))
     except (TypeError, ValueError) as error:
-        raise UsageError(f"the resources asked for are none that RLlib understands: {error}") from error
+        raise errors.UsageError(f"the resources asked for are none that RLlib understands: {error}") from error
     bundles = [{name: float(amount) for name, amount in bundle.items() if amount} for bundle in factory.bundles]
     if factory.strategy == "STRICT_PACK":
         return [{name: _total(bundles, name) for bundle in bundles for name in bundle}]
@@ -82,19 +82,19 @@ def check_room(
         return
     for name in sorted({name for bundle in request for name in bundle}):
         if _total(request, name) > room.total(name) + ROUNDING:
-            raise UsageError(
+            raise errors.UsageError(
                 f"{_amount(name, _total(request, name))} asked for ({_listing(request)}); {room.name} has "
                 f"{_amount(name, room.total(name))}: {_advice(request, room, name, config)}"
             )
     fitting = _fitting(request, room, 1 if concurrent is None else concurrent)
     if fitting == 0:
         machines = ", ".join(_bundle({name: node.get(name, 0.0) for name in ("CPU", "GPU")}) for node in room.nodes)
-        raise UsageError(
+        raise errors.UsageError(
             f"{_listing(request)} asked for, each on one machine; the machines of {room.name} have {machines}: ask for "
             "fewer or smaller processes"
         )
     if concurrent is not None and fitting < concurrent:
-        raise UsageError(
+        raise errors.UsageError(
             f"{concurrent} trials at once asked for, each of {_listing(request)}; {room.name} has room for {fitting}: "
             "leave --max-concurrent-trials out, and as many run as fit"
         )

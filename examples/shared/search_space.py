@@ -24,7 +24,7 @@ from ray import tune
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.tune.search.sample import Categorical, Domain
 
-from rlservo.export.contract.errors import UsageError
+from rlservo import errors
 
 assert ray_settings
 DISTRIBUTIONS: dict[str, Callable[..., Any]] = {
@@ -64,9 +64,11 @@ def parse_settings(pairs: Sequence[str], option: str) -> dict[str, list[Any]]:
         name, equals, text = pair.partition("=")
         values = [_value(part) for part in text.split(",")] if not text.startswith(("[", "{")) else [_value(text)]
         if not equals or not name.isidentifier() or any(value is None for value in values):
-            raise UsageError(f"{option} {pair}: expected NAME=VALUE or NAME=VALUE,VALUE,..., as in lr=1e-4,3e-4")
+            raise errors.UsageError(f"{option} {pair}: expected NAME=VALUE or NAME=VALUE,VALUE,..., as in lr=1e-4,3e-4")
         if name in settings:
-            raise UsageError(f"{option} {pair}: {name} was given before; write its values after one =, with commas")
+            raise errors.UsageError(
+                f"{option} {pair}: {name} was given before; write its values after one =, with commas"
+            )
         settings[name] = values
     return settings
 
@@ -95,9 +97,9 @@ def load_search_space(path: Path) -> dict[str, Any]:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise UsageError(f"--search-space {path}: cannot be read: {reason}") from error
+        raise errors.UsageError(f"--search-space {path}: cannot be read: {reason}") from error
     if not isinstance(document, Mapping) or not document:
-        raise UsageError(f"--search-space {path}: expected a map from a setting's name to its values or range")
+        raise errors.UsageError(f"--search-space {path}: expected a map from a setting's name to its values or range")
     return {str(name): _domain(path, str(name), entry) for name, entry in document.items()}
 
 
@@ -114,10 +116,12 @@ def _domain(path: Path, name: str, entry: Any) -> Any:
             if len(numbers) == count and all(isinstance(one, int | float) for one in numbers):
                 if numbers[0] < numbers[1] and (kind != "loguniform" or numbers[0] > 0):
                     return DISTRIBUTIONS[kind](*numbers)
-                raise UsageError(f"--search-space {path}: {name}: {kind} {values} needs low < high (above 0 for log)")
+                raise errors.UsageError(
+                    f"--search-space {path}: {name}: {kind} {values} needs low < high (above 0 for log)"
+                )
     if not isinstance(entry, list | Mapping):
         return _number(entry)
-    raise UsageError(
+    raise errors.UsageError(
         f"--search-space {path}: {name}: expected a value, a list, or one of "
         f"{', '.join(['choice', *DISTRIBUTIONS])} with a list, got {entry}"
     )
@@ -137,15 +141,15 @@ def apply(config: AlgorithmConfig, settings: Mapping[str, Any], option: str) -> 
     names += [name.removeprefix("_") for name in vars(config) if hasattr(type(config), name.removeprefix("_"))]
     for name, value in settings.items():
         if name in NEW_NAMES:
-            raise UsageError(f"{option} {name}: use {NEW_NAMES[name]} instead")
+            raise errors.UsageError(f"{option} {name}: use {NEW_NAMES[name]} instead")
         if name not in names:
             close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
             hint = f"did you mean {' or '.join(close)}?" if close else f"see {type(config).__name__}'s attributes"
-            raise UsageError(f"{option} {name}: {type(config).__name__} has no such setting: {hint}")
+            raise errors.UsageError(f"{option} {name}: {type(config).__name__} has no such setting: {hint}")
         try:
             setattr(config, name, value)
         except Exception as error:  # RLlib's deprecated names raise in their setters
-            raise UsageError(f"{option} {name}: RLlib refuses it: {str(error).splitlines()[0]}") from error
+            raise errors.UsageError(f"{option} {name}: RLlib refuses it: {str(error).splitlines()[0]}") from error
 
 
 def validate(config: AlgorithmConfig, of: str = "this configuration") -> None:
@@ -153,7 +157,7 @@ def validate(config: AlgorithmConfig, of: str = "this configuration") -> None:
     try:
         config.copy(copy_frozen=False).validate()
     except Exception as error:  # RLlib's checks raise ValueError and much else
-        raise UsageError(f"RLlib refuses {of}: {' '.join(str(error).split())}") from error
+        raise errors.UsageError(f"RLlib refuses {of}: {' '.join(str(error).split())}") from error
 
 
 def check_combinations(config: AlgorithmConfig, space: Mapping[str, Any], at_most: int = 100) -> list[AlgorithmConfig]:

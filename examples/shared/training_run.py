@@ -40,7 +40,7 @@ from rich.console import Console
 from rich.table import Table
 
 import shared.resources as resources
-from rlservo.export.contract.errors import RlservoError, UsageError
+from rlservo import errors
 
 assert ray_settings
 RETURN = "env_runners/episode_return_mean"
@@ -114,9 +114,9 @@ def main_with_sentences(main: Callable[[], None], script: str) -> NoReturn:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
-    except RlservoError as error:
+    except errors.RlservoError as error:
         print(f"error: {error.message}", file=sys.stderr)
-        sys.exit(2 if isinstance(error, UsageError) else 1)
+        sys.exit(2 if isinstance(error, errors.UsageError) else 1)
     sys.exit(0)
 
 
@@ -195,7 +195,7 @@ def _start(folder: str, num_cpus: int, num_gpus: float, quiet: Mapping[str, Any]
         except Exception as error:  # Ray raises plain Exception, RuntimeError, and its own
             ray.shutdown()
             if attempt == attempts - 1:
-                raise RlservoError(f"Ray did not start: {_first_line(error)}") from error
+                raise errors.RlservoError(f"Ray did not start: {_first_line(error)}") from error
             print(f"Ray did not start ({_first_line(error)}); once more", file=sys.stderr, flush=True)
 
 
@@ -206,7 +206,7 @@ def _join(address: str, quiet: Mapping[str, Any]) -> None:
             socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
         ray.init(address, **quiet)
     except Exception as error:  # Ray's own tree, RuntimeError, ConnectionError, ValueError: all say the same
-        raise UsageError(
+        raise errors.UsageError(
             f"--address {address}: no Ray cluster answers there ({_first_line(error)}); start one with "
             "'ray start --head', with the same RAY_AUTH_MODE and token as here"
         ) from error
@@ -407,7 +407,7 @@ def check_storage(storage: Path) -> None:
         with tempfile.TemporaryDirectory(dir=_make_folder(storage)):
             pass
     except OSError as error:
-        raise UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
+        raise errors.UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
 
 
 def _make_folder(storage: Path) -> Path:
@@ -426,7 +426,7 @@ def _new_folder(storage: Path, name: str) -> Path:
                 return folder
             folder = folder.with_name(f"{name}-{secrets.token_hex(2)}")
     except OSError as error:
-        raise UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
+        raise errors.UsageError(f"--storage {storage}: cannot be written: {error.strerror}") from error
 
 
 def _trial_name(trial: Any) -> str:
@@ -445,7 +445,7 @@ def load_run(folder: Path) -> tuple[Run, list[str]]:
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         near = sorted(path.parent for path in folder.parent.glob(f"*/{RUN_FILE}"))
         runs = f"; the newest there is {max(near, key=lambda path: path.stat().st_mtime)}" if near else ""
-        raise UsageError(
+        raise errors.UsageError(
             f"--resume {folder}: not the folder of a run, which has a {RUN_FILE} and Tune's state in it{runs}"
         ) from error
 
@@ -461,11 +461,11 @@ def resume(folder: Path, *, where: str = "this machine") -> Outcome:
     resources.check_room(run.request, resources.ray_room(where))
     default_config(run.algorithm)  # registers the algorithms, quietly
     if not tune.Tuner.can_restore(str(folder)):
-        raise UsageError(f"--resume {folder}: the run was stopped before Tune saved anything; start it anew")
+        raise errors.UsageError(f"--resume {folder}: the run was stopped before Tune saved anything; start it anew")
     try:
         tuner = tune.Tuner.restore(str(folder), run.algorithm, resume_unfinished=True, resume_errored=True)
     except Exception as error:  # a damaged or foreign pickle may raise anything
-        raise UsageError(f"--resume {folder}: Tune's state cannot be read: {_first_line(error)}") from error
+        raise errors.UsageError(f"--resume {folder}: Tune's state cannot be read: {_first_line(error)}") from error
     return _fit(tuner, folder, run, swept)
 
 
@@ -475,7 +475,7 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
     except KeyboardInterrupt:
         raise InterruptError(folder) from None
     except Exception as error:  # before a trial has begun, or Tune's own; a trial's are in the results
-        raise RlservoError(f"training failed: {_cause(error)}") from error
+        raise errors.RlservoError(f"training failed: {_cause(error)}") from error
     trials, failed, unfinished = [], [], False
     for result in (results[index] for index in range(len(results))):
         if result.error is not None:
@@ -486,7 +486,7 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
     if unfinished or not trials:
         raise InterruptError(folder)
     if len(failed) == len(trials):
-        raise RlservoError(
+        raise errors.RlservoError(
             f"training failed: {_cause(failed[0].error)}; all of it is in {failed[0].path}/error.txt, and "
             f"--resume {folder} goes on from the last checkpoint"
         )
@@ -548,7 +548,7 @@ def best_checkpoint_of(outcome: Outcome) -> Path:
     for trial in outcome.trials:
         if trial.best_checkpoint is not None:
             return trial.best_checkpoint
-    raise RlservoError(f"{outcome.folder} holds no checkpoint: the training ended before the first one")
+    raise errors.RlservoError(f"{outcome.folder} holds no checkpoint: the training ended before the first one")
 
 
 def report(outcome: Outcome, run: Run) -> None:
@@ -627,10 +627,8 @@ def export_and_run(
     seed: int = 10_000,
 ) -> Path:
     """Export the checkpoint and run episodes with the bundle, which acts as RLlib would: that is what export proves."""
-    from rlservo.export.commands.export import export_checkpoint
-    from rlservo.serve_app.rollout.control_loop import rollout
+    from rlservo import Policy, export_checkpoint, rollout
     from rlservo.serve_app.rollout.report import render_report
-    from rlservo.serve_app.runtime.policy import Policy
 
     bundle = export_checkpoint(checkpoint, out, app_dir=app_dir, notify=print)
     print(f"bundle: {bundle.path}", flush=True)

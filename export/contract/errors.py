@@ -37,7 +37,7 @@ them to exit codes.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 
@@ -202,6 +202,11 @@ class RateLimitError(UnavailableError):
 
     code = "rate-limited"
 
+    def __init__(self, message: str, details: Mapping[str, Any] | None = None, *, key: str = "") -> None:
+        """`key` is the label of the API key that asked, where one did."""
+        super().__init__(message, {"key": key, **(details or {})} if key else details)
+        self.key = key
+
 
 class LateError(UnavailableError):
     """The observation waited longer than the server answers as fresh; nothing was computed."""
@@ -250,8 +255,18 @@ class ForbiddenError(RlservoError):
 
     code = "forbidden"
 
+    def __init__(self, message: str, details: Mapping[str, Any] | None = None, *, key: str = "") -> None:
+        """`key` is the label of the API key that asked, where one did."""
+        super().__init__(message, {"key": key, **(details or {})} if key else details)
+        self.key = key
+
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def quoted(names: Iterable[str]) -> str:
+    """Return names for a sentence, each in quotes."""
+    return ", ".join(f"'{name}'" for name in names)
 
 
 def first_line(error: BaseException) -> str:

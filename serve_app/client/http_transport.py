@@ -33,6 +33,7 @@ from rlservo.serve_app.client.deadline_backend import DeadlineBackend
 from rlservo.serve_app.client.error_replies import decode_error, excerpt
 from rlservo.serve_app.client.server_address import host_of, parse_address
 from rlservo.serve_app.wire.direct_offer import OFFER, find_offer
+from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 try:  # three times faster than the standard library on an image; not a requirement of the client
     import orjson
@@ -42,7 +43,7 @@ except ModuleNotFoundError:
 FIRST_WAIT_S = 0.05  # before the second attempt; doubles each time
 LONGEST_WAIT_S = 2.0
 MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; keeps a wrong URL from filling the memory
-LABEL = b"x-session-id"
+LABEL = LABEL_HEADER.encode()
 OFFER_HEADER = OFFER.encode()
 OFFER_S = 1.0  # [s] in which a connection may be made to what was offered
 KEEPALIVE_S = 5.0  # that an idle connection is kept

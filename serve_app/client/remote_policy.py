@@ -31,13 +31,13 @@ from rlservo.serve_app.client.observations import encode_observation
 from rlservo.serve_app.client.replies import answering_version, check_successor
 from rlservo.serve_app.interface import ActingPolicy, Observation
 from rlservo.serve_app.recording.start import record_policy
+from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
 if TYPE_CHECKING:
     from rlservo.serve_app.recording.recorder import Recorder
 
 logger = logging.getLogger(__name__)
 
-LONGEST_STATUS = 64  # that a server takes
 POLL_S = 0.1  # between two looks at a server that is starting
 LONGEST_TRY_S = 5.0  # of one such look
 

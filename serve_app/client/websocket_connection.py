@@ -13,6 +13,7 @@ import time
 from typing import cast
 
 from rlservo.export.contract.errors import DeadlineError, UnavailableError, UsageError
+from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 try:
     from websockets.client import ClientProtocol
@@ -52,7 +53,7 @@ class WebSocket:
                 self._socket = ssl.create_default_context().wrap_socket(self._socket, server_hostname=uri.host)
             request = self._protocol.connect()
             request.headers["User-Agent"] = "rlservo-client"
-            request.headers["x-session-id"] = label
+            request.headers[LABEL_HEADER] = label
             if api_key is not None:
                 request.headers["Authorization"] = f"Api-Key {api_key}"
             self._protocol.send_request(request)

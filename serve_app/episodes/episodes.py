@@ -147,7 +147,7 @@ class Episodes:
                 self.sessions.check_room(name, session_id)
             session = Session(policy)
         else:
-            session = self.sessions.find(name, session_id)
+            session = self.sessions.use(name, session_id)
             self._check_version(store, request, session, session_id)
             repeated = session.answer_again(seq, request.obs)
             if repeated is not None:

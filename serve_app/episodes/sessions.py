@@ -144,8 +144,8 @@ class Sessions:
         self.rows -= stream.rows
         stream.rows = 0
 
-    def find(self, name: str, session_id: SessionId) -> Session:
-        """Return a session that was begun here. Raises SessionLostError."""
+    def use(self, name: str, session_id: SessionId) -> Session:
+        """Return a session that was begun here, which is used by that; one lost is counted. Raises SessionLostError."""
         self._evict()
         key = (name, session_id)
         session = self._sessions.get(key)

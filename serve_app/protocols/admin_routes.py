@@ -1,6 +1,6 @@
 """Administration over HTTP: load, unload, alias, rollback, canary, shadow, on every replica at once.
 
-Every command answers when all replicas serve the change, or says which do not and why. `request_checks.authorize`
+Every command answers when all replicas serve the change, or says which do not and why. `access_checks.authorize`
 lets nobody in without an admin key. The Open Inference Protocol's `load` and `unload` are two of these under other
 names.
 """

@@ -16,11 +16,11 @@ from rlservo.serve_app.protocols.fastapi_routes import add_route
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.status_page import add_status_page
+from rlservo.serve_app.server.access_checks import AccessChecks, Hosts
 from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.audit import AUDIT
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.gauges import exposition
-from rlservo.serve_app.server.request_checks import Hosts, RequestChecks
 from rlservo.serve_app.server.request_path import StoreProvider
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
@@ -43,7 +43,7 @@ def create_app(
     `settings` name cannot be read.
     """
     core = Core(store_provider, settings, replica=replica, control=control)
-    checks = RequestChecks(Hosts(host, settings, keyed=bool(core.keys.accepted.keys)), core.keys)
+    checks = AccessChecks(Hosts(host, settings, keyed=bool(core.keys.accepted.keys)), core.keys)
     # A redirect would be an answer to a path that no route has: there is none.
     app = PolicyApp(
         core, checks, title="rlservo", description=DESCRIPTION, docs_url=None, redoc_url=None, redirect_slashes=False

@@ -20,25 +20,25 @@ from fastapi import FastAPI
 from starlette.routing import BaseRoute, Match
 from starlette.types import Message, Receive, Scope, Send
 
-from rlservo.export.contract.errors import RlservoError, UnknownPolicyError
+from rlservo.export.contract.errors import ForbiddenError, RateLimitError, RlservoError, UnknownPolicyError
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.direct_routes import PostRoute, StreamRoute
 from rlservo.serve_app.protocols.http_errors import Headers, error_answer, http_error, send_error, too_large
 from rlservo.serve_app.protocols.websocket_stream import refuse_upgrade
-from rlservo.serve_app.server.api_keys import Access, access_of
-from rlservo.serve_app.server.audit import AUDIT, AuditEntry
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_checks import (
+from rlservo.serve_app.server.access_checks import (
     HEADERS,
     LABEL,
     PATH,
     REPLY_HEADERS,
     REQUEST_ID,
-    RequestChecks,
+    AccessChecks,
     check_path,
     fold_headers,
     header_text,
 )
+from rlservo.serve_app.server.api_keys import Access, access_of
+from rlservo.serve_app.server.audit import AUDIT, AuditEntry
+from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_log import FIELDS
 from rlservo.serve_app.server.request_path import ClientGoneError, Codec
 from rlservo.serve_app.wire.request_stamp import STAMP
@@ -73,7 +73,7 @@ class PolicyApp(FastAPI):
     reaches FastAPI.
     """
 
-    def __init__(self, core: Core, checks: RequestChecks, **options: Any) -> None:
+    def __init__(self, core: Core, checks: AccessChecks, **options: Any) -> None:
         super().__init__(**options)
         self._core = core
         self._checks = checks
@@ -158,7 +158,9 @@ class PolicyApp(FastAPI):
                 return
             body = await receive_body(self._core, headers, receive)
         except RlservoError as error:
-            entry.code, entry.key = error.code, entry.key or str(error.details.get("key", ""))
+            entry.code = error.code
+            if isinstance(error, ForbiddenError | RateLimitError):
+                entry.key = entry.key or error.key
             await self._refuse(scope, headers, receive, send, error)
         except ClientGoneError:
             return

@@ -8,14 +8,13 @@ import orjson
 from starlette.types import Receive
 
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError
-from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.episodes.request import REQUEST_FIELDS, Request, parse_episode, parse_options
 from rlservo.serve_app.protocols.http_endpoint import Body, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.json_messages import parse_json
 from rlservo.serve_app.protocols.media_types import check_media_type
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
-from rlservo.serve_app.server.request_fields import REQUEST_FIELDS, parse_episode, parse_options
 from rlservo.serve_app.versions.policy_store import Decision
 
 SUCH_AS = '{"obs": [...]}'

@@ -14,7 +14,8 @@ import orjson
 from pydantic import BaseModel, ConfigDict, Field
 
 from rlservo.export.contract.errors import RequestError
-from rlservo.serve_app.server.request_fields import LONGEST_SESSION_ID, LONGEST_STATUS, MAX_SEED, json_type
+from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, MAX_SEED, json_type
+from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
 LONGEST_LENIENT_BODY = 1 << 20  # a larger body with NaN in it is refused without saying where the NaN is
 OBS = (

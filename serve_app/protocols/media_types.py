@@ -12,7 +12,7 @@ from fastapi import Request
 
 from rlservo.export.contract.errors import MediaTypeError
 from rlservo.serve_app.protocols.http_errors import JSON
-from rlservo.serve_app.server.request_checks import HEADERS
+from rlservo.serve_app.server.access_checks import HEADERS
 
 
 def check_media_type(headers: Mapping[bytes, bytes], *accepted: bytes, optional: bool = False) -> None:

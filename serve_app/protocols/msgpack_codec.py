@@ -15,10 +15,9 @@ from starlette.types import Message
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RequestError, TooLargeError
 from rlservo.export.contract.spaces import DictSpec
-from rlservo.serve_app.episodes.request import Episode, Request
+from rlservo.serve_app.episodes.request import REQUEST_FIELDS, Episode, Request, parse_episode, parse_options
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
-from rlservo.serve_app.server.request_fields import REQUEST_FIELDS, parse_episode, parse_options
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 

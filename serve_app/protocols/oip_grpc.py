@@ -39,11 +39,12 @@ from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
 from rlservo.serve_app.protocols.http_errors import retry_after_s, status_of
 from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
 from rlservo.serve_app.protocols.oip_tensors import DTYPES, check_form, check_size, datatype_of, from_bytes
+from rlservo.serve_app.server.access_checks import StreamKey, authorize, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_checks import StreamKey, authorize, presented_key
 from rlservo.serve_app.server.request_path import BUG
 from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.request_names import LABEL_HEADER
 from rlservo.serve_app.wire.request_stamp import STAMP
 
 Incoming = tuple[bytes, float | None]
@@ -52,7 +53,7 @@ Incoming = tuple[bytes, float | None]
 logger = logging.getLogger(__name__)
 
 PROTOCOL = "grpc"
-REQUEST_ID, LABEL = "x-request-id", "x-session-id"
+REQUEST_ID = "x-request-id"
 CODES = {
     400: grpc.StatusCode.INVALID_ARGUMENT,
     401: grpc.StatusCode.UNAUTHENTICATED,
@@ -177,7 +178,7 @@ class Grpc:
             "",
             None,
             time.perf_counter(),
-            label=texts.get(LABEL),
+            label=texts.get(LABEL_HEADER),
             request_id=texts.get(REQUEST_ID),
             headers=headers,
             waited=self._core.admission.waited(headers.get(STAMP.encode())),

@@ -25,9 +25,18 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.types import Receive
 
 from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
-from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError
+from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError, quoted
 from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.serve_app.episodes.request import Episode, Request
+from rlservo.serve_app.episodes.request import (
+    LONGEST_SESSION_ID,
+    OPTIONS,
+    Episode,
+    Request,
+    json_type,
+    parse_episode,
+    parse_finite,
+    parse_options,
+)
 from rlservo.serve_app.episodes.sessions import SessionId
 from rlservo.serve_app.protocols.http_endpoint import Body, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, too_large
@@ -42,17 +51,9 @@ from rlservo.serve_app.protocols.oip_tensors import (
     write_tensor,
 )
 from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.access_checks import HEADERS
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
-from rlservo.serve_app.server.request_checks import HEADERS
-from rlservo.serve_app.server.request_fields import (
-    LONGEST_SESSION_ID,
-    OPTIONS,
-    json_type,
-    parse_episode,
-    parse_finite,
-    parse_options,
-)
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.state_names import BELONGS_TO
 
@@ -435,10 +436,6 @@ def _wanted_outputs(
         chosen = parse_flag(own, "binary_data")
         wanted[name] = binary if chosen is None else chosen
     return wanted
-
-
-def quoted(names: list[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names)
 
 
 def offered_inputs(policy: Policy) -> list[TensorSpec]:

@@ -35,8 +35,7 @@ from rlservo.serve_app.protocols.direct_routes import StreamRoute
 from rlservo.serve_app.protocols.http_errors import Headers, encode_bug, error_answer, send_error
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_checks import (
+from rlservo.serve_app.server.access_checks import (
     HEADERS,
     LABEL,
     REPLY_HEADERS,
@@ -45,6 +44,7 @@ from rlservo.serve_app.server.request_checks import (
     header_text,
     presented_key,
 )
+from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_metrics import IDLE
 
 logger = logging.getLogger(__name__)

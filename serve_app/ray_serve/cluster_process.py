@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.serve_app.ray_serve import ray_parts
-from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, free_ports, remove_folder
+from rlservo.serve_app.ray_serve.ports import free_ports
+from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, remove_folder
 from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, cut_log, error_line
 from rlservo.serve_app.server.admin_key import remove_key
 

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.ray_serve import loopback_ports
+from rlservo.serve_app.ray_serve import loopback_binding
 from rlservo.serve_app.ray_serve.haproxy.configuration import CHECK_SECRET
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary, install_wrapper
-from rlservo.serve_app.ray_serve.processes import MARK, claim_port, free_ports, is_free
+from rlservo.serve_app.ray_serve.ports import claim_port, free_ports, is_free
+from rlservo.serve_app.ray_serve.processes import MARK
 from rlservo.serve_app.ray_serve.server_log import LOG_BYTES
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
 
@@ -74,7 +75,7 @@ LOCAL = {
     # Nothing but the proxy's ports is for others. The variable that turns clusters off, which Ray does by itself on
     # macOS, lets the node's address be 127.0.0.1, and Ray's ports listen on that address.
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
-    loopback_ports.VARIABLE: loopback_ports.ALL,
+    loopback_binding.VARIABLE: loopback_binding.ALL,
     # Ray writes its event loops' statistics to its logs every minute, 100 MB a day: now once a day (-1 is never
     # for some of its processes, and all the time for another). It keeps 3 GB of each process's logs.
     "RAY_event_stats_print_interval_ms": "86400000",

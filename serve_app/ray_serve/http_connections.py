@@ -7,11 +7,7 @@ uvicorn (0.54) bounds one phase of a connection, the idle time after a reply. Fo
 - for a client that does not read its reply, also after the connection has been closed;
 - for nothing: `Upgrade: websocket` with a body is handed to the WebSocket protocol without that body.
 
-And it takes a head of any size.
-
-Of a WebSocket it takes whatever comes: 16 KB that unpack to 16 MB, again and again; as many frames at once as fit a
-read, which the application then answers one after the other while the event loop stands still; pings whose answers
-nobody reads.
+And it takes a head of any size. Of WebSockets see `websocket_connections.py`.
 
 A request for an action that came whole is answered at once where nothing has to wait (`eager_start.py`), in the turn of
 the event loop that reads it, and its reply is written in one piece.
@@ -33,18 +29,15 @@ from rlservo.serve_app.protocols.http_endpoint import REPLY, WholeBody
 from rlservo.serve_app.ray_serve import eager_start, uvicorn_parts
 from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
 from rlservo.serve_app.ray_serve.uvicorn_parts import (
-    OPEN,
     STATUS_LINE,
     HttpToolsProtocol,
     RequestResponseCycle,
-    WebSocketsSansIOProtocol,
-    apply_mask,  # pyright: ignore[reportPrivateImportUsage]
     auto,
 )
+from rlservo.serve_app.ray_serve.websocket_connections import BoundedStream
 
 if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
-    from websockets.frames import Frame
+    from starlette.types import ASGIApp, Receive, Scope, Send
 
 HEAD_S = 5.0
 """[s] for a request's head, from the connection's begin or the head's first byte on."""
@@ -58,18 +51,8 @@ UNREAD_S = 10.0
 """[s] that sent bytes may wait for a client that does not read."""
 CHECK_PERIOD_S = 1.0
 """[s] between two checks of a connection's phase."""
-PIECE_BYTES = 16384
-"""Of a WebSocket, between two checks of how much has come: uvloop reads 256 KB at once, which are 40,000 frames."""
-MOST_AHEAD = 64
-"""Requests of a stream that wait for those before them: request and answer alternate, a late answer lets some wait."""
-# Of a frame's first two bytes (RFC 6455, 5.2): what begins one that is a whole message, or none.
-BINARY, MASKED, LENGTH_FOLLOWS = 0x82, 0x80, 126
-WHOLE = bytes((0x81, BINARY, 0x88, 0x89, 0x8A))
-MOST_EMPTY, SMALL_BYTES = 1000, 512
-"""Frames of a WebSocket in a second that complete no message: pings, pongs, small fragments."""
 
 LATE = b'{"error":"the request did not arrive in time","code":"deadline-passed"}'
-TOO_MUCH = 1008  # the close code "policy violation"
 LATE_REPLY = (
     b"HTTP/1.1 408 Request Timeout\r\ncontent-type: application/json\r\nconnection: close\r\n"
     b"content-length: %d\r\n\r\n%s" % (len(LATE), LATE)
@@ -274,123 +257,6 @@ class TimedProtocol(HttpToolsProtocol):
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-
-
-class BoundedStream(WebSocketsSansIOProtocol):
-    """A WebSocket that ends when its client sends more than it can be answered, and lets others have their turns."""
-
-    _since = float("-inf")  # when the second began in which `_empty` counts
-    _empty = 0
-    _is_at_frame = False  # whether what is read next begins a frame
-
-    def __init__(self, *arguments: Any, on_lost: Callable[[], None] | None = None, **more: Any) -> None:
-        """Call `on_lost` when the connection has ended."""
-        super().__init__(*arguments, **more)
-        self._on_lost = on_lost
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Say so."""
-        super().connection_lost(exc)
-        if self._on_lost is not None:
-            self._on_lost()
-
-    def data_received(self, data: bytes) -> None:
-        """Read what has come, piece by piece, until it is too much."""
-        if self.conn.state is not OPEN:  # the handshake, and what comes before it is answered
-            self._is_at_frame = not self.handshake_initiated
-        elif self._is_at_frame and (message := self._find_message(data)) is not None:
-            waits = not self.queue.empty()
-            self.queue.put_nowait({"type": "websocket.receive", "bytes": message})
-            if waits and not self.read_paused:  # it costs two system calls, which one message is not worth
-                self.read_paused = True
-                self.transport.pause_reading()
-            return
-        for start in range(0, len(data), PIECE_BYTES):
-            if self.transport.is_closing():
-                return
-            super().data_received(data[start : start + PIECE_BYTES])
-            if self.queue.qsize() > MOST_AHEAD:
-                self._end(f"more than {MOST_AHEAD} requests wait: await answers")
-            elif self._empty > MOST_EMPTY:
-                self._end(f"more than {MOST_EMPTY} pings or fragments in a second")
-
-    def handle_ping(self) -> None:
-        """Answer it."""
-        self._count()
-        super().handle_ping()
-
-    def handle_pong(self, event: Frame) -> None:
-        """Count it."""
-        self._count()
-        super().handle_pong(event)
-
-    def handle_cont(self, event: Frame) -> None:
-        """Take a message's next fragment."""
-        if not event.fin and len(event.data) < SMALL_BYTES:
-            self._count()
-        super().handle_cont(event)
-
-    def _find_message(self, data: bytes) -> bytes | None:
-        """Return the message that has come, where that is one binary frame and nothing else.
-
-        Nearly all are. The library's parser takes as long for one as a small policy does, and sees all others. From
-        the first on that does not end where a read does, it sees everything: nobody else knows where frames begin.
-        """
-        start, size, frames = 0, len(data), 0
-        content = 0
-        while start + 6 <= size and data[start] in WHOLE and data[start + 1] >= MASKED:
-            length, content = data[start + 1] - MASKED, start + 6
-            if length >= LENGTH_FOLLOWS:
-                if length > LENGTH_FOLLOWS or start + 8 > size:
-                    break
-                length, content = data[start + 2] << 8 | data[start + 3], start + 8
-            start, frames = content + length, frames + 1
-        if start != size:
-            self._is_at_frame = False
-            return None
-        if frames > 1 or data[0] != BINARY or size > PIECE_BYTES or self.close_sent:
-            return None
-        return apply_mask(data[content:], data[content - 4 : content])
-
-    async def send(self, message: Any) -> None:
-        """Send a message; a binary one as a frame of its own."""
-        content = message.get("bytes")
-        if content is None or self.close_sent or self.disconnected or self.conn.state is not OPEN:
-            await super().send(message)
-            return
-        await self.writable.wait()
-        size = len(content)
-        if size < LENGTH_FOLLOWS:
-            head = b"\x82%c" % size
-        elif size < 1 << 16:
-            head = b"\x82\x7e" + size.to_bytes(2, "big")
-        else:
-            head = b"\x82\x7f" + size.to_bytes(8, "big")
-        self.transport.write(head + content)
-
-    async def receive(self) -> Message:  # type: ignore[override]
-        """Return the next message; others have their turn before one that has come already."""
-        if not self.queue.empty():
-            await asyncio.sleep(0)
-        return await super().receive()  # type: ignore[return-value]
-
-    def _count(self) -> None:
-        now = self.loop.time()
-        if now - self._since > 1.0:
-            self._since, self._empty = now, 0
-        self._empty += 1
-
-    def _end(self, reason: str) -> None:
-        if self.transport.is_closing():
-            return
-        while not self.queue.empty():
-            self.queue.get_nowait()
-        self.queue.put_nowait({"type": "websocket.disconnect", "code": TOO_MUCH, "reason": reason})
-        self.stop_keepalive()
-        self.conn.fail(TOO_MUCH, reason)
-        self.transport.write(b"".join(self.conn.data_to_send()))
-        self.close_sent = self.disconnected = True  # what the application still sends is for nobody
-        self.transport.close()
 
 
 def _has_body(scope: Any) -> bool:

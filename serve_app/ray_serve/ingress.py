@@ -2,7 +2,7 @@
 
 Serve spends more on a request than a policy does: contexts, tasks, a request object, statistics, a line for its log. A
 request for actions needs none of it. How much a replica takes on is decided by `request_path.py`, who may ask by
-`request_checks.py`, metrics and the log are ours, and a replica that is told to stop waits for its HTTP server, which
+`access_checks.py`, metrics and the log are ours, and a replica that is told to stop waits for its HTTP server, which
 waits for whoever is still being answered (ray 2.60). So such requests go straight to the application, and everything
 else to Serve. Streams gain as well: Serve reads a WebSocket in a task of its own.
 
@@ -24,8 +24,8 @@ from typing import Any, Protocol
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from rlservo.serve_app.ray_serve import closed_endpoints, http_connections, loopback_ports
-from rlservo.serve_app.server.request_checks import mend_headers
+from rlservo.serve_app.ray_serve import closed_endpoints, http_connections, loopback_binding
+from rlservo.serve_app.server.access_checks import mend_headers
 
 FULL = b'{"error":"this replica has as many requests as it takes on: try again shortly","code":"over-capacity"}'
 TURNED_AWAY = (
@@ -119,6 +119,6 @@ def middlewares() -> list[Middleware]:
     """Return what Serve puts around each HTTP server it starts; it calls this before it binds the server's port."""
     http_connections.install()
     closed_endpoints.install()
-    if loopback_ports.is_wanted():
-        loopback_ports.install()
+    if loopback_binding.is_wanted():
+        loopback_binding.install()
     return [Middleware(Ingress)]

@@ -25,10 +25,11 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.contract.errors import UnavailableError, UsageError
-from rlservo.serve_app.ray_serve import direct_port, loopback_ports
-from rlservo.serve_app.ray_serve.environment import ray_environment
+from rlservo.serve_app.ray_serve import direct_port, loopback_binding
+from rlservo.serve_app.ray_serve.environment import PROXY_SETTINGS, ray_environment
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
-from rlservo.serve_app.ray_serve.processes import check_port, describe_end, end_marked, remove_folder
+from rlservo.serve_app.ray_serve.ports import check_port
+from rlservo.serve_app.ray_serve.processes import describe_end, end_marked, remove_folder
 from rlservo.serve_app.ray_serve.server_log import SERVER_LOG, last_fault
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure
@@ -252,11 +253,11 @@ def _child(
         folder, haproxy=haproxy, mark=mark, port=plan["port"], max_message=settings["max_body_bytes"]
     )
     if haproxy is None and not is_loopback(plan["host"]):
-        environment[loopback_ports.VARIABLE] = loopback_ports.INNER
+        environment[loopback_binding.VARIABLE] = loopback_binding.INNER
     if settings["direct_port"] is not None:
         environment[direct_port.VARIABLE] = str(folder / DIRECT_SOCKET)
     # The proxy is no part of the application, which is given its settings.
-    for name in ("stream_idle_s", "max_connections_per_address"):
+    for name in PROXY_SETTINGS:
         environment[PREFIX + name.upper()] = str(settings[name])
     read_fd, write_fd = os.pipe()
     (folder / RAY_FOLDER).mkdir()

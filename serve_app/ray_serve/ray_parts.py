@@ -20,6 +20,7 @@ REPLICA_ID = "ray.serve._private.common:ReplicaID"
 REQUEST_METADATA = "ray.serve._private.common:RequestMetadata"
 NEEDED = (
     "ray.serve.context:_get_global_client",
+    "ray.actor:ActorHandle._actor_id",
     "ray.serve._private.controller:ServeController.get_http_config",
     "ray.serve._private.controller:ServeController.get_deployment_config",
     *(f"{KEY_VALUE_STORE}:_internal_kv_{verb}" for verb in ("get", "put", "list", "del")),
@@ -38,6 +39,8 @@ NEEDED = (
     "ray._private.services:start_ray_process",
     "ray._private.worker:_global_node",
 )
+FIELDS = ("ray.serve._private.client:ServeControllerClient._controller",)
+"""As needed, and set by their class's `__init__`: of an object there is none when the start is checked."""
 SPARED = (
     "ray.serve._private.replica:Replica._stop_accepting_direct_ingress",
     "ray._private.parameter:RayParams",
@@ -54,12 +57,7 @@ def find(name: str) -> Any:
     try:
         return reduce(getattr, attributes.split(".") if attributes else [], importlib.import_module(module))
     except (ImportError, AttributeError):
-        import ray
-
-        raise RuntimeError(
-            f"Ray {ray.__version__} has no {name.replace(':', '.')}, which this version of rlservo uses: install a Ray "
-            f"that it knows, such as {KNOWN}"
-        ) from None
+        raise _refusal(name) from None
 
 
 def is_there(name: str) -> bool:
@@ -75,3 +73,16 @@ def check() -> None:
     """Raise RuntimeError where this Ray lacks a name that is needed."""
     for name in NEEDED:
         find(name)
+    for name in FIELDS:
+        kind, _, field = name.rpartition(".")
+        if field not in vars(find(kind))["__init__"].__code__.co_names:
+            raise _refusal(name)
+
+
+def _refusal(name: str) -> RuntimeError:
+    import ray
+
+    return RuntimeError(
+        f"Ray {ray.__version__} has no {name.replace(':', '.')}, which this version of rlservo uses: install a Ray "
+        f"that it knows, such as {KNOWN}"
+    )

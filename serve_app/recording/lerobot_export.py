@@ -20,7 +20,6 @@ from rlservo.serve_app.recording.reader import Recording
 
 DATA_FILE = "data/chunk-000/file-000.parquet"
 EPISODES_FILE = "meta/episodes/chunk-000/file-000.parquet"
-INDICES = ("frame_index", "episode_index", "index", "task_index")
 QUANTILES = {"q01": 1, "q10": 10, "q50": 50, "q90": 90, "q99": 99}
 DEFAULT_FPS = 10
 TASKS_FOR_PANDAS = {  # LeRobot looks tasks up by their sentence: it is the table's index

@@ -20,7 +20,7 @@ from rlservo.export.contract.errors import ObservationError, first_line
 from rlservo.export.contract.spaces import BoxSpec, LeafSpec
 from rlservo.serve_app.runtime.drift import EVERY, Drift
 from rlservo.serve_app.runtime.elements import first_element, rounding_slack
-from rlservo.serve_app.runtime.observation_faults import describe, describe_unequal, first_non_number, list_names
+from rlservo.serve_app.runtime.observation_error_text import describe, describe_unequal, first_non_number, list_names
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.bundle import CONTRACT_FILE, CONTRACT_KEY, GOLDEN_FILE, ONNX_FILE, Bundle
 from rlservo.export.contract.contract import REWARD, Contract, parse_contract
-from rlservo.export.contract.errors import BundleError, BundleTamperedError, GoldenMismatchError, first_line
+from rlservo.export.contract.errors import BundleError, BundleTamperedError, GoldenMismatchError, first_line, quoted
 from rlservo.export.contract.ort_session import open_ort_session
 from rlservo.export.contract.scores import split_scores
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, LeafSpec, MultiDiscreteSpec, leaf_specs
@@ -45,12 +45,12 @@ def check_contract(bundle: Bundle) -> None:
     known = {*observations, REWARD, *(f"state_in.{state.name}" for state in contract.state)}
     listed = [tensor.name for tensor in contract.inputs]
     if missing := [name for name in observations if name not in listed]:
-        raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no input {_quoted(missing)}")
+        raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no input {quoted(missing)}")
     if strange := [name for name in listed if name not in known]:
-        raise BundleError(f"{bundle.path}: the input {_quoted(strange)} is neither an observation nor a state")
+        raise BundleError(f"{bundle.path}: the input {quoted(strange)} is neither an observation nor a state")
     outputs = {tensor.name: tensor for tensor in contract.outputs}
     if missing := [name for name in actions if name not in outputs]:
-        raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no output {_quoted(missing)}")
+        raise BundleError(f"{bundle.path}: {CONTRACT_FILE} lists no output {quoted(missing)}")
     tensors_of = {"inputs": observations, "outputs": actions}
     for side, listed_tensors in (("inputs", contract.inputs), ("outputs", contract.outputs)):
         for tensor in listed_tensors:
@@ -104,10 +104,6 @@ def _check_leaf(bundle: Bundle, name: str, space: LeafSpec) -> None:
             raise BundleError(f"{where} has {len(side)} bounds for {space.size} elements")
 
 
-def _quoted(names: Sequence[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names)
-
-
 def open_graph(bundle: Bundle, threads: int) -> onnxruntime.InferenceSession:
     with bundle.verified_copy(ONNX_FILE) as file:
         try:
@@ -158,7 +154,7 @@ def check_copy(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> Non
     if now != exported:
         changed = [name for name in Contract.model_fields if getattr(now, name) != getattr(exported, name)]
         raise BundleTamperedError(
-            f"{bundle.path / CONTRACT_FILE} has been edited since the export: its {_quoted(changed)} "
+            f"{bundle.path / CONTRACT_FILE} has been edited since the export: its {quoted(changed)} "
             f"{'is' if len(changed) == 1 else 'are'} not what {bundle.onnx.name} was proven with",
             {"fields": changed},
         )

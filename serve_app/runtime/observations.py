@@ -12,7 +12,7 @@ from rlservo.export.contract.errors import ObservationError
 from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec, leaf_specs
 from rlservo.serve_app.runtime.drift import Drift
 from rlservo.serve_app.runtime.leaf_observations import LeafParser
-from rlservo.serve_app.runtime.observation_faults import describe
+from rlservo.serve_app.runtime.observation_error_text import describe
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 
 MOST_NOTICES = 16  # of a list of observations: its reply carries them

@@ -233,23 +233,6 @@ class Policy(Closeable):
         self.last_notices = step.notices
         return step.action
 
-    def act_from(
-        self,
-        obs: Observation,
-        state: Mapping[str, ArrayLike] | None,
-        *,
-        explore: bool = False,
-        seed: int | None = None,
-        reward: ArrayLike | None = None,
-    ) -> tuple[Any, State]:
-        """Return (action, next state) and remember nothing: for a server, whose callers carry their own state.
-
-        `state` is what this method returned for the step before, by state name, with a batch axis where `obs` has one;
-        None begins an episode. Raises RequestError when it does not fit the contract, and what `act` raises.
-        """
-        step = self.step(obs, state=state, explore=explore, seed=seed, reward=reward)
-        return step.action, step.own_state
-
     def step(
         self,
         obs: Observation,

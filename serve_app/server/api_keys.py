@@ -1,4 +1,4 @@
-"""API keys, kept as hashes, and what they are for; `request_checks.py` checks requests against them.
+"""API keys, kept as hashes, and what they are for; `access_checks.py` checks requests against them.
 
 A key is 256 random bits, so its plain SHA-256 is all that needs keeping: there is no dictionary to try. A line of the
 key file, or an entry of RLSERVO_API_KEYS (separated by commas), is
@@ -11,7 +11,6 @@ key file, or an entry of RLSERVO_API_KEYS (separated by commas), is
 from __future__ import annotations
 
 import hashlib
-import hmac
 import math
 import os
 import re
@@ -145,15 +144,6 @@ class Keys:
             )
         digest = settings.operator_key.removeprefix("sha256:")
         return cls(tuple(keys), Key("operator", Role.admin, bytes.fromhex(digest)) if digest else None)
-
-    def find(self, presented: bytes) -> Key | None:
-        """Return the key that was presented. Every kept digest is compared, each in constant time."""
-        digest = hashlib.sha256(presented).digest()
-        found = None
-        for key in self.keys if self.operator is None else (*self.keys, self.operator):
-            if hmac.compare_digest(digest, key.digest):
-                found = key
-        return found
 
 
 def new_key(label: str, *, admin: bool = False, rate: float | None = None, burst: int | None = None) -> tuple[str, str]:

@@ -31,6 +31,7 @@ class RateLimits:
             raise RateLimitError(
                 f"the key '{key.label}' may ask {limit.rate:g} times a second here, {limit.burst} times at once: wait "
                 f"{wait_s:.3g} s",
-                {"key": key.label, "retry_after_s": round(wait_s, 3)},
+                {"retry_after_s": round(wait_s, 3)},
+                key=key.label,
             )
         self._buckets[key.label] = tokens - 1.0, now

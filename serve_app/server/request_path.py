@@ -19,8 +19,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-import numpy as np
-
 from rlservo.export.contract.errors import (
     DeadlineError,
     InternalError,
@@ -33,7 +31,6 @@ from rlservo.export.contract.errors import (
     TooLargeError,
     UnavailableError,
 )
-from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import Request, check_deadline
 from rlservo.serve_app.episodes.sessions import Session
@@ -42,6 +39,7 @@ from rlservo.serve_app.runtime.network_memory import NetworkDroppedError
 from rlservo.serve_app.server.loop_clock import LoopClock
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
 from rlservo.serve_app.server.request_metrics import Metrics
+from rlservo.serve_app.server.row_count import count_rows, most_rows
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.network_restorer import NetworkRestorer
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blame, blamed_version
@@ -442,41 +440,3 @@ def _check_again(request: Request, since: float, limit_s: float) -> None:
         raise LateError(f"the observation waited longer than {limit_s * 1e3:g} ms for its batch: send a newer one")
     if request.deadline_ms is not None:
         check_deadline(request)
-
-
-# Number of observations in a request, before anything is computed of it.
-
-
-def most_rows(obs: Any) -> int:
-    """Return how many observations there are at most, whatever the space is: `count_rows` looks closer."""
-    most, parts = 0, [obs]
-    while parts:
-        part = parts.pop()
-        if type(part) is dict:
-            parts += part.values()
-        else:
-            most = max(most, _length(part))
-            if type(part) in (list, tuple) and part and type(part[0]) in (dict, list, tuple, np.ndarray):
-                parts.append(part[0])  # the parts of a Tuple are of one batch
-    return most
-
-
-def count_rows(space: SpaceSpec, obs: Any) -> int:
-    """Return how many observations a large `obs` holds; an array as long as the space's own is one."""
-    if isinstance(space, DictSpec | TupleSpec):
-        if isinstance(space, DictSpec) and type(obs) is list:
-            return len(obs)  # of single observations
-        inside = space.spaces.items() if isinstance(space, DictSpec) else enumerate(space.spaces)
-        parts = obs if type(obs) in (dict, list, tuple) else {}
-        found: dict[Any, Any] = dict(parts) if type(parts) is dict else dict(enumerate(parts))
-        return max((count_rows(child, found[key]) for key, child in inside if key in found), default=0)
-    if type(obs) is dict:  # element names and values
-        return max((_length(value) for value in obs.values()), default=0)
-    rows = _length(obs)
-    return rows if rows != (space.shape or (0,))[0] else 1
-
-
-def _length(value: Any) -> int:
-    if type(value) is np.ndarray:
-        return len(value) if value.ndim else 0
-    return len(value) if type(value) in (list, tuple) else 0

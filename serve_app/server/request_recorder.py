@@ -25,7 +25,7 @@ from rlservo.serve_app.episodes.request import Episode, Request, shorten_label
 from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
 from rlservo.serve_app.runtime.exploration import Draw
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.request_path import count_rows
+from rlservo.serve_app.server.row_count import count_rows
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 

@@ -21,7 +21,7 @@ from rich.console import Console
 
 import soak as soak_module
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 from soak import Track, mix, soak

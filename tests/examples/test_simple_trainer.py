@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rlservo import errors
 from rlservo.serve_app.runtime.policy import Policy
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -218,5 +219,5 @@ def test_search_space_reads_values_and_ranges(trainer: Any, tmp_path: Path) -> N
         ("lr: [", "cannot be read"),
     ):
         file.write_text(wrong)
-        with pytest.raises(search_space.UsageError, match=sentence):
+        with pytest.raises(errors.UsageError, match=sentence):
             search_space.load_search_space(file)

@@ -17,6 +17,7 @@ import shared.episode_traces as episode_traces
 import shared.training_run as training_run
 import simple_trainer
 
+from rlservo import errors
 from trainings import ON_ONE_CORE
 
 RUNS = {
@@ -64,7 +65,7 @@ def main() -> None:
                     episodes=0 if name.startswith(("Endless", "Crashing")) else 1,
                 )
                 found[name] = {"bundle": str(bundle), "steps": steps}
-            except training_run.RlservoError as error:
+            except errors.RlservoError as error:
                 found[name] = {"error": error.message}
         found[name]["said"] = said.getvalue()
     Path("edges.json").write_text(json.dumps(found))

@@ -1,4 +1,4 @@
-"""What the export tests share beside the trained checkpoints of `tests/checkpoints.py`."""
+"""Fixtures of the export tests beside the trained checkpoints of `tests/checkpoints.py`."""
 
 from __future__ import annotations
 

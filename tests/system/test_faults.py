@@ -27,7 +27,7 @@ from websockets.sync.client import connect
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
 from rlservo.serve_app.ray_serve.haproxy.process_table import command_of, process_ids
-from rlservo.serve_app.ray_serve.processes import check_port, port_holder
+from rlservo.serve_app.ray_serve.ports import check_port, port_holder
 from rlservo.serve_app.wire.msgpack_arrays import pack
 from servers import Run, launched, processes_of
 

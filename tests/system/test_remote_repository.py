@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from bundles import write_box_policy
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from servers import ask, running, wait_until_served
 from storages import SECRET, Storage
 

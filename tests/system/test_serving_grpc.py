@@ -19,7 +19,7 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.protocols.oip_grpc import Grpc, is_local
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.recording.episodes import episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.runtime.policy import Policy

@@ -1,4 +1,4 @@
-"""What a running server offers to the network: its ports, its time-outs, its share for each address, its logs."""
+"""A running server on the network: its ports, its time-outs, its share for each address, its logs."""
 
 from __future__ import annotations
 

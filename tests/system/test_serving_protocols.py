@@ -15,7 +15,7 @@ from websockets.exceptions import InvalidStatus
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.runtime.policy import Policy
 from servers import LiveServer
 

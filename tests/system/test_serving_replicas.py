@@ -28,7 +28,7 @@ from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.ray_serve import direct_server
-from rlservo.serve_app.ray_serve.processes import free_ports, port_holder
+from rlservo.serve_app.ray_serve.ports import free_ports, port_holder
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from servers import Run, launched

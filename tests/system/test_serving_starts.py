@@ -21,7 +21,7 @@ import pytest
 from rlservo.export.contract.errors import BundleError, UsageError
 from rlservo.serve_app.ray_serve.environment import cluster_environment, proxy_files, proxy_ports
 from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from servers import ask, launched, running, wait_until_served
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]

@@ -281,17 +281,27 @@ def _hide_serve(text: str, limits: Limits) -> str:
         text = _insert(text, "grpc", rule)
     if not limits.secret:
         return text
-    checks = _count(r"^ *option httpchk", text)
+    http, grpc = _checked_backends(text)
     new = rf"\1\n    http-check send hdr {CHECK_HEADER} {limits.secret}"
-    text = _replace(text, r"^( *option httpchk GET /-/healthz)$", new, "the health check", times=checks)
-    checks = _count(r"^ *option tcp-check", text)
+    text = _replace(text, r"^( *option httpchk GET /-/healthz)$", new, "the health check", times=http)
     return _replace(
         text,
         r"^( *tcp-check send-binary )([0-9a-f]+)$",
         lambda found: found[1] + _with_secret(bytes.fromhex(found[2]), limits.secret).hex(),
         "the gRPC health check",
-        times=checks,
+        times=grpc,
     )
+
+
+def _checked_backends(text: str) -> tuple[int, int]:
+    """Return how many backends ask their servers for their health, over HTTP and over gRPC (`proto h2`).
+
+    Told by the servers, so that no check at all is as wrong as another one than is known here.
+    """
+    backends = [part for part in re.split(r"^(?=\S)", text, flags=re.MULTILINE) if part.startswith("backend ")]
+    servers = [re.findall(r"^ +server (?!.* track ).*$", part, re.MULTILINE) for part in backends]  # a track copies
+    kinds = [any(" proto h2" in server for server in found) for found in servers if found]
+    return kinds.count(False), kinds.count(True)
 
 
 def _with_secret(request: bytes, secret: str) -> bytes:

@@ -23,7 +23,7 @@ from rlservo.envs.robot_server.connections import count_connections
 from rlservo.envs.robot_server.manager import MANAGER_PORTS, RobotServers, ServerManager
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, SERVER_MANAGER, Empty, ManagerStatus, State
 from rlservo.envs.robot_server.server import CannotListenError, PortInUseError, bind
-from rlservo.serve_app.ray_serve.processes import check_port, free_ports
+from rlservo.serve_app.ray_serve.ports import check_port, free_ports
 
 UR = "roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur5"
 MIR = "roslaunch mir100_robot_server sim_robot_server.launch"

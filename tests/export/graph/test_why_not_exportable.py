@@ -1,4 +1,4 @@
-"""What is told of a network that cannot be exported, also by a torch without the private names it is read from."""
+"""Reasons why a network cannot be exported, also by a torch without the private names they are read from."""
 
 from __future__ import annotations
 

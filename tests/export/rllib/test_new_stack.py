@@ -350,8 +350,9 @@ def test_a_recurrent_policy_keeps_its_state_and_reset_drops_it(
     np.testing.assert_array_equal(first, again)
     state = None
     for one, expected in zip(obs, first, strict=True):
-        action, state = policy.act_from(one, state)
-        np.testing.assert_array_equal(action, expected)
+        step = policy.step(one, state=state)
+        np.testing.assert_array_equal(step.action, expected)
+        state = step.own_state
     assert state is not None and {name: value.shape for name, value in state.items()} == {"c": (1, 8), "h": (1, 8)}
 
 
@@ -382,7 +383,7 @@ def test_a_state_that_does_not_fit_is_refused_by_name(
 ) -> None:
     policy = Policy.load(export("lstm_box").path)
     with pytest.raises(RequestError, match=words):
-        policy.act_from(np.zeros(3, np.float32), state)
+        policy.step(np.zeros(3, np.float32), state=state)
 
 
 def test_a_policy_that_sees_rewards_asks_for_them(export: Callable[[str], ExportResult]) -> None:
@@ -397,9 +398,10 @@ def test_a_policy_that_sees_rewards_asks_for_them(export: Callable[[str], Export
 
 def test_an_exploring_policy_remembers_the_action_it_took(export: Callable[[str], ExportResult]) -> None:
     policy = Policy.load(export("previous").path)
-    greedy = int(policy.act_from(2, None)[0])
+    greedy = int(policy.step(2).action)
     for seed in range(50):
-        action, state = policy.act_from(2, None, explore=True, seed=seed)
+        step = policy.step(2, explore=True, seed=seed)
+        action, state = step.action, step.own_state
         np.testing.assert_array_equal(state["previous_actions"], np.eye(8, dtype=np.float32)[4 + int(action)])
         if int(action) != greedy:
             return

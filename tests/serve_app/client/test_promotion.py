@@ -23,6 +23,7 @@ import pytest
 from gymnasium.envs.registration import register, registry
 
 from rlservo.export.contract.errors import BundleError, ObservationError, UnavailableError, UsageError
+from rlservo.serve_app.client import promotion
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.promotion import (
@@ -46,6 +47,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions import plan
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions, VersionState
 
 Serve = Callable[[Any], AbstractContextManager[int]]
@@ -786,3 +788,8 @@ def test_a_key_that_is_revoked_stops_it_and_the_way_on_is_said(
     monkeypatch.undo()
     outcome = promotion()
     assert outcome.outcome == STOPPED and outcome.is_finished and server.plan.canary is None
+
+
+def test_the_alias_that_a_promotion_moves_is_the_one_that_servers_follow() -> None:
+    """Two constants: the client imports nothing of the server."""
+    assert promotion.PRODUCTION == plan.PRODUCTION

@@ -1,4 +1,4 @@
-"""Who may use a route: every route, in every spelling of its path, as bytes on a socket, with too little of a key.
+"""Access to routes: every route, in every spelling of its path, as bytes on a socket, with too little of a key.
 
 A path that a check reads differently from the router is a way around the check, so no client that mends paths is used.
 """

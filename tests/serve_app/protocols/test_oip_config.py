@@ -1,4 +1,4 @@
-"""What Triton's tools ask for before they infer: how a policy is run, and what has been counted of it."""
+"""Model configuration and statistics that Triton's tools ask for before they infer."""
 
 from __future__ import annotations
 

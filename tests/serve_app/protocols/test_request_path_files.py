@@ -3,32 +3,52 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import http.client
 import json
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
 import pytest
 import uvicorn
 from onnxruntime import InferenceSession
 
+from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve import ingress as ingress_module
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 from rlservo.serve_app.ray_serve.ingress import Ingress, ServeBypass
 from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
 from stores import store_of
 
 ROOT = Path(__file__).resolve().parents[3]
 OURS = (str(ROOT / "serve_app"), str(ROOT / "export"), str(ROOT / "deploy"))
-MOST_FILES = 9  # of ours, between the socket and the network
-BODY = json.dumps({"obs": [0.1] * 27}).encode()
+NINE = [
+    "serve_app/ray_serve/http_connections.py",
+    "serve_app/ray_serve/ingress.py",
+    "serve_app/protocols/http_endpoint.py",
+    "serve_app/server/access_checks.py",
+    "serve_app/server/request_path.py",
+    "serve_app/protocols/json_codec.py",
+    "serve_app/versions/policy_store.py",
+    "serve_app/runtime/policy.py",
+    "serve_app/runtime/leaf_observations.py",
+]
+"""Files of ours between the socket and the network, which DESIGN.md lists."""
+OBS = [0.1] * 27
+KEY, LINE = new_key("robot")
+CLOCK = clock_id()
+
+Ask = Callable[[], Awaitable[None]]
 
 
 class PassedFiles:
@@ -54,48 +74,66 @@ def bypass(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServeBypass]:
     yield ingress_module.bypass
 
 
-def request() -> bytes:
-    """Return a request as HAProxy passes it on."""
-    headers = [
-        "POST /v1/policies/ur5/act HTTP/1.1",
-        "host: 127.0.0.1",
-        "content-type: application/json",
-        f"content-length: {len(BODY)}",
-        f"{STAMP}: {time.time() * 1e3:.0f}-{clock_id()}",
-        "x-forwarded-for: 127.0.0.1",
-    ]
-    return "\r\n".join([*headers, "", ""]).encode() + BODY
-
-
-def test_a_json_request_passes_at_most_nine_files_between_socket_and_network(ur5: Path, bypass: ServeBypass) -> None:
-    async def scenario() -> PassedFiles:
-        store = store_of(Policy.load(ur5))
-        app = create_app(lambda: store, ServerSettings())
-        bypass.install(app)
-        config = uvicorn.Config(
-            Ingress(app), http=TimedProtocol, log_level="critical", lifespan="off", access_log=False
-        )
-        server = uvicorn.Server(config)
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            serving = asyncio.create_task(server.serve(sockets=[listener]))
-            reader, writer = await asyncio.open_connection(*listener.getsockname())
-            passed = PassedFiles()
-            for number in range(3):  # the first tells the prefix, by way of Serve
-                content = request()
-                sys.setprofile(passed if number == 2 else None)
-                try:
-                    writer.write(content)
-                    status = await reader.readline()
-                    await reader.readuntil(b"}")
-                finally:
-                    sys.setprofile(None)
-                assert b" 200 " in status
-            writer.close()
-            server.should_exit = True
-            await serving
-        return passed
-
-    passed = asyncio.run(scenario())
+async def pass_through(ur5: Path, bypass: ServeBypass, listener: socket.socket, ask: Ask, lines: str) -> list[str]:
+    """Return our files that a request passes, in the order of the first call in each; `lines` are the server's keys."""
+    store = store_of(Policy.load(ur5))
+    app = create_app(lambda: store, ServerSettings(api_keys=lines))
+    bypass.install(app)
+    config = uvicorn.Config(Ingress(app), http=TimedProtocol, log_level="critical", lifespan="off", access_log=False)
+    server = uvicorn.Server(config)
+    serving = asyncio.create_task(server.serve(sockets=[listener]))
+    passed = PassedFiles()
+    for number in range(3):  # the first tells the prefix, by way of Serve
+        sys.setprofile(passed if number == 2 else None)  # of this thread, and so not of a client in another
+        try:
+            await ask()
+        finally:
+            sys.setprofile(None)
+    server.should_exit = True
+    await serving
     assert passed.reached_network
-    assert len(passed.files) <= MOST_FILES, list(passed.files)
-    assert list(passed.files)[-1] == "serve_app/runtime/leaf_observations.py"  # what is nearest to the network
+    return list(passed.files)
+
+
+@pytest.mark.parametrize("key", [False, True], ids=["open", "keyed"])
+def test_a_json_request_passes_nine_files_between_socket_and_network(ur5: Path, bypass: ServeBypass, key: bool) -> None:
+    """Of nothing but an observation, as HAProxy passes it on."""
+    body = json.dumps({"obs": OBS}).encode()
+
+    def post() -> int:
+        headers = {
+            "content-type": "application/json",
+            STAMP: f"{time.time() * 1e3:.0f}-{CLOCK}",
+            "x-forwarded-for": "127.0.0.1",
+            **({"authorization": f"Bearer {KEY}"} if key else {}),
+        }
+        connection.request("POST", "/v1/policies/ur5/act", body, headers)
+        reply = connection.getresponse()
+        reply.read()
+        return reply.status
+
+    async def ask() -> None:
+        assert await asyncio.to_thread(post) == 200
+
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,
+        contextlib.closing(http.client.HTTPConnection(*listener.getsockname())) as connection,
+    ):
+        files = asyncio.run(pass_through(ur5, bypass, listener, ask, LINE if key else ""))
+    assert sorted(files) == sorted(NINE)
+    assert files[0] == NINE[0]
+    assert files[-1] == NINE[-1]  # what is nearest to the network
+
+
+def test_a_request_of_our_client_passes_a_tenth_file_which_parses_its_options(ur5: Path, bypass: ServeBypass) -> None:
+    """It has a number, a deadline, its episode's label and a key."""
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,
+        PolicyClient(f"http://127.0.0.1:{listener.getsockname()[1]}", "ur5", api_key=KEY) as client,
+    ):
+
+        async def ask() -> None:
+            await asyncio.to_thread(client.act, np.array(OBS, np.float32))
+
+        files = asyncio.run(pass_through(ur5, bypass, listener, ask, LINE))
+    assert sorted(files) == sorted([*NINE, "serve_app/episodes/request.py"])

@@ -1,4 +1,4 @@
-"""Whether a server that others reach answers without a key, asked as anybody could."""
+"""Probe of a server from outside: one that others reach and that answers without a key is found."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve import direct_port, direct_server, http_connections
 from rlservo.serve_app.ray_serve.direct_server import DirectServer
-from rlservo.serve_app.ray_serve.processes import free_ports
+from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import load_policy

@@ -31,7 +31,7 @@ from rlservo.serve_app.ray_serve.haproxy import (
     process_table,
     watcher,
 )
-from rlservo.serve_app.ray_serve.processes import free_ports, is_free
+from rlservo.serve_app.ray_serve.ports import free_ports, is_free
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire import request_stamp
 from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
@@ -454,6 +454,26 @@ def test_replicas_under_another_name_are_an_error_and_not_left_as_ray_has_them(t
         configuration.patch_configuration(text.replace("server SERVE_REPLICA", "server REPLICA"), tmp_path)
     patched = configuration.patch_configuration(text, tmp_path)
     assert patched.count("on-marked-down shutdown-sessions") == patched.count("set-timeout server") == 2
+
+
+@pytest.mark.parametrize(
+    ("check", "sentence"),
+    [
+        (r"^ *option httpchk .*\n", "the health check is there 0 times, not 1"),
+        (r"^ *tcp-check send-binary .*\n", "the gRPC health check is there 0 times, not 1"),
+        (r" proto h2", "the health check is there 1 times, not 2"),
+    ],
+)
+def test_health_checks_that_cannot_be_given_the_secret_are_an_error(tmp_path: Path, check: str, sentence: str) -> None:
+    """Without it replicas answer them 404, and HAProxy takes every replica for dead."""
+    limits = configuration.Limits(max_connections=0, stream_idle_s=300.0, secret="0123456789abcdef")
+    text = rendered(tmp_path, replicas=True, grpc=True)
+    patched = configuration.patch_configuration(text, tmp_path, limits=limits)
+    assert patched.count(f"http-check send hdr {configuration.CHECK_HEADER} {limits.secret}") == 1
+    assert patched.count(limits.secret.encode().hex()) == 1
+    changed = re.sub(check, "", text, flags=re.MULTILINE)
+    with pytest.raises(configuration.TemplateError, match=sentence):
+        configuration.patch_configuration(changed, tmp_path, limits=limits)
 
 
 def test_a_frontend_that_listens_elsewhere_is_an_error(tmp_path: Path) -> None:

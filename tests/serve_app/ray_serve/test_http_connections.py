@@ -22,6 +22,7 @@ from uvicorn.server import ServerState
 from rlservo.serve_app.ray_serve import http_connections, uvicorn_parts
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 from rlservo.serve_app.ray_serve.ingress import Ingress
+from rlservo.serve_app.ray_serve.websocket_connections import BoundedStream
 
 SOON_S = 10.0  # a busy machine's
 HANDSHAKE = (
@@ -339,7 +340,7 @@ def echoed(pieces: list[bytes], draw: random.Random) -> bytes:
         config = uvicorn.Config(app, lifespan="off", log_level="critical")
         config.load()
         transport = Transport()
-        protocol = http_connections.BoundedStream(config, ServerState(), {}, asyncio.get_running_loop())
+        protocol = BoundedStream(config, ServerState(), {}, asyncio.get_running_loop())
         protocol.connection_made(transport)
         protocol.data_received(f"GET / HTTP/1.1\r\nhost: x\r\n{HANDSHAKE}\r\n".encode())
         while not transport.written:
@@ -395,7 +396,7 @@ def test_a_stream_with_requests_ahead_lets_others_have_their_turns() -> None:
     async def run() -> list[str]:
         config = uvicorn.Config(app, lifespan="off")
         config.load()
-        protocol = http_connections.BoundedStream(config, ServerState(), {}, asyncio.get_running_loop())
+        protocol = BoundedStream(config, ServerState(), {}, asyncio.get_running_loop())
         protocol.transport = Transport()
         order: list[str] = []
         for _ in range(3):

@@ -14,8 +14,8 @@ from starlette.types import Message, Receive, Scope, Send
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve import ingress as ingress_module
 from rlservo.serve_app.ray_serve.ingress import NO_WATCH, Ingress, ServeBypass
+from rlservo.serve_app.server.access_checks import REQUEST_ID
 from rlservo.serve_app.server.api_keys import new_key
-from rlservo.serve_app.server.request_checks import REQUEST_ID
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import load_policy
 from stores import store_of

@@ -19,7 +19,8 @@ import pytest
 from cluster_resources import make_certificates
 
 from rlservo.serve_app.ray_serve.environment import cluster_environment
-from rlservo.serve_app.ray_serve.processes import MARK, end_marked, free_ports, remove_folder
+from rlservo.serve_app.ray_serve.ports import free_ports
+from rlservo.serve_app.ray_serve.processes import MARK, end_marked, remove_folder
 
 pytestmark = [
     pytest.mark.serve,

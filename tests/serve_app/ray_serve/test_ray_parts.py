@@ -12,7 +12,7 @@ import pytest
 import ray
 
 from rlservo.serve_app.ray_serve import cluster_process, grpc_ingress, ray_parts, uvicorn_parts
-from rlservo.serve_app.ray_serve.ray_parts import NEEDED, SPARED
+from rlservo.serve_app.ray_serve.ray_parts import FIELDS, NEEDED, SPARED
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # ray.serve's use of pydantic
@@ -41,6 +41,17 @@ def test_a_ray_that_lacks_a_needed_name_is_refused_by_version(name: str, monkeyp
     assert ray.__version__ in str(refusal.value) and name.replace(":", ".") in str(refusal.value)
     with pytest.raises(RuntimeError, match="install a Ray that it knows"):
         app.build(app.BuildArguments.model_validate({"policies": ["somewhere"]}))
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_so_is_one_whose_objects_lack_a_needed_field(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def initialize(self: Any, controller: Any) -> None:
+        self._controller_handle = controller
+
+    monkeypatch.setattr(ray_parts.find(name.rpartition(".")[0]), "__init__", initialize)
+    with pytest.raises(RuntimeError) as refusal:
+        ray_parts.check()
+    assert ray.__version__ in str(refusal.value) and name.replace(":", ".") in str(refusal.value)
 
 
 def test_so_is_a_uvicorn_that_lacks_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,5 +120,7 @@ def test_a_grpcio_that_keeps_methods_elsewhere_is_refused_by_version(monkeypatch
 
 def test_the_documents_table_has_every_name() -> None:
     table = OPERATIONS.read_text().partition("## What must change for the next Ray")[2]
-    missing = [name for name in (*NEEDED, *SPARED) if f"`{name.rpartition(':')[2].rpartition('.')[2]}`" not in table]
+    missing = [
+        name for name in (*NEEDED, *FIELDS, *SPARED) if f"`{name.rpartition(':')[2].rpartition('.')[2]}`" not in table
+    ]
     assert not missing

@@ -23,6 +23,7 @@ from websockets.exceptions import ConnectionClosed
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server import api_key_file
+from rlservo.serve_app.server.access_checks import find_key
 from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.gauges import exposition
@@ -165,8 +166,8 @@ def test_a_file_that_cannot_be_used_changes_nothing_and_is_said_once(
     for _ in range(5):
         keys.refresh()
     assert (
-        keys.accepted.find(OLD.encode())
-        and not keys.accepted.find(NEW.encode())
+        find_key(keys.accepted, OLD.encode())
+        and not find_key(keys.accepted, NEW.encode())
         and not keys.current
         and keys.changes == 0
     )
@@ -177,7 +178,10 @@ def test_a_file_that_cannot_be_used_changes_nothing_and_is_said_once(
     for _ in range(2):
         keys.refresh()
     assert (
-        keys.accepted.find(NEW.encode()) and not keys.accepted.find(OLD.encode()) and keys.current and keys.changes == 1
+        find_key(keys.accepted, NEW.encode())
+        and not find_key(keys.accepted, OLD.encode())
+        and keys.current
+        and keys.changes == 1
     )
     assert "'cell-8' added, 'cell-7' removed" in caplog.text
     with pytest.raises(UsageError, match=sentence):  # what the start refuses, for the same reason
@@ -192,9 +196,9 @@ def test_half_a_file_is_not_used(file: Path) -> None:
     keys.refresh()
     file.write_text(whole)
     keys.refresh()
-    assert keys.accepted.find(OLD.encode()) and not keys.accepted.find(NEW.encode())  # each was seen once
+    assert find_key(keys.accepted, OLD.encode()) and not find_key(keys.accepted, NEW.encode())  # each was seen once
     keys.refresh()
-    assert keys.accepted.find(OLD.encode()) and keys.accepted.find(NEW.encode()) and keys.changes == 1
+    assert find_key(keys.accepted, OLD.encode()) and find_key(keys.accepted, NEW.encode()) and keys.changes == 1
 
 
 def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(

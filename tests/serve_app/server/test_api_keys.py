@@ -18,9 +18,9 @@ from websockets.exceptions import InvalidStatus
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.server.access_checks import AccessChecks, Hosts, find_key, fold_headers
 from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Access, Keys, Role, check_exposure, new_key
-from rlservo.serve_app.server.request_checks import Hosts, RequestChecks, fold_headers
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
@@ -86,8 +86,8 @@ def test_a_key_is_never_kept_only_its_hash() -> None:
     assert len(CELL) > 40 and CELL != OTHER
     keys = Keys.from_settings(ServerSettings(api_keys=f"{CELL_LINE}, {ADMIN_LINE},"))
     assert [(key.label, key.role) for key in keys.keys] == [("cell-7", Role.act), ("operator", Role.admin)]
-    assert keys.find(ADMIN.encode()) == keys.keys[1]
-    assert keys.find(b"") is keys.find(CELL[:-1].encode()) is keys.find(CELL_LINE.encode()) is None
+    assert find_key(keys, ADMIN.encode()) == keys.keys[1]
+    assert find_key(keys, b"") is find_key(keys, CELL[:-1].encode()) is find_key(keys, CELL_LINE.encode()) is None
     assert CELL_LINE not in repr(ServerSettings(api_keys=CELL_LINE))
 
 
@@ -192,7 +192,7 @@ def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served
 def check(headers: list[tuple[bytes, bytes]], **settings: Any) -> None:
     """Check a request with these headers against a server on loopback that wants no key."""
     chosen = ServerSettings(**settings)
-    checks = RequestChecks(Hosts("127.0.0.1", chosen, keyed=False), CurrentKeys(chosen))
+    checks = AccessChecks(Hosts("127.0.0.1", chosen, keyed=False), CurrentKeys(chosen))
     checks.check({"type": "http", "method": "POST"}, fold_headers(headers), Access.act)
 
 

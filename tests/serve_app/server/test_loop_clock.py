@@ -1,4 +1,4 @@
-"""How old a request is: HAProxy's stamp, and an event loop that stood still."""
+"""Age of a request: HAProxy's stamp, and an event loop that stood still."""
 
 from __future__ import annotations
 

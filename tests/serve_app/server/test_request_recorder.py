@@ -1,4 +1,4 @@
-"""What a server records, over every protocol: the actions replay bit for bit, episodes begin and end where they did."""
+"""A server's recordings, over every protocol: actions replay bit for bit, episodes begin and end where they did."""
 
 from __future__ import annotations
 

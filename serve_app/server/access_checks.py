@@ -10,6 +10,8 @@ Sources: Fetch Standard, section 3.1 (Origin); W3C Fetch Metadata Request Header
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import ipaddress
 import re
 import socket
@@ -17,9 +19,10 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UnauthenticatedError
-from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Role
+from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Keys, Role
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.loopback import is_loopback
+from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 if TYPE_CHECKING:
     from starlette.types import Scope
@@ -39,7 +42,7 @@ TIMEOUT = b"x-request-timeout-seconds"  # Ray Serve's; infinity makes its event 
 PAGE_SCHEMES = (b"http://", b"https://")  # a proxy may have ended TLS
 HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
-LABEL = b"x-session-id"  # whose request it is, where a canary runs; Ray Serve's own routing knows the header, too
+LABEL = LABEL_HEADER.encode()
 HEADERS = "rlservo.headers"  # in a connection's scope: what `fold_headers` gave
 REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, beside the protocol's own
 ANY_HOST = "*"
@@ -109,16 +112,24 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     if presented is None:
         what = "administration needs an admin" if admin else "this server wants an API"
         raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
-    key = accepted.find(presented)
+    key = find_key(accepted, presented)
     if key is None:
         raise UnauthenticatedError("this API key is not known to the server")
     if key.limit is not None:
         keys.limits.spend(key, key.limit)
     if admin and key.role is not Role.admin:
-        raise ForbiddenError(
-            f"the key '{key.label}' may ask for actions, and this needs an admin key", {"key": key.label}
-        )
+        raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key", key=key.label)
     return key
+
+
+def find_key(keys: Keys, presented: bytes) -> Key | None:
+    """Return the key that was presented. Every kept digest is compared, each in constant time."""
+    digest = hashlib.sha256(presented).digest()
+    found = None
+    for key in keys.keys if keys.operator is None else (*keys.keys, keys.operator):
+        if hmac.compare_digest(digest, key.digest):
+            found = key
+    return found
 
 
 class StreamKey:
@@ -141,7 +152,7 @@ class StreamKey:
             self._keys.limits.spend(self._key, self._key.limit)
 
 
-class RequestChecks:
+class AccessChecks:
     """Refuses, by their headers, HTTP requests and WebSockets that no client of ours sends or that have no key."""
 
     def __init__(self, hosts: Hosts, keys: CurrentKeys) -> None:
@@ -195,7 +206,7 @@ def header_text(headers: Mapping[bytes, bytes], name: bytes) -> str | None:
 def mend_headers(headers: list[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
     """Return headers that Ray Serve (2.60) can read, which decodes some as UTF-8 and answers what it cannot with 500.
 
-    `RequestChecks` refuses such a request later, when it has seen the key.
+    `AccessChecks` refuses such a request later, when it has seen the key.
     """
     mended: list[tuple[bytes, bytes]] = []
     for name, value in headers:
