@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable
+import textwrap
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -329,10 +330,14 @@ def markdown(result: Result, facts: dict[str, Any]) -> str:
         "",
         *_markdown(ROBOTS_HEADINGS, robots(result)),
         "",
-        *(f"- {verdict}" for verdict in verdicts(result)),
-        *(f"- not measured: {name}: {why}" for name, why in result.missing.items()),
+        *_bullets(verdicts(result)),
+        *_bullets(f"not measured: {name}: {why}" for name, why in result.missing.items()),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _bullets(sentences: Iterable[object]) -> list[str]:
+    return [textwrap.fill(str(each), 120, initial_indent="- ", subsequent_indent="  ") for each in sentences]
 
 
 def _markdown(headings: list[str], rows: list[list[str]]) -> list[str]:

@@ -14,7 +14,7 @@ from rlservo.export.contract.errors import UnavailableError, UsageError
 # Where `free_ports` looks: above those Ray gives its workers, below those of replicas (`environment.py`, 30000 and up)
 # and those of outgoing connections (Linux: 32768 and up).
 PORTS = range(20_000, 30_000)
-_claims: dict[int, socket.socket] = {}  # by port, while this process lives: what it means to listen on
+_claimed: set[int] = set()  # ports that this process means to listen on, or has somebody listen on
 
 
 def check_port(host: str, port: int) -> None:
@@ -89,7 +89,7 @@ def free_ports(count: int) -> list[int]:
     for port in candidates:
         if len(found) == count:
             break
-        if port not in _claims and claim_port(port):
+        if port not in _claimed and claim_port(port):
             found.append(port)
     if len(found) < count:
         raise UnavailableError(f"{len(found)} of the ports {PORTS[0]} to {PORTS[-1]} are free: {count} are needed")
@@ -102,7 +102,7 @@ def claim_port(port: int) -> bool:
     Seconds pass between the choice of a port and whoever listens there, and another server may be starting meanwhile.
     The claim is a socket's name in the same network namespace as the port, which goes with its process.
     """
-    if port in _claims:
+    if port in _claimed:
         return is_free(port)
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
@@ -115,7 +115,8 @@ def claim_port(port: int) -> bool:
     if not is_free(port):
         claim.close()
         return False
-    _claims[port] = claim
+    claim.detach()  # open, and with it the claim, until this process ends
+    _claimed.add(port)
     return True
 
 
