@@ -256,6 +256,9 @@ class Cluster:
     async def put(self, key: str, value: bytes) -> None:
         self.records[key] = value
 
+    async def create(self, key: str, value: bytes) -> bool:
+        return self.records.setdefault(key, value) is value
+
     async def delete(self, key: str) -> None:
         self.records.pop(key, None)
 
