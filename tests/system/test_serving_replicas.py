@@ -135,10 +135,10 @@ def wait_for_two(server: Run, direct_port: int) -> list[int]:
     return list(found)
 
 
-def test_states_streams_and_ids_keep_an_episode(server: Run, recurrent: Path, key_file: Path) -> None:
+def test_states_streams_and_ids_keep_an_episode(server: Run, recurrent: Path, key_file: Path, direct_port: int) -> None:
     key_file.write_text(OLD_LINE + "\n")
     wait_until_followed(server.port, {OLD: 200})
-    assert len(server.processes("ServeReplica")) == 2
+    wait_for_two(server, direct_port)
     with Policy.load(recurrent / MODEL) as policy:
         expected = [policy.act(obs) for obs in SEEN]
     url = f"http://127.0.0.1:{server.port}"

@@ -46,6 +46,7 @@ from rlservo.serve_app.runtime.network_memory import NetworkMemory
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.request_metrics import VersionCounts
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions import plan
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions, VersionState
@@ -202,10 +203,10 @@ def test_a_bad_canary_is_rolled_back_long_before_the_time_is_over(run: Any, serv
 
 
 def test_a_failure_of_a_canary_drawn_by_chance_is_its_own(server: Server) -> None:
-    before = server.core.metrics.counts("ur5").get("1")
+    counts = server.core.metrics.counts("ur5")
+    before, failed = counts.get("1"), counts.get("3", VersionCounts()).failed.get("unsafe-action", 0)
     with server.admin() as admin:
         admin.canary("ur5", "3", 1.0)
-    failed = server.core.metrics.counts("ur5")["3"].failed.get("unsafe-action", 0)
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
     connection.request("POST", "/v1/policies/ur5/act", json.dumps({"obs": OBS}), {"content-type": "application/json"})
     assert connection.getresponse().status == 500
