@@ -33,7 +33,8 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from servers import Run, launched
 
-pytestmark = [pytest.mark.serve, pytest.mark.slow]
+# The last test leaves one replica.
+pytestmark = [pytest.mark.serve, pytest.mark.slow, pytest.mark.random_order(disabled=True)]
 
 OLD, OLD_LINE = new_key("cell-7")
 NEW, NEW_LINE = new_key("cell-8")
