@@ -4,11 +4,13 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-# Unit tests: what starts no Ray, simulator, robot server or proxy, trains nothing, and does not wait for time to pass.
+# Unit tests: what starts no Ray, simulator, robot server, proxy or storage, trains nothing, does not wait for time to
+# pass.
 UNITS := tests/serve_app tests/envs/test_registration.py tests/export/checkpoints/test_experiment.py \
 	tests/test_layout.py tests/test_package.py
 NOT_UNITS := $(addprefix --ignore=tests/serve_app/, ray_serve/test_haproxy_wrapper.py \
-	ray_serve/test_http_connections.py client/test_bad_line.py client/test_client_faults.py replay)
+	ray_serve/test_http_connections.py client/test_bad_line.py client/test_client_faults.py replay \
+	versions/test_remote_repository.py)
 
 .PHONY: demo test quick check bench soak faults wheel setup clean
 
