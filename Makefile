@@ -20,7 +20,7 @@ demo: setup  ## Export the two shipped checkpoints, serve them, drive both simul
 test: setup  ## All tests, in three processes: on two cores one of them often waits
 	$(BIN)/python -m pytest -n 3
 
-quick: setup  ## Unit tests, in under a minute
+quick: setup  ## Unit tests, in a minute and a half on two cores
 	$(BIN)/python -m pytest -n 4 -m "not slow and not serve and not trained" $(NOT_UNITS) $(UNITS)
 
 check: setup  ## Lint, format and types, as CI runs them

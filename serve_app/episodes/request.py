@@ -39,7 +39,7 @@ def shorten_label(label: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """What a request says of the episode it belongs to."""
+    """What a request says of the episode it belongs to. A client may send each of these fields, and no other."""
 
     state: Mapping[str, Any] | None = None
     """The recurrent state that the client carries (see `carried_state.py`); empty at an episode's start. None: it

@@ -186,10 +186,10 @@ class SharedSessions:
         if self._leaving is not None:
             await self._leaving.wait()
         assert request.episode is not None and request.episode.session_id is not None
-        if self._memory(request, token) is None or await self._find(AFTER + token) is not None:
-            return None
         session = self._memory(request, token)
-        if session is None:
+        if session is None or await self._find(AFTER + token) is not None:
+            return None
+        if self._memory(request, token) is not session:  # it went while the store was asked
             return None
         is_stamped = request.stream_id is None and request.seq is None  # otherwise `seq` says which request it is
         stamp = request.headers.get(STAMP_HEADER) if is_stamped else None
@@ -305,7 +305,7 @@ class SharedSessions:
             if not key.startswith((MOVED, AFTER)):
                 record = await self._find(key)
                 if record is None or not await self._create(AFTER + record.token, closed(key)):
-                    continue  # an episode is begun just now
+                    continue  # it is deleted already, or an episode was begun just now
             await self._delete(key)
         self._unneeded = unneeded
 
