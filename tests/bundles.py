@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -89,16 +88,12 @@ def save_graph(
 
 
 def write_bundle(folder: Path, contract: Contract, obs: NDArray[Any], **more: NDArray[Any]) -> Path:
-    """Complete a folder that holds policy.onnx: TorchScript, golden vectors of `obs`, contract and hashes.
+    """Complete a folder that holds policy.onnx: a file for TorchScript, golden vectors of `obs`, contract and hashes.
 
     `more` are further inputs by name, a dot written as two underscores.
     """
-    import torch
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # torch 2.13 prefers torch.export; bundles hold TorchScript
-        scripted = torch.jit.trace(torch.nn.Tanh(), torch.zeros(1, 2))  # never opened here, but its hash is checked
-        torch.jit.save(scripted, folder / bundle_files.TORCHSCRIPT_FILE)
+    # What loads and serves bundles checks its hash and never opens it; torch would take each process seconds to import.
+    (folder / bundle_files.TORCHSCRIPT_FILE).write_bytes(b"no TorchScript: " + bytes(1000))
     session = onnxruntime.InferenceSession(folder / bundle_files.ONNX_FILE)
     names = [tensor.name for tensor in contract.outputs]
     inputs = {"obs": obs, **{name.replace("__", "."): array for name, array in more.items()}}

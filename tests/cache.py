@@ -12,7 +12,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,7 +42,14 @@ def cached(name: str, made_of: Iterable[Path | str], make: Callable[[Path], None
 
 def versions(*packages: str) -> str:
     """Return a word for `made_of`: this Python and the installed versions of these packages."""
-    return " ".join([PYTHON, *(f"{package}=={version(package)}" for package in packages)])
+    return " ".join([PYTHON, *(f"{package}=={_version(package)}" for package in packages)])
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:  # then nothing is made with it here
+        return "none"
 
 
 def _digest(made_of: Iterable[Path | str]) -> str:

@@ -30,8 +30,8 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
 from stores import store_of
 
-ROOT = Path(__file__).resolve().parents[3]
-OURS = (str(ROOT / "serve_app"), str(ROOT / "export"), str(ROOT / "deploy"))
+HOME = Path(ingress_module.__file__).parents[2]  # as this Python imports them, which may be by a link
+OURS = (str(HOME / "serve_app"), str(HOME / "export"), str(HOME / "deploy"))
 NINE = [
     "serve_app/ray_serve/http_connections.py",
     "serve_app/ray_serve/ingress.py",
@@ -64,7 +64,7 @@ class PassedFiles:
         if frame.f_code is InferenceSession.run.__code__:
             self.reached_network = True
         elif frame.f_code.co_filename.startswith(OURS):
-            self.files.setdefault(str(Path(frame.f_code.co_filename).relative_to(ROOT)))
+            self.files.setdefault(str(Path(frame.f_code.co_filename).relative_to(HOME)))
 
 
 @pytest.fixture

@@ -120,6 +120,7 @@ def test_minari_loads_its_dataset(run: Path, tmp_path: Path, monkeypatch: pytest
 
 
 def test_conversion_of_several_policies_wants_a_name(policies: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
     with Recorder(tmp_path / "run.mcap") as recorder:
         for name in ("ur5", "gridworld"):
             record(WithRecording(Policy.load(policies / name), recorder), [4])

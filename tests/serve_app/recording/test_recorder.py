@@ -168,8 +168,8 @@ def test_exploring_decision_keeps_the_modules_own_action_and_its_log_probability
 
 @pytest.mark.parametrize("kind", ["diag_gaussian", "squashed_gaussian", "categorical", "multi_categorical"])
 def test_log_probability_is_rllibs(kind: str, rng: Rng) -> None:
-    import torch
-    from ray.rllib.core.distribution.torch import torch_distribution as rllib
+    torch = pytest.importorskip("torch")
+    rllib = pytest.importorskip("ray.rllib.core.distribution.torch.torch_distribution")
 
     box = BoxSpec(shape=(3,), dtype="float32", low=-1.0, high=1.0)
     multi = MultiDiscreteSpec(shape=(2,), nvec=(3, 4), start=(5, 0))
