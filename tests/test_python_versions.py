@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import shutil
 import subprocess
@@ -18,6 +19,8 @@ FOLDERS = ("envs", "export", "serve_app", "deploy", "examples")
 OLDEST = (3, 10)
 CLASSIFIER = re.compile(r'"Programming Language :: Python :: 3\.(\d+)"')
 INSTALLED_S = 400
+SERVING = ("client", "serve", "sim", "record", "remote", "cockpit")  # what unit tests need of the extras
+TEST_TOOLS = ("pytest", "uvicorn", "httpx", "pyyaml", "jsonschema", "playwright", "moto")
 
 PROGRAM = """
 import sys
@@ -63,38 +66,70 @@ def interpreter(minor: str) -> str:
     pytest.skip(f"there is no Python 3.{minor} here")
 
 
-def requirements() -> list[str]:
-    """Return what the base and the extra `client` need, as the project file says."""
-    base, client = (re.search(rf"^{name} = \[(.*?)\]", project(), re.M | re.S) for name in ("dependencies", "client"))
-    assert base is not None and client is not None
-    return re.findall(r'"([^"]+)"', base[1] + client[1])
+def requirements(*extras: str) -> list[str]:
+    """Return what the base and these extras need, as the project file says."""
+    lists = [re.search(rf"^{name} = \[\n?(.*?)\]$", project(), re.M | re.S) for name in ("dependencies", *extras)]
+    named = [line for found in lists if found is not None for line in re.findall(r'"([^"]+)"', found[1])]
+    assert len(lists) == 1 + len(extras) and None not in lists
+    return [line for line in named if not line.startswith("rlservo[")]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("minor", CLASSIFIER.findall(project()))
-def test_base_and_client_run_on_every_python_that_is_named(minor: str, ur5: Path, tmp_path: Path) -> None:
+def environment_of(minor: str, *options: str) -> Path:
+    """Return the Python of an environment of Python 3.`minor`, or skip where there is none or pip cannot install."""
     named = interpreter(minor)
 
     def install(folder: Path) -> None:
         for command in (
             [named, "-m", "venv", "--without-pip", str(folder)],
-            [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet",
-             *requirements()],
-        ):  # fmt: skip
+            [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet", *options],
+        ):
             done = subprocess.run(command, capture_output=True, text=True, timeout=INSTALLED_S)
             if done.returncode != 0:
                 pytest.skip(f"Python 3.{minor} cannot have the requirements: {done.stderr.strip()[-300:]}")
 
     said = subprocess.run([named, "-VV"], capture_output=True, text=True, timeout=60).stdout
-    python = cached(f"base-python3.{minor}", [said, *requirements()], install) / "bin" / "python"
-    package = tmp_path / "path" / "rlservo"  # what setuptools' package-dir makes of the tree
+    return cached(f"python3.{minor}", [said, *options], install) / "bin" / "python"
+
+
+def linked_package(folder: Path) -> Path:
+    """Return a folder for PYTHONPATH where this tree is the package `rlservo`, as setuptools' package-dir makes it."""
+    package = folder / "path" / "rlservo"
     package.mkdir(parents=True)
     for source in [*(ROOT / "deploy" / "package").glob("*.py"), *(ROOT / name for name in FOLDERS[:4])]:
         (package / source.name).symlink_to(source)
-    environment = {"PYTHONPATH": str(package.parent), "PYTHONDONTWRITEBYTECODE": "1", "ORT_DISABLE_TELEMETRY": "1"}
+    return package.parent
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("minor", CLASSIFIER.findall(project()))
+def test_base_and_client_run_on_every_python_that_is_named(minor: str, ur5: Path, tmp_path: Path) -> None:
+    python = environment_of(minor, *requirements("client"))
+    path = linked_package(tmp_path)
+    environment = {"PYTHONPATH": str(path), "PYTHONDONTWRITEBYTECODE": "1", "ORT_DISABLE_TELEMETRY": "1"}
     done = subprocess.run(
         [str(python), "-W", "error", "-c", PROGRAM, str(ur5)],
         capture_output=True, text=True, timeout=200, cwd=tmp_path, env=environment,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("refused\nacted (6,)\n") and "algorithm" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1500)  # minutes of processor time, on cores that other tests have as well
+def test_unit_tests_pass_on_the_newest_python(tmp_path: Path) -> None:
+    """`make quick` with that interpreter, without torch and RLlib: with them it would be an install of gigabytes."""
+    minor = max(CLASSIFIER.findall(project()), key=int)
+    tools = [line for line in requirements("dev") if line.startswith(TEST_TOOLS)]
+    needed = [*requirements(*SERVING), "onnx", *tools]
+    python = environment_of(minor, "-c", str(ROOT / "constraints.txt"), *needed)
+    path = linked_package(tmp_path)
+    (path / "rlservo.pth").symlink_to(ROOT / "envs" / "rlservo-gymnasium.pth")
+    (path / "sitecustomize.py").write_text(f"import site\nsite.addsitedir({str(path)!r})\n")
+    own = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    done = subprocess.run(
+        ["make", "--silent", "--old-file=setup", "quick", f"VENV={python.parents[1]}"],
+        capture_output=True, text=True, cwd=ROOT, env={**own, "PYTHONPATH": str(path)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr
+    passed = re.search(r"(\d+) passed", done.stdout)
+    assert passed is not None and int(passed[1]) > 1500, done.stdout[-500:]
