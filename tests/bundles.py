@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import onnx
@@ -19,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from cache import cached, versions
+from cache import cached, digest, versions
 from checkpoints import APP, TRAINED_WITH
 from rlservo.export.contract import bundle as bundle_files
 from rlservo.export.contract.contract import (
@@ -37,6 +38,9 @@ from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
 from stores import MemoryLedger
+
+if TYPE_CHECKING:
+    from rlservo.export.commands.export import ExportResult
 
 ROOT = Path(__file__).resolve().parents[1]
 OBS = 27
@@ -332,6 +336,41 @@ def discrete_policy() -> Callable[..., Path]:
 
 EXPORTED_WITH = versions("ray", "torch", "onnx", "onnxscript", "onnxruntime", "gymnasium", "numpy")
 PRODUCT = [ROOT / folder for folder in ("export", "serve_app", "envs")]  # what an export runs through
+
+
+@functools.cache
+def _exporting_code() -> str:
+    """A word for what an export runs through, its own code and others'."""
+    return digest([*PRODUCT, APP, EXPORTED_WITH])
+
+
+@functools.cache
+def _exported_checkpoint(checkpoint: Path, module_id: str | None) -> Path:
+    def export(out: Path) -> None:
+        from rlservo.export.commands.export import export_checkpoint
+
+        how: dict[str, Any] = {"name": "policy", "app_dir": APP, "module_id": module_id}
+        export_checkpoint(checkpoint, out, notify=lambda line: None, **how)
+
+    name = "-".join(["exported", checkpoint.name, *([module_id] if module_id else [])])
+    return cached(name, [checkpoint, _exporting_code(), str(module_id)], export) / "policy" / "1"
+
+
+@pytest.fixture(scope="session")
+def exported() -> Callable[..., ExportResult]:
+    """Return a function that gives the export of a checkpoint, of one of its modules. Its files: not to be written to.
+
+    Tests of the exporting itself, of what it says and of its other options, call `export_checkpoint`.
+    """
+    from rlservo.export.commands.export import ExportResult
+
+    def export(checkpoint: Path, module_id: str | None = None) -> ExportResult:
+        path = _exported_checkpoint(checkpoint, module_id)
+        return ExportResult(path, bundle_files.read_contract(path))
+
+    return export
+
+
 RECURRENT = ("lstm_box", "lstm_previous", "act_nested")
 SHIPPED = {  # by the name they are served under
     "ur5": "ur5_positioning",

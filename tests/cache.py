@@ -27,7 +27,7 @@ def cached(name: str, made_of: Iterable[Path | str], make: Callable[[Path], None
     """
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rlservo-tests"
     root.mkdir(parents=True, exist_ok=True)
-    folder = root / f"{name}-{_digest(made_of)}"
+    folder = root / f"{name}-{digest(made_of)}"
     complete = folder.with_name(f"{folder.name}.complete")  # beside it: the folder holds what `make` wrote, only
     with folder.with_name(f"{folder.name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # another process of this run, or another run, may be making the same
@@ -52,7 +52,8 @@ def _version(package: str) -> str:
         return "none"
 
 
-def _digest(made_of: Iterable[Path | str]) -> str:
+def digest(made_of: Iterable[Path | str]) -> str:
+    """Return a word that tells files, folders and words with another content from these."""
     found = hashlib.sha256()
     for part in made_of:
         if isinstance(part, str):

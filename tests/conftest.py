@@ -17,6 +17,10 @@ from xdist.scheduler import LoadScopeScheduling
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+# numpy's linear algebra waits for its threads by spinning, which is most of what it does beside other processes: to fit
+# a recording's values took fifteen times the processor time. Read when numpy is imported, in children too.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 pytest_plugins = [
     "checkpoints",
     "bundles",

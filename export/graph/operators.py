@@ -209,6 +209,14 @@ def _count_nonzero(x: Tensor, dim: Any = None) -> Tensor:
     return torch.sum(counted) if dim is None else torch.sum(counted, dim)
 
 
+def _nanmean(x: Tensor, dim: Any = None, keepdim: bool = False, *, dtype: torch.dtype | None = None) -> Tensor:
+    x = x if dtype is None else x.to(dtype)
+    missing = torch.isnan(x)
+    numbers = torch.where(missing, torch.zeros_like(x), x)
+    dims = list(range(x.dim())) if dim is None else dim
+    return torch.sum(numbers, dims, keepdim) / torch.sum((~missing).to(x.dtype), dims, keepdim)
+
+
 def _std(x: Tensor, dim: Any = None, *args: Any, **named: Any) -> Tensor:
     return torch.std(x.double(), dim, *args, **named).to(x.dtype)  # squares leave single precision from 1e19 on
 
@@ -361,6 +369,7 @@ EXACT: dict[str, Callable[..., Any]] = {
     "fliplr": _flip_axis(1),
     "flipud": _flip_axis(0),
     "count_nonzero": _count_nonzero,
+    "nanmean": _nanmean,
     "std": _std,
     "var": _var,
     "searchsorted": _searchsorted,

@@ -6,11 +6,13 @@ successes below which a policy as good as the card's lower confidence bound fall
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import math
 import pickle
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,6 +21,8 @@ import numpy as np
 import pytest
 import yaml
 
+from bundles import EXPORTED_WITH, PRODUCT
+from cache import cached, versions
 from rlservo.serve_app.runtime.policy import Policy
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -26,6 +30,7 @@ SHIPPED = EXAMPLES / "checkpoints"
 NAMES = sorted(path.parent.name for path in SHIPPED.glob("*/training.yaml"))
 SEED = 700_000
 ONCE_IN = 10_000
+RUN_WITH = f"{EXPORTED_WITH} {versions('mujoco')}"
 LARGEST = 750_000  # bytes of a folder
 
 
@@ -45,6 +50,21 @@ evaluate_shipped = load("evaluate_shipped")
 def bundles(all_shipped: Path) -> dict[str, Path]:
     """Every shipped checkpoint, exported by today's code: that alone proves that the file acts as RLlib does."""
     return {name: all_shipped / name / "1" for name in NAMES}
+
+
+def evaluated(name: str, bundle: Path, episodes: int, acting: Callable[[Policy], Any] | None = None) -> list[Any]:
+    """Return what an evaluation of a policy came to, with `acting` of it: kept while nothing that it runs changes."""
+
+    def evaluate(folder: Path) -> None:
+        with Policy.load(bundle) as policy:
+            settings = evaluate_shipped.load_settings(name)
+            measured = evaluate_shipped.evaluate(acting(policy) if acting else policy, settings, episodes, SEED)
+        (folder / "evaluation.json").write_text(json.dumps([dataclasses.asdict(one) for one in measured]))
+
+    code = [EXAMPLES / "evaluate_shipped.py", EXAMPLES / "shared", Path(__file__), *PRODUCT, RUN_WITH]
+    how = [SHIPPED / name, str(episodes), acting.__name__ if acting else "as it is"]
+    kept = cached(f"evaluated-{name}", [*how, *code], evaluate) / "evaluation.json"
+    return [evaluate_shipped.Evaluation(**one) for one in json.loads(kept.read_text())]
 
 
 def fewest_successes(rate: float, episodes: int) -> int:
@@ -88,8 +108,7 @@ def test_each_acts_as_well_as_its_card_says(name: str, bundles: dict[str, Path])
     settings = evaluate_shipped.load_settings(name)
     # An episode of CartPole is 500 steps; a card of many rows gets few episodes in each, which are judged together too.
     episodes = 20 if name == "cartpole_dqn" else min(40, 120 // len(settings["evaluation"]))
-    with Policy.load(bundles[name]) as policy:
-        measured = evaluate_shipped.evaluate(policy, settings, episodes, SEED)
+    measured = evaluated(name, bundles[name], episodes)
     for ours, card in zip(measured, card_figures(name), strict=True):
         if card["successes"] is not None:
             assert ours.successes >= fewest_successes(card["success_interval"][0], episodes), ours
@@ -131,10 +150,8 @@ def test_the_recurrent_policy_needs_its_memory(bundles: dict[str, Path]) -> None
             self.policy.reset()
             return self.policy.act(obs, **arguments)
 
-    settings = evaluate_shipped.load_settings("mir100_sparse_fixes")
-    with Policy.load(bundles["mir100_sparse_fixes"]) as policy:
-        remembering = evaluate_shipped.evaluate(policy, settings, 20, SEED)[0]
-        forgetting = evaluate_shipped.evaluate(Forgetful(policy), settings, 20, SEED)[0]
+    name = "mir100_sparse_fixes"
+    (remembering, *_), (forgetting, *_) = (evaluated(name, bundles[name], 20, one) for one in (None, Forgetful))
     assert remembering.successes > forgetting.successes + 5
     assert remembering.mean_return > forgetting.mean_return
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from checkpoints import APP
+from rlservo.export.commands.export import ExportResult
 from rlservo.export.graph.one_thread import one_thread
 
 
@@ -29,6 +30,18 @@ def notices() -> list[str]:
 def app() -> Path:
     """The folder with the user's own code that some of the checkpoints need."""
     return APP
+
+
+@pytest.fixture
+def exported_copy(exported: Callable[..., ExportResult], tmp_path: Path) -> Callable[[Path], ExportResult]:
+    """Return a function that gives a checkpoint's export, as `exported`, where a test may write to its files."""
+
+    def copy(checkpoint: Path) -> ExportResult:
+        kept = exported(checkpoint)
+        path = shutil.copytree(kept.path, tmp_path / "exported" / checkpoint.name / "1")
+        return ExportResult(path, kept.contract)
+
+    return copy
 
 
 @pytest.fixture

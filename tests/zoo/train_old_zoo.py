@@ -46,6 +46,7 @@ def old(config: Any, env: str, *, filtered: str = "NoFilter", kind: str = "", **
     config.api_stack(enable_rl_module_and_learner=False, enable_env_runner_and_connector_v2=False)
     config.environment(env, env_config={"kind": kind} if kind else {}, **environment)
     config.env_runners(num_env_runners=0, observation_filter=filtered).debugging(seed=1)
+    config.reporting(min_time_s_per_iteration=0)  # by itself SAC goes on for a second, APPO for ten
     # An interval that is never reached: evaluation happens when it is asked for, with an environment of its own.
     config.evaluation(
         evaluation_interval=1000,
@@ -96,7 +97,6 @@ def sac(env: str, **more: Any) -> Any:
 
 def parallel(config: Any) -> Any:
     old(config, "CartPole-v1", filtered="MeanStdFilter").env_runners(rollout_fragment_length=32)
-    config.reporting(min_time_s_per_iteration=0)
     return config.training(train_batch_size=64, model={"fcnet_hiddens": [16]}).resources(num_gpus=0)
 
 

@@ -153,6 +153,7 @@ def offline(config: Any, data: str, action: str, **training: Any) -> Any:
     )
     config.evaluation(evaluation_interval=1, evaluation_num_env_runners=0, evaluation_duration=1)
     config.learners(num_learners=0).training(train_batch_size_per_learner=32, **training)
+    config.reporting(min_time_s_per_iteration=0)  # by itself CQL goes on for a second
     return config.rl_module(model_config=SMALL)
 
 
@@ -210,6 +211,8 @@ def configurations(out: Path) -> dict[str, Any]:
     choices, numbers = (recorded(out, action) for action in ("discrete", "box"))
     impala = spaces_env(IMPALAConfig(), "vector", "box").learners(num_learners=0).rl_module(model_config=SMALL)
     appo = spaces_env(APPOConfig(), "vector", "multi_discrete").learners(num_learners=0).rl_module(model_config=LSTM)
+    for config in (impala, appo):
+        config.reporting(min_time_s_per_iteration=0)  # by themselves they go on for ten seconds
     gru = RLModuleSpec(module_class=zoo_spaces.GruModule, model_config={"max_seq_len": 10})
     episodes = {"type": "EpisodeReplayBuffer", "capacity": 1000}
     masking = RLModuleSpec(module_class=ActionMaskingTorchRLModule, model_config={"head_fcnet_hiddens": [8]})

@@ -47,10 +47,12 @@ def doubler(env: Any = None, spaces: Any = None, device: Any = None) -> Any:
     return zoo_parts.Doubler()
 
 
-def ppo(env: str, *, before: Any = None, spec: Any = None, model: Any = SMALL, **environment: Any) -> Any:
+def ppo(
+    env: str, *, before: Any = None, spec: Any = None, model: Any = SMALL, steps: int = 64, **environment: Any
+) -> Any:
     config = PPOConfig().environment(env, **environment)
     config.env_runners(num_env_runners=0, env_to_module_connector=before)
-    config.training(train_batch_size=128, minibatch_size=64, num_epochs=1)
+    config.training(train_batch_size=steps, minibatch_size=64, num_epochs=1)
     return config.rl_module(rl_module_spec=spec) if spec else config.rl_module(model_config=model)
 
 
@@ -67,9 +69,9 @@ def off_policy(config: Any, env: str, **environment: Any) -> Any:
 
 def configurations() -> dict[str, Any]:
     appo = APPOConfig().environment("CartPole-v1").env_runners(num_env_runners=0).learners(num_learners=0)
-    appo.rl_module(model_config=SMALL)
+    appo.reporting(min_time_s_per_iteration=0).rl_module(model_config=SMALL)  # by itself it goes on for ten seconds
     return {
-        "pendulum": ppo("Pendulum-v1", before=mean_std_filter),
+        "pendulum": ppo("Pendulum-v1", before=mean_std_filter, steps=128),
         "cart_pole": ppo("CartPole-v1"),
         "clipped": ppo("Pendulum-v1", normalize_actions=False, clip_actions=True),
         "shared": ppo("Pendulum-v1", model=DefaultModelConfig(fcnet_hiddens=[16], vf_share_layers=True)),

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import onnx
 import onnxruntime
 import pytest
 
-from rlservo.export.commands.export import export_checkpoint
+from rlservo.export.commands.export import ExportResult, export_checkpoint
 from rlservo.export.commands.naming import default_name
 from rlservo.export.contract import bundle
 from rlservo.export.contract.bundle import load_bundle, write_contract
@@ -42,9 +43,9 @@ EXPORTED = [
 
 @pytest.mark.parametrize("name", EXPORTED)
 def test_an_export_acts_as_rllib_did_in_its_own_rollout(
-    zoo: Path, app: Path, tmp_path: Path, notices: list[str], name: str
+    zoo: Path, exported: Callable[..., ExportResult], name: str
 ) -> None:
-    result = export_checkpoint(zoo / name, tmp_path, app_dir=app, notify=notices.append)
+    result = exported(zoo / name)
     seen = np.load(zoo / f"{name}.npz")
     assert len(seen["obs"]) >= 90
     outputs = tuple(output.name for output in result.contract.outputs)
@@ -88,9 +89,9 @@ def test_a_bundle_says_what_went_in(zoo: Path, tmp_path: Path, notices: list[str
 
 
 def test_the_onnx_file_carries_names_a_dynamic_batch_and_the_contract(
-    zoo: Path, tmp_path: Path, notices: list[str]
+    zoo: Path, exported: Callable[..., ExportResult]
 ) -> None:
-    result = export_checkpoint(zoo / "mixed", tmp_path, notify=notices.append)
+    result = exported(zoo / "mixed")
     model = onnx.load(str(result.path / "policy.onnx"))
     onnx.checker.check_model(model, full_check=True)
     assert model.opset_import[0].version <= 18 and model.ir_version <= 8
@@ -105,8 +106,8 @@ def test_the_onnx_file_carries_names_a_dynamic_batch_and_the_contract(
         assert run({"obs": np.zeros((size, 5), np.float32)})["action"].shape == (size, 3)
 
 
-def test_golden_vectors_are_finite_and_reproduced(zoo: Path, tmp_path: Path, notices: list[str]) -> None:
-    result = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
+def test_golden_vectors_are_finite_and_reproduced(zoo: Path, exported: Callable[..., ExportResult]) -> None:
+    result = exported(zoo / "pendulum")
     inputs, outputs = load_bundle(result.path).golden()
     assert inputs["obs"].shape == (64, 3) and set(outputs) == {"action", "action_dist_inputs", "value"}
     assert all(np.isfinite(values).all() for values in (*inputs.values(), *outputs.values()))
@@ -124,8 +125,10 @@ def test_versions_count_up_and_are_never_overwritten(zoo: Path, tmp_path: Path, 
         export_checkpoint(zoo / "cart_pole", tmp_path, name="balance", version="7", notify=notices.append)
 
 
-def test_an_edited_contract_with_valid_hashes_is_refused_at_load(zoo: Path, tmp_path: Path, notices: list[str]) -> None:
-    result = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
+def test_an_edited_contract_with_valid_hashes_is_refused_at_load(
+    zoo: Path, exported_copy: Callable[[Path], ExportResult]
+) -> None:
+    result = exported_copy(zoo / "pendulum")
     space = result.contract.action_space
     assert space.kind == "box"
     wider = space.model_copy(update={"low": -200.0, "high": 200.0})  # a robot would be let through
@@ -137,9 +140,9 @@ def test_an_edited_contract_with_valid_hashes_is_refused_at_load(zoo: Path, tmp_
 
 
 def test_a_contract_is_replaced_whole_or_not_at_all(
-    zoo: Path, tmp_path: Path, notices: list[str], monkeypatch: pytest.MonkeyPatch
+    zoo: Path, exported_copy: Callable[[Path], ExportResult], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    result = export_checkpoint(zoo / "cart_pole", tmp_path, notify=notices.append)
+    result = exported_copy(zoo / "cart_pole")
     before = {file.name: file.read_bytes() for file in result.path.iterdir()}
 
     def full(_path: Path) -> str:

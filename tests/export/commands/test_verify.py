@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import gymnasium
@@ -15,7 +15,7 @@ from rich.console import Console
 
 from checkpoints import training_code
 from rlservo.export.commands.element_names import read_elements
-from rlservo.export.commands.export import export_checkpoint
+from rlservo.export.commands.export import ExportResult, export_checkpoint
 from rlservo.export.commands.prune import prune_checkpoint
 from rlservo.export.commands.report import contract_report
 from rlservo.export.commands.verify import verify_bundle
@@ -44,9 +44,9 @@ def spaces(app: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def test_verify_runs_both_on_the_same_seeds_and_writes_it_into_the_bundle(
-    zoo: Path, tmp_path: Path, notices: list[str]
+    zoo: Path, exported_copy: Callable[[Path], ExportResult], notices: list[str]
 ) -> None:
-    exported = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
+    exported = exported_copy(zoo / "pendulum")
     result = verify_bundle(exported.path, zoo / "pendulum", env_id="Pendulum-v1", episodes=2, notify=notices.append)
     assert result.same_checkpoint and result.parity.formats["onnx"].max_rel < 1e-5
     evaluation = load_bundle(exported.path).contract.evaluations[0]  # the hashes fit the new contract
@@ -57,9 +57,9 @@ def test_verify_runs_both_on_the_same_seeds_and_writes_it_into_the_bundle(
 
 
 def test_verify_reports_success_where_the_environment_tells(
-    zoo: Path, tmp_path: Path, notices: list[str], toy: str
+    zoo: Path, exported_copy: Callable[[Path], ExportResult], notices: list[str], toy: str
 ) -> None:
-    exported = export_checkpoint(zoo / "mixed", tmp_path, notify=notices.append)
+    exported = exported_copy(zoo / "mixed")
     result = verify_bundle(exported.path, zoo / "mixed", env_id=toy, episodes=3, first_seed=5, notify=notices.append)
     assert result.evaluation is not None and result.evaluation.success_rate_bundle == 1.0
     assert result.evaluation.return_bundle == pytest.approx(result.evaluation.return_checkpoint, rel=1e-5)
@@ -67,12 +67,15 @@ def test_verify_reports_success_where_the_environment_tells(
 
 @pytest.mark.parametrize(("name", "action"), [("lstm_box", "box"), ("act_nested", "nested"), ("previous", "discrete")])
 def test_verify_drives_recurrent_and_nested_policies(
-    wide_zoo: Path, recurrent: Path, app: Path, tmp_path: Path, notices: list[str], spaces: str, name: str, action: str
+    wide_zoo: Path,
+    app: Path,
+    exported_copy: Callable[[Path], ExportResult],
+    notices: list[str],
+    spaces: str,
+    name: str,
+    action: str,
 ) -> None:
-    if (recurrent / name).exists():
-        bundle = Path(shutil.copytree(recurrent / name / "1", tmp_path / name / "1"))
-    else:
-        bundle = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append).path
+    bundle = exported_copy(wide_zoo / name).path
     assert read_contract(bundle).provenance.env_config["action"] == action
     result = verify_bundle(bundle, wide_zoo / name, env_id=spaces, episodes=3, app_dir=app, notify=notices.append)
     evaluation = result.evaluation
@@ -83,29 +86,34 @@ def test_verify_drives_recurrent_and_nested_policies(
 
 
 def test_verify_drives_where_the_actions_do_not_start_at_zero(
-    zoo: Path, tmp_path: Path, notices: list[str], toy: str
+    zoo: Path, exported_copy: Callable[[Path], ExportResult], notices: list[str], toy: str
 ) -> None:
-    exported = export_checkpoint(zoo / "started", tmp_path, notify=notices.append)
+    exported = exported_copy(zoo / "started")
     result = verify_bundle(exported.path, zoo / "started", env_id=toy, episodes=2, notify=notices.append)
     assert result.evaluation is not None
     assert result.evaluation.return_bundle == pytest.approx(result.evaluation.return_checkpoint, rel=1e-5)
 
 
 def test_an_interrupted_verification_writes_no_half_of_a_comparison(
-    zoo: Path, tmp_path: Path, notices: list[str], monkeypatch: pytest.MonkeyPatch
+    zoo: Path,
+    exported_copy: Callable[[Path], ExportResult],
+    notices: list[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    exported = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
+    exported = exported_copy(zoo / "pendulum")
     monkeypatch.setattr(PendulumEnv, "step", interrupt)
     with pytest.raises(KeyboardInterrupt):
         verify_bundle(exported.path, zoo / "pendulum", env_id="Pendulum-v1", episodes=2, notify=notices.append)
     assert read_contract(exported.path).evaluations == ()
 
 
-def test_verify_catches_another_checkpoint(zoo: Path, tmp_path: Path, notices: list[str]) -> None:
-    exported = export_checkpoint(zoo / "relu", tmp_path, notify=notices.append)
+def test_verify_catches_another_checkpoint(
+    zoo: Path, exported_copy: Callable[[Path], ExportResult], notices: list[str]
+) -> None:
+    exported = exported_copy(zoo / "relu")
     with pytest.raises(ParityError):
         verify_bundle(exported.path, zoo / "shared", notify=notices.append)
     assert "exported from another checkpoint" in " ".join(notices)
@@ -114,11 +122,11 @@ def test_verify_catches_another_checkpoint(zoo: Path, tmp_path: Path, notices: l
 
 
 def test_verify_refuses_what_is_no_bundle_and_an_environment_that_does_not_fit(
-    zoo: Path, tmp_path: Path, notices: list[str]
+    zoo: Path, tmp_path: Path, exported_copy: Callable[[Path], ExportResult], notices: list[str]
 ) -> None:
     with pytest.raises(BundleError):
         verify_bundle(tmp_path, zoo / "pendulum", notify=notices.append)
-    exported = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
+    exported = exported_copy(zoo / "pendulum")
     with pytest.raises(UsageError, match=r"does not fit CartPole-v1: the observation has shape \(4,\) there"):
         verify_bundle(exported.path, zoo / "pendulum", env_id="CartPole-v1", notify=notices.append)
     with pytest.raises(UsageError, match="is not registered"):
@@ -191,12 +199,12 @@ def test_an_environment_that_names_nothing_is_no_notice(notices: list[str]) -> N
 
 @pytest.mark.parametrize("width", [80, 160])
 def test_the_report_shows_names_bounds_baked_steps_and_proof(
-    zoo: Path, tmp_path: Path, notices: list[str], width: int
+    zoo: Path, exported: Callable[..., ExportResult], width: int
 ) -> None:
-    exported = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append)
+    kept = exported(zoo / "pendulum").contract
     elements = tuple(Element(name=name, unit="rad/s") for name in ("cos_angle", "sin_angle", "speed"))
-    space = exported.contract.observation_space.model_copy(update={"elements": elements})
-    contract = exported.contract.model_copy(update={"observation_space": space})
+    space = kept.observation_space.model_copy(update={"elements": elements})
+    contract = kept.model_copy(update={"observation_space": space})
     file = io.StringIO()
     Console(width=width, file=file).print(contract_report(contract))
     shown = file.getvalue()
@@ -212,12 +220,9 @@ ROBOT_NAMES = [f"{joint}_joint_{what}" for joint in ("shoulder_pan", "shoulder_l
 
 @pytest.mark.parametrize("name", ["act_nested", "lstm_previous", "image", "obs_tuple"])
 def test_the_report_of_any_policy_fits_a_terminal_and_breaks_no_name(
-    wide_zoo: Path, recurrent: Path, app: Path, tmp_path: Path, notices: list[str], name: str
+    wide_zoo: Path, exported: Callable[..., ExportResult], name: str
 ) -> None:
-    if (recurrent / name).exists():
-        contract = read_contract(recurrent / name / "1")
-    else:
-        contract = export_checkpoint(wide_zoo / name, tmp_path, app_dir=app, notify=notices.append).contract
+    contract = exported(wide_zoo / name).contract
     file = io.StringIO()
     Console(width=80, file=file).print(contract_report(contract))
     shown = file.getvalue()
@@ -230,9 +235,9 @@ def test_the_report_of_any_policy_fits_a_terminal_and_breaks_no_name(
 
 
 def test_long_element_names_with_units_and_a_filter_fit_eighty_columns(
-    zoo: Path, tmp_path: Path, notices: list[str]
+    zoo: Path, exported: Callable[..., ExportResult]
 ) -> None:
-    contract = export_checkpoint(zoo / "pendulum", tmp_path, notify=notices.append).contract
+    contract = exported(zoo / "pendulum").contract
     size = len(ROBOT_NAMES)
     space = BoxSpec(shape=(size,), dtype="float32", low=-6.283185307, high=6.283185307,
                     elements=tuple(Element(name=one, unit="rad/s") for one in ROBOT_NAMES))  # fmt: skip

@@ -238,6 +238,8 @@ OPERATORS: dict[str, Operator] = {
     "diff_twice": exact(lambda o: torch.diff(o, n=2, prepend=o[:, :1])),
     "sum": summed(lambda o: o.sum(1, keepdim=True)),
     "mean": summed(lambda o: o.mean(1, keepdim=True)),
+    "nanmean": summed(lambda o: torch.nanmean(torch.where(o > 0.5, math.nan, o), 1, True)),
+    "nanmean_of_all": summed(lambda o: torch.nanmean(o, dim=1).unsqueeze(1)),
     "prod": rounded(lambda o: o.prod(1, keepdim=True)),
     "std": summed(lambda o: torch.std(o, 1, keepdim=True), limit=1e30),
     "var": summed(lambda o: torch.var(o, 1, keepdim=True), 2),

@@ -7,7 +7,7 @@ in all but 1 of 10,000 cases, and the seeds are fixed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ray.rllib.policy.sample_batch import SampleBatch
 from rlservo.export.checkpoints.location import CheckpointFiles, locate_checkpoint
 from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.commands.export import export_checkpoint
+from rlservo.export.commands.export import ExportResult
 from rlservo.export.contract.errors import RequestError
 from rlservo.export.recipe.trees import named_leaves
 from rlservo.export.rllib.restore import restore
@@ -50,10 +50,9 @@ def observed(zoo: Path, name: str) -> dict[str, Any]:
     return {key: values[3] for key, values in np.load(zoo / f"{name}.npz").items() if key.startswith("obs")}
 
 
-def explore(zoo: Path, app: Path, name: str, folder: Path) -> Any:
-    result = export_checkpoint(zoo / name, folder, app_dir=app, notify=lambda _: None)
+def explore(zoo: Path, exported: Callable[..., ExportResult], name: str) -> Any:
     (obs,) = observed(zoo, name).values()
-    return Policy.load(result.path).act(np.repeat(obs[None], DRAWS, axis=0), explore=True, seed=5)
+    return Policy.load(exported(zoo / name).path).act(np.repeat(obs[None], DRAWS, axis=0), explore=True, seed=5)
 
 
 def drawn_by_rllib(zoo: Path, app: Path, name: str) -> Mapping[str, Any]:
@@ -74,18 +73,24 @@ def drawn_by_rllib(zoo: Path, app: Path, name: str) -> Mapping[str, Any]:
 
 
 @pytest.mark.parametrize("name", NEW)
-def test_exploring_actions_are_distributed_as_rllibs(zoo: Path, app: Path, tmp_path: Path, name: str) -> None:
-    assert_distributed_alike(explore(zoo, app, name, tmp_path), drawn_by_rllib(zoo, app, name))
+def test_exploring_actions_are_distributed_as_rllibs(
+    zoo: Path, app: Path, exported: Callable[..., ExportResult], name: str
+) -> None:
+    assert_distributed_alike(explore(zoo, exported, name), drawn_by_rllib(zoo, app, name))
 
 
 @pytest.mark.parametrize("name", WIDE)
-def test_every_algorithm_and_space_explores_as_rllib_does(wide_zoo: Path, app: Path, tmp_path: Path, name: str) -> None:
-    assert_distributed_alike(explore(wide_zoo, app, name, tmp_path), drawn_by_rllib(wide_zoo, app, name))
+def test_every_algorithm_and_space_explores_as_rllib_does(
+    wide_zoo: Path, app: Path, exported: Callable[..., ExportResult], name: str
+) -> None:
+    assert_distributed_alike(explore(wide_zoo, exported, name), drawn_by_rllib(wide_zoo, app, name))
 
 
 @pytest.mark.parametrize("name", OLD)
-def test_the_old_stack_explores_as_rllib_does(old_zoo: Path, app: Path, tmp_path: Path, name: str) -> None:
-    ours = explore(old_zoo, app, name, tmp_path)
+def test_the_old_stack_explores_as_rllib_does(
+    old_zoo: Path, app: Path, exported: Callable[..., ExportResult], name: str
+) -> None:
+    ours = explore(old_zoo, exported, name)
     with user_code(app):
         files = locate_checkpoint(old_zoo / name)
         assert isinstance(files, OldStackFiles)
@@ -106,6 +111,8 @@ def test_the_old_stack_explores_as_rllib_does(old_zoo: Path, app: Path, tmp_path
     assert_distributed_alike(ours, theirs)
 
 
-def test_a_policy_without_a_distribution_says_that_it_cannot_explore(zoo: Path, app: Path, tmp_path: Path) -> None:
+def test_a_policy_without_a_distribution_says_that_it_cannot_explore(
+    zoo: Path, exported: Callable[..., ExportResult]
+) -> None:
     with pytest.raises(RequestError, match="has no action distribution and cannot explore"):
-        explore(zoo, app, "dqn", tmp_path)
+        explore(zoo, exported, "dqn")

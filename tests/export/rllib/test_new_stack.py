@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import re
 import shutil
 import subprocess
@@ -52,15 +51,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*PPOTorchRLModule.*:Deprecation
 
 
 @pytest.fixture(scope="session")
-def export(wide_zoo: Path, app: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], ExportResult]:
-    """Return a function that exports a checkpoint of the zoo, once a session."""
-    folder = tmp_path_factory.mktemp("exported")
-
-    @functools.cache
-    def export(name: str) -> ExportResult:
-        return export_checkpoint(wide_zoo / name, folder, name=name, app_dir=app, notify=lambda _: None)
-
-    return export
+def export(wide_zoo: Path, exported: Callable[..., ExportResult]) -> Callable[[str], ExportResult]:
+    """Return a function that gives the export of a checkpoint of the zoo."""
+    return lambda name: exported(wide_zoo / name)
 
 
 def observation(contract: Contract, seen: Mapping[str, Any], rows: Any) -> Any:
@@ -220,15 +213,23 @@ def load(wide_zoo: Path, app: Path, notices: list[str]) -> Callable[[str], Resto
     return load
 
 
-def prove_as(checkpoint: RestoredPolicy, recipe: Recipe, tmp_path: Path, swap: Mapping[str, str] = {}) -> None:
-    """Prove a graph built from `recipe`, its states exchanged as `swap` says, against RLlib's own pipeline."""
+def prove_as(checkpoint: RestoredPolicy, recipe: Recipe, tmp_path: Path) -> Callable[[Mapping[str, str]], None]:
+    """Prove a graph built from `recipe` against RLlib's own pipeline.
+
+    Returns a function that does so again with the graph's states exchanged.
+    """
     references = record(checkpoint.start_loop, draw_batches(checkpoint.recipe, seed=3))
     graph = PolicyGraph(recipe, checkpoint.network)
     pair = next(one.batch for one in references if len(one.batch) == 2)
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(2, np.bool_))
     write_onnx(graph, example, tmp_path / "policy.onnx")
     run = run_onnx(tmp_path / "policy.onnx")
-    prove(recipe, references, {"onnx": lambda inputs: run({swap.get(name, name): v for name, v in inputs.items()})})
+
+    def swapped(swap: Mapping[str, str]) -> None:
+        prove(recipe, references, {"onnx": lambda inputs: run({swap.get(name, name): v for name, v in inputs.items()})})
+
+    swapped({})
+    return swapped
 
 
 def changed(recipe: Recipe, **changes: Any) -> Recipe:
@@ -238,9 +239,9 @@ def changed(recipe: Recipe, **changes: Any) -> Recipe:
 @pytest.mark.parametrize("name", ["lstm_box", "act_nested"])
 def test_a_swapped_state_is_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path, name: str) -> None:
     checkpoint = load(name)
-    prove_as(checkpoint, checkpoint.recipe, tmp_path)
+    prove_again = prove_as(checkpoint, checkpoint.recipe, tmp_path)
     with pytest.raises(ParityError, match="of the sequences"):
-        prove_as(checkpoint, checkpoint.recipe, tmp_path, {"state_in.c": "state_in.h", "state_in.h": "state_in.c"})
+        prove_again({"state_in.c": "state_in.h", "state_in.h": "state_in.c"})
 
 
 def test_a_state_that_is_not_reset_is_caught(load: Callable[[str], RestoredPolicy], tmp_path: Path) -> None:

@@ -71,6 +71,17 @@ def export(old_zoo: Path, app: Path, tmp_path: Path, notices: list[str]) -> Call
 
 
 @pytest.fixture
+def kept(old_zoo: Path, exported: Callable[..., ExportResult]) -> Callable[[str], ExportResult]:
+    """Return a function that gives the export of a checkpoint, made once. Its files are not to be written to."""
+
+    def kept(name: str) -> ExportResult:
+        checkpoint, _, policy = name.partition("_") if name in SEVERAL else (name, "", None)
+        return exported(old_zoo / checkpoint, policy)
+
+    return kept
+
+
+@pytest.fixture
 def old_copy(old_zoo: Path, tmp_path: Path) -> Callable[[str], Path]:
     """Return a function that copies a checkpoint to where a test may damage it."""
     return lambda name: Path(shutil.copytree(old_zoo / name, tmp_path / "damaged" / name))
@@ -117,9 +128,9 @@ def assert_same_actions(got: Mapping[str, NDArray[Any]], seen: Mapping[str, NDAr
 
 @pytest.mark.parametrize("name", [*EXPORTED, *SEVERAL])
 def test_an_old_stack_export_acts_as_rllib_did_in_its_own_evaluation(
-    old_zoo: Path, export: Callable[..., ExportResult], name: str
+    old_zoo: Path, kept: Callable[[str], ExportResult], name: str
 ) -> None:
-    contract, path = (result := export(name)).contract, result.path
+    contract, path = (result := kept(name)).contract, result.path
     assert contract.provenance.api_stack == "old"
     seen = dict(np.load(old_zoo / f"{name}.npz"))
     names = [tuple(tensor.name for tensor in side) for side in (contract.inputs, contract.outputs)]
@@ -207,9 +218,9 @@ def test_the_action_rule_is_the_policys_own(
 
 @pytest.mark.parametrize(("name", "states", "initial"), [("lstm", ["h", "c"], 0.0), ("user_recurrent", ["0"], 0.25)])
 def test_a_recurrent_models_state_goes_in_and_out_and_begins_as_the_model_says(
-    export: Callable[..., ExportResult], name: str, states: list[str], initial: float
+    kept: Callable[[str], ExportResult], name: str, states: list[str], initial: float
 ) -> None:
-    contract = export(name).contract
+    contract = kept(name).contract
     assert [(leaf.name, leaf.shape, leaf.initial) for leaf in contract.state] == [
         (one, (8,), initial) for one in states
     ]
@@ -240,9 +251,9 @@ def test_a_value_head_that_nothing_trained_is_left_out_with_a_notice(
 
 
 def test_a_scan_of_128_beams_is_rescaled_as_rllib_takes_it_for_an_ataris_memory(
-    load: Callable[..., RestoredPolicy], export: Callable[..., ExportResult], tmp_path: Path
+    load: Callable[..., RestoredPolicy], kept: Callable[[str], ExportResult], tmp_path: Path
 ) -> None:
-    result = export("filtered_beams")
+    result = kept("filtered_beams")
     assert [step.step for step in result.contract.baked_in][:2] == ["rescale", "mean_std_filter"]
     restored = load("beams")
     assert [type(step) for step in restored.recipe.steps] == [Preprocess]
@@ -463,8 +474,8 @@ def test_a_state_that_cannot_be_trusted_is_refused(
         load("pendulum", damaged.parent)
 
 
-def test_integer_actions_run_and_cannot_explore(old_zoo: Path, export: Callable[..., ExportResult]) -> None:
-    policy, seen = Policy.load(export("counts").path), np.load(old_zoo / "counts.npz")
+def test_integer_actions_run_and_cannot_explore(old_zoo: Path, kept: Callable[[str], ExportResult]) -> None:
+    policy, seen = Policy.load(kept("counts").path), np.load(old_zoo / "counts.npz")
     np.testing.assert_array_equal(policy.act(seen["obs"]), seen["action"])
     with pytest.raises(RequestError, match="explor"):
         policy.act(seen["obs"], explore=True)
@@ -573,9 +584,9 @@ def test_a_registration_is_read_from_the_users_code_without_running_it(
 
 
 def test_verify_proves_an_old_stack_bundle_again_and_drives_with_both(
-    old_zoo: Path, export: Callable[..., ExportResult], notices: list[str]
+    old_zoo: Path, kept: Callable[[str], ExportResult], tmp_path: Path, notices: list[str]
 ) -> None:
-    path = export("pendulum").path
+    path = Path(shutil.copytree(kept("pendulum").path, tmp_path / "pendulum" / "1"))
     result = verify_bundle(path, old_zoo / "pendulum", env_id="Pendulum-v1", episodes=1, notify=notices.append)
     assert result.same_checkpoint and "old API stack" in result.parity.reference
     assert result.evaluation is not None and result.evaluation.return_bundle < -50

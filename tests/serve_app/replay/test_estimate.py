@@ -38,12 +38,12 @@ def walk(
     return total / episodes
 
 
-@pytest.fixture
-def walked(policies: Path, tmp_path: Path) -> Path:
-    policy = Policy.load(policies / "gridworld")
-    with WithRecording(policy, tmp_path / "run.mcap", wait=True) as record:
+@pytest.fixture(scope="module")
+def walked(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    policy, file = Policy.load(policies / "gridworld"), tmp_path_factory.mktemp("walked") / "run.mcap"
+    with WithRecording(policy, file, wait=True) as record:
         walk(policy, 600, np.random.default_rng(0), record)
-    return tmp_path / "run.mcap"
+    return file
 
 
 def test_the_recorded_policy_gets_its_own_return(policies: Path, walked: Path) -> None:
