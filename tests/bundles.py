@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -93,12 +94,8 @@ def write_bundle(folder: Path, contract: Contract, obs: NDArray[Any], **more: ND
 
     `more` are further inputs by name, a dot written as two underscores.
     """
-    import torch
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # torch 2.13 prefers torch.export; bundles hold TorchScript
-        scripted = torch.jit.trace(torch.nn.Tanh(), torch.zeros(1, 2))  # never opened here, but its hash is checked
-        torch.jit.save(scripted, folder / bundle_files.TORCHSCRIPT_FILE)
+    made = cached("torchscript", [versions("torch")], _write_torchscript)  # for torch takes seconds to import
+    shutil.copy(made / bundle_files.TORCHSCRIPT_FILE, folder)
     session = onnxruntime.InferenceSession(folder / bundle_files.ONNX_FILE)
     names = [tensor.name for tensor in contract.outputs]
     inputs = {"obs": obs, **{name.replace("__", "."): array for name, array in more.items()}}
@@ -106,6 +103,16 @@ def write_bundle(folder: Path, contract: Contract, obs: NDArray[Any], **more: ND
     bundle_files.write_golden(folder, inputs, outputs)
     bundle_files.write_contract(folder, contract)
     return folder
+
+
+def _write_torchscript(folder: Path) -> None:
+    """Write a file that is never opened, but whose hash is checked."""
+    import torch
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # torch 2.13 prefers torch.export; bundles hold TorchScript
+        scripted = torch.jit.trace(torch.nn.Tanh(), torch.zeros(1, 2))
+        torch.jit.save(scripted, folder / bundle_files.TORCHSCRIPT_FILE)
 
 
 def write_box_policy(
