@@ -24,6 +24,7 @@ import pytest
 import websockets.sync.client
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+REBOUND = "robot.rebound.test"  # a name that leads to this machine
 FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -31,7 +32,7 @@ FLAGS = (
     "--disable-background-networking",
     "--no-first-run",
     "--remote-debugging-port=0",
-    "--host-resolver-rules=MAP * ~NOTFOUND,EXCLUDE 127.0.0.1,EXCLUDE localhost",
+    f"--host-resolver-rules=MAP {REBOUND} 127.0.0.1,MAP * ~NOTFOUND,EXCLUDE 127.0.0.1,EXCLUDE localhost",
 )
 PATIENCE_S = 60.0  # of a busy machine
 LARGEST_MESSAGE = 64 << 20  # [bytes]; a picture is one
@@ -168,6 +169,20 @@ def browser_program() -> str:
     if program is None:
         pytest.skip("no Chromium or Chrome is installed: no page was opened")
     return program
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that open a page."""
+    for item in items:
+        if {"browser", "chromium"} & set(getattr(item, "fixturenames", ())):
+            item.add_marker("browser")
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """A browser for all tests of this process, each with tabs of its own."""
+    with browsing() as running:
+        yield running
 
 
 @contextlib.contextmanager

@@ -33,7 +33,10 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--disable-gpu-rasterization",  # Debian's Chromium would draw the panels in the same software
+    "--disable-gpu-compositing",  # and would put the page together in it: half of what a frame takes
 )
+SMOOTH = bool(os.environ.get("RLSERVO_PICTURES"))  # a picture for the README, whose edges are smooth
+ROUGH = "--webgl-antialiasing-mode=none"  # four samples of a pixel would be the rest's two thirds
 # A few frames a second are enough to see what happens, and each is drawn by the processors that the test shares.
 FEW_FRAMES = """const each = requestAnimationFrame;
 window.requestAnimationFrame = draw => setTimeout(() => each(draw), 300);"""
@@ -168,7 +171,7 @@ def chromium() -> Iterator[Any]:
     path = browser_program()
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=path, headless=True, args=FLAGS)  # with an empty profile
+        browser = driver.chromium.launch(executable_path=path, headless=True, args=FLAGS if SMOOTH else (*FLAGS, ROUGH))
         yield browser
         browser.close()
 

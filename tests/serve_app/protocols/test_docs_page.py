@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from browser import browsing
+from browser import Browser
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.docs_page import PAGE
 from rlservo.serve_app.server.settings import ServerSettings
@@ -27,10 +27,10 @@ def test_the_page_names_no_other_host() -> None:
 
 
 def test_the_documentation_is_drawn_and_tried_out_without_the_internet(
-    policies: Path, served: Callable[[Any], AbstractContextManager[int]]
+    browser: Browser, policies: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
     store = load_store(policies)
-    with served(create_app(lambda: store, ServerSettings())) as port, browsing() as browser, browser.tab() as tab:
+    with served(create_app(lambda: store, ServerSettings())) as port, browser.tab() as tab:
         tab.visit(f"http://127.0.0.1:{port}/docs")
         drawn = tab.wait_for(  # what Swagger UI makes of /openapi.json
             "(drawn => drawn.length > 3 && drawn.map(path => path.dataset.path))"

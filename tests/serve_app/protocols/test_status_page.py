@@ -16,7 +16,7 @@ from typing import Any
 import httpx
 import pytest
 
-from browser import Browser, Tab, browsing
+from browser import Browser, Tab
 from rlservo.export.contract.bundle import read_contract, write_contract
 from rlservo.export.contract.contract import BakedStep
 from rlservo.export.contract.spaces import BoxSpec, Element
@@ -203,12 +203,6 @@ def server(repository: Path, controlled: Controlled, served: Serve) -> Iterator[
         settings = ServerSettings(operator_key=OPERATOR_LINE.split()[-1])
         with served(create_app(lambda: control.store, settings, control=control, replica="replica-a")) as port:
             yield Served(port)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with browsing() as running:
-        yield running
 
 
 @pytest.fixture

@@ -6,11 +6,7 @@ attempts); from another port; and under a name that has come to lead to the poli
 
 from __future__ import annotations
 
-import contextlib
 import json
-import shutil
-import signal
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -21,7 +17,7 @@ from typing import Any
 import httpx
 import pytest
 
-from browser import BROWSERS
+from browser import REBOUND, Browser
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
@@ -33,14 +29,6 @@ Controlled = Callable[..., AbstractContextManager[ReplicaVersions]]
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
-REBOUND = "robot.rebound.test"
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-background-networking",
-    f"--host-resolver-rules=MAP {REBOUND} 127.0.0.1,MAP * ~NOTFOUND,EXCLUDE 127.0.0.1,EXCLUDE localhost",
-)
 SESSION = "robot-7"
 ACT = {"obs": [0.1, 0.2, 0.3], "session_id": SESSION}
 INFER = {
@@ -130,28 +118,11 @@ async def nothing(scope: Any, receive: Any, send: Any) -> None:
     await send({"type": "http.response.body", "body": b""})
 
 
-@pytest.fixture(scope="module")
-def browser() -> str:
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        pytest.skip("no Chromium or Chrome is installed: no page was opened")
-    return found
-
-
-def visit(browser: str, url: str, pages: Pages, folder: Path) -> dict[str, Any]:
-    """Open a page, wait for its report, end the browser."""
-    command = [browser, *FLAGS, f"--user-data-dir={folder}", "--remote-debugging-port=0", url]
-    with (folder.parent / f"{folder.name}.log").open("wb") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-    try:
-        assert pages.reported.wait(180), (folder.parent / f"{folder.name}.log").read_text()[-2000:]
-    finally:
-        process.send_signal(signal.SIGTERM)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(20)
-        if process.poll() is None:
-            process.kill()
-            process.wait()
+def visit(browser: Browser, url: str, pages: Pages) -> dict[str, Any]:
+    """Open a page, and wait for its report."""
+    with browser.tab() as tab:
+        tab.visit(url)
+        assert pages.reported.wait(180), tab.complaints
     return pages.report
 
 
@@ -198,11 +169,11 @@ def check_untouched(target: Target, report: dict[str, Any], plan: Any) -> None:
     assert not [name for name, outcome in report.items() if name.startswith("read") and outcome == 200], report
 
 
-def test_the_servers_own_page_gets_through(browser: str, target: Target, tmp_path: Path) -> None:
+def test_the_servers_own_page_gets_through(browser: Browser, target: Target) -> None:
     """Or the tests below would show nothing."""
     target.step(reset=True)
     target.pages.page = page_for(f"http://127.0.0.1:{target.port}")
-    report = visit(browser, f"http://127.0.0.1:{target.port}/page.html", target.pages, tmp_path / "profile")
+    report = visit(browser, f"http://127.0.0.1:{target.port}/page.html", target.pages)
     assert report["act json"] == report["infer json"] == report["infer octets"] == report["read /v1/policies"] == 200
     assert report["read page"] == 200
     assert report["socket /"] == report["socket /v1/policies/leaky/stream"] == "open"
@@ -213,27 +184,23 @@ def test_the_servers_own_page_gets_through(browser: str, target: Target, tmp_pat
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
-def test_a_page_from_another_port_moves_nothing(
-    browser: str, target: Target, served: Serve, tmp_path: Path, host: str
-) -> None:
+def test_a_page_from_another_port_moves_nothing(browser: Browser, target: Target, served: Serve, host: str) -> None:
     """127.0.0.1 on another port is the same site to a browser, localhost another one."""
     target.step(reset=True)
     plan = target.control.plan
     pages = Pages(nothing, page_for(f"http://127.0.0.1:{target.port}"))
     with served(pages) as port:
-        report = visit(browser, f"http://{host}:{port}/page.html", pages, tmp_path / "profile")
+        report = visit(browser, f"http://{host}:{port}/page.html", pages)
     assert report["act blob"] == report["infer blob"] == "sent", report
     check_untouched(target, report, plan)
 
 
-def test_a_page_whose_name_leads_to_the_server_moves_and_reads_nothing(
-    browser: str, target: Target, tmp_path: Path
-) -> None:
+def test_a_page_whose_name_leads_to_the_server_moves_and_reads_nothing(browser: Browser, target: Target) -> None:
     target.step(reset=True)
     plan = target.control.plan
     url = f"http://{REBOUND}:{target.port}"
     target.pages.page = page_for(url)
-    report = visit(browser, f"{url}/page.html", target.pages, tmp_path / "profile")
+    report = visit(browser, f"{url}/page.html", target.pages)
     answers = {outcome for name, outcome in report.items() if not name.endswith(("form", "beacon"))}
     assert answers == {403, 400, "refused"}, report
     check_untouched(target, report, plan)
@@ -242,12 +209,12 @@ def test_a_page_whose_name_leads_to_the_server_moves_and_reads_nothing(
 @pytest.mark.serve
 @pytest.mark.slow
 def test_on_ray_serve_a_page_is_refused_for_where_it_comes_from(
-    browser: str, live_server: Any, served: Serve, tmp_path: Path
+    browser: Browser, live_server: Any, served: Serve
 ) -> None:
     """Through HAProxy, ahead of Serve's handling and behind it; before anybody looks at a key."""
     pages = Pages(nothing, page_for(f"http://127.0.0.1:{live_server.port}"))
     with served(pages) as port:
-        report = visit(browser, f"http://localhost:{port}/page.html", pages, tmp_path / "profile")
+        report = visit(browser, f"http://localhost:{port}/page.html", pages)
     assert {report[name] for name in report if name.startswith("socket")} == {"refused"}, report
     assert not [name for name, outcome in report.items() if name.startswith("read") and outcome == 200], report
     url, key = f"http://127.0.0.1:{live_server.port}", {"authorization": live_server.bearer}

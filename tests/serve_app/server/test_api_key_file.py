@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import http.client
 import json
 import logging
@@ -230,7 +229,6 @@ def test_the_watching_ends_with_the_application(file: Path) -> None:
     def watching() -> set[threading.Thread]:
         return {thread for thread in threading.enumerate() if thread.name == "key-file"}
 
-    gc.collect()
     before = watching()
     keys = CurrentKeys(ServerSettings(api_keys_file=str(file)))
     (mine,) = watching() - before
