@@ -36,12 +36,27 @@ PATIENCE_S = 120
 RECURRENT = "lstm_box"
 Check: TypeAlias = tuple[str, bool, str]  # name, whether all is well, message
 
-# A head node as `ray start --head` makes one, but gone when its standard input is.
-CLUSTER = """
-import json, sys, ray
+# For what starts a node of the cluster. It leaves out what no test looks at: the autoscaler's monitor, the log monitor,
+# and of the dashboard all but what `serve deploy` and `serve status` ask. They are an eighth of the cluster's CPU time.
+LEAN_NODE = """
+import functools
+from ray._private import parameter, services
 from rlservo.serve_app.ray_serve.cluster_process import leave_out_agent
-plan = json.loads(sys.argv[1])
 leave_out_agent()
+start = services.start_ray_process
+def start_lean(command, process_type, *arguments, **more):
+    if process_type == "dashboard":
+        command = [*command, "--modules-to-load=ServeHead"]
+    return start(command, process_type, *arguments, **more)
+services.start_ray_process = start_lean
+parameter.RayParams = functools.partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
+"""
+# A head node as `ray start --head` makes one, but gone when its standard input is.
+CLUSTER = (
+    LEAN_NODE
+    + """
+import json, sys, ray
+plan = json.loads(sys.argv[1])
 context = ray.init(address="local", num_cpus=4, num_gpus=0, object_store_memory=80 << 20, include_dashboard=True,
                    dashboard_host="127.0.0.1", dashboard_port=plan["dashboard"], log_to_driver=False,
                    configure_logging=False, _temp_dir=plan["folder"], _node_ip_address="127.0.0.1")
@@ -51,6 +66,7 @@ from ray import serve
 serve.shutdown()
 ray.shutdown()
 """
+)
 
 
 @dataclass
@@ -227,6 +243,8 @@ def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) 
     environment = own | cluster_environment(folder, one_machine=True) | proxy_ports() | proxy_files(folder) | {
         MARK: mark,
         DIFFERENT: ITS_VALUE,
+        "RAY_enable_worker_prestart": "0",  # a process for each core, beside those that Serve starts
+        "RAY_preload_python_modules": "rlservo.serve_app.ray_serve.lean_imports",  # as in `rlservo serve`
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
         "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(first),
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(first + 20),

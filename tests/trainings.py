@@ -44,9 +44,14 @@ def command(script: str, *arguments: str) -> list[str]:
 def environment(home: Path) -> dict[str, str]:
     """A home of its own shows what a script leaves there. Ray's workers would step back behind all else: nice 15.
 
-    And networks as small as these take no less time on two threads, of which the other one waits by spinning.
+    Networks as small as these take no less time on two threads, of which the other one waits by spinning. And most of
+    a worker's time is its imports: `quick_rllib.py`.
     """
-    return {**os.environ, "HOME": str(home), "RAY_worker_niceness": "0", "OMP_NUM_THREADS": "1"}
+    path = os.pathsep.join(part for part in (str(HERE), os.environ.get("PYTHONPATH", "")) if part)
+    return {
+        **os.environ, "HOME": str(home), "PYTHONPATH": path, "RAY_worker_niceness": "0", "OMP_NUM_THREADS": "1",
+        "RAY_preload_python_modules": "quick_rllib",
+    }  # fmt: skip
 
 
 def _inference(script: str, *more: str) -> tuple[str, ...]:
@@ -82,7 +87,14 @@ IN_ONE_RAY = {
 """Scripts of `examples/`, or of the tests' own, by name."""
 
 PRODUCT = ("export", "envs", "serve_app/runtime", "serve_app/wire", "serve_app/rollout", "serve_app/recording")
-TESTS_OWN = ("trainings.py", "train_in_one_ray.py", "examples/app", "examples/train_edges.py", "benchmarks")
+TESTS_OWN = (
+    "trainings.py",
+    "train_in_one_ray.py",
+    "quick_rllib.py",
+    "examples/app",
+    "examples/train_edges.py",
+    "benchmarks",
+)
 TRAINED_WITH = [
     *(HERE.parent / name for name in ("benchmarks/training.py", "examples", *PRODUCT)),
     *(HERE / name for name in TESTS_OWN),

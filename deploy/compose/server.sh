@@ -10,9 +10,10 @@ export RAY_REDIS_ADDRESS="${RLSERVO_REDIS:?HOST:PORT of Redis}"
 environment="$(rlservo cluster env --one-machine --haproxy-folder "$HOME/haproxy" --max-connections-per-address 0)"
 eval "$environment"
 dashboard="${RLSERVO_DASHBOARD_PORT:-8265}"
-# Not `ray start`, whose raylet waits too short for its agents on a busy machine, and aborts.
+# Not `ray start`, whose raylet waits too short for its agents on a busy machine, and aborts. Without what nobody uses
+# here: the autoscaler and the log monitor.
 python -m rlservo.serve_app.ray_serve.ray_node start --head --block --node-ip-address 127.0.0.1 --dashboard-host 127.0.0.1 --dashboard-port "$dashboard" \
-  --object-store-memory 80000000 --disable-usage-stats \
+  --object-store-memory 80000000 --disable-usage-stats --no-monitor --include-log-monitor false \
   --redis-password "$(cat "${RLSERVO_REDIS_PASSWORD_FILE:?the file of its password}")" "$@" &
 ray="$!"
 trap 'kill -TERM "$ray" 2>/dev/null || true; wait "$ray" || true' TERM INT EXIT

@@ -1,18 +1,19 @@
 """`rlservo demo`: export two checkpoints, serve them, drive two robots, show what happened.
 
-Exporting and serving run as the very commands a user would type, in processes of their own; the loop runs here.
+Exporting and serving run as the very commands a user would type, in other processes; the loop runs here.
 """
 
 from __future__ import annotations
 
 import ctypes
+import json
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from rlservo.deploy.demo.commands import show
 from rlservo.deploy.demo.picture import Robot, RobotRun, Trace, draw_picture, film
 from rlservo.deploy.terminal import ends_like_ctrl_c
 from rlservo.export.contract.contract import Contract
@@ -73,10 +75,10 @@ def run_demo(
     start = time.monotonic()
 
     console.rule("1  export: RLlib checkpoint to policy bundle")
-    for robot in ROBOTS:
-        _command(
-            console, "export", str(checkpoints / robot.checkpoint), "--out", str(repository), "--name", robot.policy
-        )
+    _run(
+        ["export", str(checkpoints / robot.checkpoint), "--out", str(repository), "--name", robot.policy]
+        for robot in ROBOTS
+    )
 
     console.rule("2  serve: both policies on one Ray Serve endpoint")
     runs: list[RobotRun] = []
@@ -89,7 +91,7 @@ def run_demo(
             return
         console.rule(f"3  drive: {episodes} episodes each, every action over HTTP")
         for robot in ROBOTS:
-            _show(console, "rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts)
+            show(console, ["rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts])
             with PolicyClient(url, robot.policy) as policy, console.status("driving ..."):
                 traces: list[Trace] = []
                 report = rollout(_Recorder(policy, traces), robot.env_id, episodes=episodes, seed=FIRST_SEED)
@@ -133,16 +135,11 @@ class _Recorder(ActingPolicy):
         self._policy.close()
 
 
-def _command(console: Console, *words: str) -> None:
-    """Show and run one rlservo command; its output goes to the terminal."""
-    _show(console, *words)
-    result = subprocess.run([sys.executable, "-m", "rlservo.deploy.cli", *words])
+def _run(commands: Iterable[list[str]]) -> None:
+    """Show and run rlservo commands in one process; their output goes to the terminal."""
+    result = subprocess.run([sys.executable, "-m", "rlservo.deploy.demo.commands", json.dumps(list(commands))])
     if result.returncode != 0:
-        raise RlservoError(f"`rlservo {words[0]}` ended with exit code {result.returncode}")
-
-
-def _show(console: Console, *words: str) -> None:
-    console.print(f"$ rlservo {shlex.join(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
+        raise RlservoError(f"the export ended with exit code {result.returncode}")
 
 
 @contextmanager
@@ -150,7 +147,7 @@ def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
     """Run `rlservo serve` on a free port until the block ends; stop it as Ctrl-C would."""
     (port,) = free_ports(1)
     words = ("serve", str(repository), "--port", str(port))
-    _show(console, *words)
+    show(console, words)
     url = f"http://127.0.0.1:{port}"
     with log.open("wb") as stream:
         # Not in our process group: a Ctrl-C at the terminal reaches us alone, and we pass it on once.

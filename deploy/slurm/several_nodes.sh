@@ -75,12 +75,15 @@ sys.exit(f"several_nodes.sh: of {wanted} Ray nodes at {address}, {there} answere
 PYTHON
 }
 
-# The dashboard is off, but Ray still looks whether its port is free.
+# The dashboard is off, but Ray still looks whether its port is free. Off, too: the autoscaler, and the log monitors,
+# whose lines nobody reads.
 on_node "$head" "${ray[@]}" start --head --block --node-ip-address="$address" --port="$port" --temp-dir="$folder" \
-  --num-cpus="$cores" --num-gpus="$gpus" --include-dashboard=false --dashboard-port="$((port + 1))"
+  --num-cpus="$cores" --num-gpus="$gpus" --include-dashboard=false --dashboard-port="$((port + 1))" \
+  --no-monitor --include-log-monitor=false
 wait_for_nodes 1
 for node in "${nodes[@]:1}"; do
-  on_node "$node" "${ray[@]}" start --block --address="$address:$port" --num-cpus="$cores" --num-gpus="$gpus"
+  on_node "$node" "${ray[@]}" start --block --address="$address:$port" --num-cpus="$cores" --num-gpus="$gpus" \
+    --include-log-monitor=false
 done
 wait_for_nodes "${#nodes[@]}"
 

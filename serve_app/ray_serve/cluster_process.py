@@ -56,7 +56,7 @@ def main() -> int:
 
         from rlservo.serve_app.ray_serve import app
 
-        _leave_out_extras()
+        leave_out_extras()
         _poll_for_node()
         ray.init(
             address="local",  # whatever RAY_ADDRESS or a running cluster says
@@ -99,7 +99,7 @@ def main() -> int:
     return 0
 
 
-def _leave_out_extras() -> None:
+def leave_out_extras() -> None:
     """Keep Ray (2.60) from starting what nothing here uses and an answer waits for, where its own switches do not.
 
     The autoscaler's monitor and the log forwarder are 165 MB and a second; `ray start` has flags for both, `ray.init`

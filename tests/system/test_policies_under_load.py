@@ -27,7 +27,7 @@ import numpy as np
 import psutil
 import pytest
 
-from clusters import KEY, PATIENCE_S, RECURRENT, Cluster, serving
+from clusters import KEY, LEAN_NODE, PATIENCE_S, RECURRENT, Cluster, serving
 from rlservo.export.contract.errors import ConflictError, RefusedError, UnauthenticatedError
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.runtime.policy import Policy
@@ -149,6 +149,66 @@ def sessions(cluster: Cluster) -> Sessions:
     return Sessions(cluster)
 
 
+# Another node of the cluster, as `ray.cluster_utils` makes one: `ray start` refuses a second one on this address.
+NODE = (
+    LEAN_NODE
+    + """
+import sys
+from ray._private.node import Node
+node = Node(
+    parameter.RayParams(gcs_address=sys.argv[1], node_ip_address="127.0.0.1", num_cpus=2, num_gpus=0, min_worker_port=0,
+              max_worker_port=0, object_store_memory=80 << 20),
+    head=False, shutdown_at_exit=True, spawn_reaper=False)
+print("joined", flush=True)
+sys.stdin.read()
+"""
+)
+
+
+@contextlib.contextmanager
+def joined(cluster: Cluster) -> Iterator[psutil.Process]:
+    """Add another node to the cluster; yields the process whose descendants are all of it."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", NODE, cluster.address],
+        env=cluster.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None and process.stdin is not None
+    try:
+        said = ""
+        while not said.startswith("joined"):  # Ray may say something first
+            said = process.stdout.readline()
+            assert said, "the node did not start"
+        yield psutil.Process(process.pid)
+    finally:
+        with contextlib.suppress(psutil.Error):
+            kill_all(psutil.Process(process.pid))
+        process.wait()
+        process.stdin.close()
+        process.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def other_node(cluster: Cluster) -> Iterator[psutil.Process]:
+    """Another node, which gets one of the replicas with the rolling update; the last test kills it."""
+    with joined(cluster) as node:
+        yield node
+
+
+def kill_all(node: psutil.Process) -> None:
+    """SIGKILL to all of a node at once, as when its power goes."""
+    for each in [*node.children(recursive=True), node]:
+        with contextlib.suppress(psutil.Error):
+            each.kill()
+
+
+def replicas_of(node: psutil.Process) -> list[int]:
+    found = []
+    for each in node.children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            found += [each.pid] if "ServeReplica" in "".join(each.cmdline()[:1]) else []
+    return found
+
+
 def set_alias(cluster: Cluster, alias: str) -> None:
     with cluster.admin() as admin:
         admin.alias("ur5", alias, "1")
@@ -242,24 +302,56 @@ def half_sent(cluster: Cluster) -> Iterator[Callable[[], list[int]]]:
         yield finish
 
 
-def test_a_rolling_update_of_settings_costs_no_request_and_keeps_the_commands(
-    cluster: Cluster, sessions: Sessions
+@contextlib.contextmanager
+def streaming(cluster: Cluster) -> Iterator[list[None]]:
+    """A stream that asks for an action each 10 ms, and must not end before this does; yields a list of its steps."""
+    stop, steps = threading.Event(), list[None]()
+
+    def stream() -> None:
+        with StreamClient(f"http://127.0.0.1:{cluster.port}", "ur5", api_key=KEY, deadline_ms=60_000) as client:
+            while not stop.is_set():
+                client.act(np.array(OBS, np.float32))
+                steps.append(None)
+                time.sleep(0.01)
+
+    with ThreadPoolExecutor(1) as pool:
+        streamed = pool.submit(stream)
+        try:
+            yield steps
+        finally:
+            stop.set()
+        streamed.result()
+
+
+def test_a_rolling_update_costs_no_request_keeps_streams_and_commands_and_broken_code_changes_nothing(
+    cluster: Cluster, sessions: Sessions, other_node: psutil.Process
 ) -> None:
+    """Of the settings, the environment and the place of the replicas: each alone would replace all of them, too."""
+    (deployment,) = cluster.application["deployments"]
     with cluster.admin() as admin:
         admin.alias("ur5", "candidate", "1")
-    old = {each["replica"] for each in cluster.replicas()}
-    with loaded(cluster) as load, half_sent(cluster) as finish:
+    with loaded(cluster) as load, streaming(cluster) as steps, half_sent(cluster) as finish:
+        cluster.application["import_path"] = "rlservo.serve_app.ray_serve.not_there:build"
+        cluster.deploy()
+        assert "not_there" in cluster.wait_for_status("DEPLOY_FAILED")
+        cluster.application["import_path"] = "rlservo.serve_app.ray_serve.app:build"
+        old = {each["replica"] for each in cluster.replicas()}
+        cluster.application["runtime_env"] = {"env_vars": {"RLSERVO_UPDATE": "1"}}
+        deployment["max_replicas_per_node"] = 1  # those that are there know of no such limit
         cluster.deploy(settings={"max_batch": 2048})
         seen = cluster.wait_for(
             lambda replicas: len(replicas) == 2 and not old & {each["replica"] for each in replicas}
         )
         time.sleep(2)  # the old ones drain: a second, then they wait for who is being answered
         assert finish() == [200, 200]
+        cluster.wait_for_status("RUNNING")
     assert load.first_failures == [], Counter(load.first_failures)
     assert set(load.versions) == {"3"}
+    assert load.answered > 50 and len(steps) > 50
     assert sessions.step() == []  # handed over
     for replica in seen:
         assert policy_of(replica)["aliases"] == {"production": "3", "candidate": "1"}
+    cluster.wait_for(lambda _: len(replicas_of(other_node)) == 1 and len(cluster.replica_pids()) == 2)
 
 
 def test_a_killed_replica_costs_a_client_that_retries_once_nothing_and_comes_back_as_it_was(
@@ -315,39 +407,6 @@ def test_a_killed_controller_costs_nobody_anything_and_commands_work_again(clust
             admin.alias("ur5", "candidate", "1")
         cluster.wait_for(lambda seen: len(seen) == 2)
     assert load.failures == [], Counter(load.failures)
-
-
-def test_a_rolling_update_of_the_environment_keeps_streams_and_broken_code_changes_nothing(
-    cluster: Cluster,
-) -> None:
-    stop, steps = threading.Event(), 0
-
-    def stream() -> None:
-        nonlocal steps
-        with StreamClient(f"http://127.0.0.1:{cluster.port}", "ur5", api_key=KEY, deadline_ms=60_000) as client:
-            while not stop.is_set():
-                client.act(np.array(OBS, np.float32))
-                steps += 1
-                time.sleep(0.01)
-
-    with loaded(cluster) as load, ThreadPoolExecutor(1) as pool:
-        streaming = pool.submit(stream)
-        try:
-            cluster.application["import_path"] = "rlservo.serve_app.ray_serve.app:not_there"
-            cluster.deploy()
-            assert "not_there" in cluster.wait_for_status("DEPLOY_FAILED")
-            cluster.application["import_path"] = "rlservo.serve_app.ray_serve.app:build"
-            old = {each["replica"] for each in cluster.replicas()}
-            cluster.application["runtime_env"] = {"env_vars": {"RLSERVO_UPDATE": "1"}}
-            cluster.deploy()
-            cluster.wait_for(lambda seen: len(seen) == 2 and not old & {each["replica"] for each in seen})
-            cluster.wait_for_status("RUNNING")
-            time.sleep(2)  # the old ones drain
-        finally:
-            stop.set()
-        streaming.result()
-    assert load.failures == [], Counter(load.failures)
-    assert load.answered > 50 and steps > 50
 
 
 def test_administration_needs_the_admin_key_and_says_what_it_will_not_do(cluster: Cluster) -> None:
@@ -418,12 +477,12 @@ def test_a_promotion_that_is_killed_half_way_goes_on_with_what_both_replicas_cou
     log = tmp_path / "log.jsonl"
     produce(cluster, "1")
     with loaded(cluster) as load:
-        with promoting(cluster, log, "2", "--for", "20s") as process:
+        with promoting(cluster, log, "2", "--for", "12s") as process:
             wait_for_checks(process, log, requests=20)
             process.kill()
             process.wait()
         assert arranged(cluster) == {("1", "2")}
-        with promoting(cluster, log, "2", "--for", "20s") as process:
+        with promoting(cluster, log, "2", "--for", "12s") as process:
             code, said = outcome_of(process)
     assert code == 0 and said.startswith("promoted: version 2 of 'ur5': error_rate>5%: it is 0%"), said
     assert arranged(cluster) == {("2", None)}
@@ -454,88 +513,32 @@ def test_a_promotion_stops_when_somebody_else_moves_the_alias(cluster: Cluster, 
     assert arranged(cluster) == {("3", None)}
 
 
-# Another node of the cluster, as `ray.cluster_utils` makes one: `ray start` refuses a second one on this address.
-NODE = """
-import sys
-from ray._private.node import Node
-from ray._private.parameter import RayParams
-from rlservo.serve_app.ray_serve.cluster_process import leave_out_agent
-leave_out_agent()
-node = Node(
-    RayParams(gcs_address=sys.argv[1], node_ip_address="127.0.0.1", num_cpus=2, num_gpus=0, min_worker_port=0,
-              max_worker_port=0, object_store_memory=80 << 20),
-    head=False, shutdown_at_exit=True, spawn_reaper=False)
-print("joined", flush=True)
-sys.stdin.read()
-"""
-
-
-@contextlib.contextmanager
-def joined(cluster: Cluster) -> Iterator[psutil.Process]:
-    """Another node of the cluster: the process whose descendants are all of it."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", NODE, cluster.address],
-        env=cluster.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert process.stdout is not None and process.stdin is not None
-    try:
-        said = ""
-        while not said.startswith("joined"):  # Ray may say something first
-            said = process.stdout.readline()
-            assert said, "the node did not start"
-        yield psutil.Process(process.pid)
-    finally:
-        with contextlib.suppress(psutil.Error):
-            kill_all(psutil.Process(process.pid))
-        process.wait()
-        process.stdin.close()
-        process.stdout.close()
-
-
-def kill_all(node: psutil.Process) -> None:
-    """SIGKILL to all of a node at once, as when its power goes."""
-    for each in [*node.children(recursive=True), node]:
-        with contextlib.suppress(psutil.Error):
-            each.kill()
-
-
-def replicas_of(node: psutil.Process) -> list[int]:
-    found = []
-    for each in node.children(recursive=True):
-        with contextlib.suppress(psutil.Error):
-            found += [each.pid] if "ServeReplica" in "".join(each.cmdline()[:1]) else []
-    return found
-
-
 def latencies_of(reply: dict[str, Any]) -> list[int]:
     """Return a replica's histogram of all it has answered."""
     return [count for version in reply["counts"].values() for count in version["latency"]]
 
 
-def test_a_lost_node_costs_a_client_that_retries_once_nothing(cluster: Cluster, sessions: Sessions) -> None:
+def test_a_lost_node_costs_a_client_that_retries_once_nothing(
+    cluster: Cluster, sessions: Sessions, other_node: psutil.Process
+) -> None:
     (deployment,) = cluster.application["deployments"]
-    with joined(cluster) as node, cluster.admin() as admin:
-        # New replicas, one for each node: those that are there know of no such limit.
-        deployment["max_replicas_per_node"] = 1
-        cluster.application["runtime_env"] = {"env_vars": {"PLACED": "apart"}}
-        try:
-            cluster.deploy()
-            deadline = time.monotonic() + 2 * PATIENCE_S
-            while not (len(replicas_of(node)) == 1 and len(cluster.replica_pids()) == 2):  # of both nodes
-                assert time.monotonic() < deadline, "the replicas are not apart"
+    deadline = time.monotonic() + 2 * PATIENCE_S
+    while not (len(replicas_of(other_node)) == 1 and len(cluster.replica_pids()) == 2):  # of both nodes
+        assert time.monotonic() < deadline, "the replicas are not apart"
+        time.sleep(0.2)
+    sessions.step()  # those that were begun on the other node go with it
+    try:
+        with loaded(cluster) as load, cluster.admin() as admin:
+            while not all(any(latencies_of(reply)) for reply in admin.counts("ur5")):
+                assert time.monotonic() < deadline, "a replica was asked nothing"
                 time.sleep(0.2)
-            sessions.step()  # those that were begun on the other node go with it
-            with loaded(cluster) as load:
-                while not all(any(latencies_of(reply)) for reply in admin.counts("ur5")):
-                    assert time.monotonic() < deadline, "a replica was asked nothing"
-                    time.sleep(0.2)
-                before = load.answered
-                kill_all(node)
-                cluster.wait_for(lambda seen: len(seen) == 1)
-                after = load.answered
-        finally:
-            del deployment["max_replicas_per_node"]  # the same code: the replica that is left stays
-            cluster.deploy()
+            before = load.answered
+            kill_all(other_node)
+            cluster.wait_for(lambda seen: len(seen) == 1)
+            after = load.answered
+    finally:
+        del deployment["max_replicas_per_node"]  # the same code: the replica that is left stays
+        cluster.deploy()
     assert load.failures == [] and after - before > 20
     for version in load.versions:
         with Policy.load(cluster.repository / "ur5" / version) as policy:

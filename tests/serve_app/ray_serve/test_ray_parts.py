@@ -72,7 +72,7 @@ def test_without_the_switches_of_what_nobody_uses_everything_starts(monkeypatch:
     for name in SPARED[1:]:
         take_away(name, monkeypatch)
     ray_parts.check()
-    cluster_process._leave_out_extras()
+    cluster_process.leave_out_extras()
     services.start_ray_process(["gcs_server"], "gcs_server")
     assert started == [["gcs_server"]]
 
