@@ -81,8 +81,8 @@ def environment_of(minor: str, *options: str) -> Path:
     def install(folder: Path) -> None:
         for command in (
             [named, "-m", "venv", "--without-pip", str(folder)],
-            [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet", "--no-compile",
-             *options],  # what is imported is compiled then
+            [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet",
+             "--no-compile", *options],  # what is imported is compiled then
         ):  # fmt: skip
             done = subprocess.run(command, capture_output=True, text=True, timeout=INSTALLED_S)
             if done.returncode != 0:
