@@ -21,7 +21,7 @@ test: setup  ## All tests, in three processes: on two cores one of them often wa
 	$(BIN)/python -m pytest -n 3
 
 quick: setup  ## Unit tests, in a minute and a half on two cores
-	$(BIN)/python -m pytest -n 4 -m "not slow and not serve and not trained" $(NOT_UNITS) $(UNITS)
+	$(BIN)/python -m pytest -n 4 -m "not slow and not serve and not trained and not browser" $(NOT_UNITS) $(UNITS)
 
 check: setup  ## Lint, format and types, as CI runs them
 	$(BIN)/python .ci/alias_stubs.py
