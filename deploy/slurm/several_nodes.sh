@@ -75,15 +75,12 @@ sys.exit(f"several_nodes.sh: of {wanted} Ray nodes at {address}, {there} answere
 PYTHON
 }
 
-# The dashboard is off, but Ray still looks whether its port is free. Off, too: the autoscaler, and the log monitors,
-# whose lines nobody reads.
+# The dashboard is off, but Ray still looks whether its port is free. Off, too: the autoscaler.
 on_node "$head" "${ray[@]}" start --head --block --node-ip-address="$address" --port="$port" --temp-dir="$folder" \
-  --num-cpus="$cores" --num-gpus="$gpus" --include-dashboard=false --dashboard-port="$((port + 1))" \
-  --no-monitor --include-log-monitor=false
+  --num-cpus="$cores" --num-gpus="$gpus" --include-dashboard=false --dashboard-port="$((port + 1))" --no-monitor
 wait_for_nodes 1
 for node in "${nodes[@]:1}"; do
-  on_node "$node" "${ray[@]}" start --block --address="$address:$port" --num-cpus="$cores" --num-gpus="$gpus" \
-    --include-log-monitor=false
+  on_node "$node" "${ray[@]}" start --block --address="$address:$port" --num-cpus="$cores" --num-gpus="$gpus"
 done
 wait_for_nodes "${#nodes[@]}"
 
