@@ -29,6 +29,7 @@ import ray
 from ray.cluster_utils import Cluster
 
 from rlservo.serve_app.ray_serve.cluster_process import leave_out_extras
+from rlservo.serve_app.ray_serve.processes import MARK, end_marked
 
 TRAINER = Path(__file__).resolve().parents[2] / "examples" / "simple_trainer.py"
 FORKS = multiprocessing.get_context("forkserver")
@@ -38,6 +39,7 @@ NODE_GROUP = "RAY_NODE_TYPE_NAME"  # what an autoscaler sets for the nodes it st
 def main(folder: Path) -> None:
     results: dict[str, Any] = {}
     import_once("quick_rllib", TRAINER.stem)
+    mark = os.environ[MARK] = secrets.token_hex(16)
     leave_out_extras()  # the dashboard and its agents, log and autoscaler monitors: no trainer asks them anything
     Path("/tmp/ray").mkdir(exist_ok=True)  # Cluster writes its address there, whatever its own folder (ray 2.60)
     temporary = tempfile.mkdtemp(prefix="grow-", dir="/tmp")
@@ -54,6 +56,7 @@ def main(folder: Path) -> None:
     finally:
         ray.shutdown()
         cluster.shutdown()
+        end_marked(mark)  # what stands for an agent outlives a raylet that was killed
         shutil.rmtree(temporary, ignore_errors=True)
     print(json.dumps(results))
 
