@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from cache import cached
-from trainings import EXAMPLES, TINY, TRAINED_WITH, Ended, OneRay, command, environment
+from trainings import EXAMPLES, ON_ONE_CORE, TINY, TRAINED_WITH, Ended, OneRay, command, environment
 
 
 def run_here(script: str, *arguments: str, home: Path) -> Ended:
@@ -174,8 +174,8 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory, one_ray: OneRay) -> It
     home = tmp_path_factory.mktemp("interrupted")
     started = subprocess.Popen(
         command(
-            "simple_trainer.py", "--num-cpus", "0", *TINY, "--stop-iters", "6", "--checkpoint-frequency", "1",
-            "--episodes", "1",
+            "simple_trainer.py", "--num-cpus", "1", *ON_ONE_CORE, *TINY, "--stop-iters", "6",
+            "--checkpoint-frequency", "1", "--episodes", "1",
         ),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(home), cwd=home,
         start_new_session=True,
