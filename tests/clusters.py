@@ -185,14 +185,14 @@ class Cluster:
     def replica_pids(self) -> list[int]:
         return self.pids_of("ServeReplica:rlservo:PolicyServer")
 
-    def pids_of(self, part: str) -> list[int]:
-        """Return our processes with this in their title or program."""
+    def pids_of(self, part: str, argument: str = "") -> list[int]:
+        """Return our processes with this in their title or program, and that in an argument."""
         pids = []
         for entry in Path("/proc").iterdir():
             if entry.name.isdigit():
                 with contextlib.suppress(OSError):
                     title = (entry / "cmdline").read_bytes().decode(errors="replace")
-                    if part in title.split("\0")[0] and self._owns(int(entry.name)):
+                    if part in title.split("\0")[0] and argument in title and self._owns(int(entry.name)):
                         pids.append(int(entry.name))
         return sorted(pids)
 

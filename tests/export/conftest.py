@@ -5,17 +5,22 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from checkpoints import APP
-from rlservo.export.commands.export import ExportResult
-from rlservo.export.graph.one_thread import one_thread
+
+if TYPE_CHECKING:
+    from rlservo.export.commands.export import ExportResult
 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_torch_thread() -> Iterator[None]:
     """Tests call parts of an export by themselves; see `one_thread` for why."""
+    pytest.importorskip("torch")
+    from rlservo.export.graph.one_thread import one_thread
+
     with one_thread():
         yield
 
@@ -37,6 +42,8 @@ def exported_copy(exported: Callable[..., ExportResult], tmp_path: Path) -> Call
     """Return a function that gives a checkpoint's export, as `exported`, where a test may write to its files."""
 
     def copy(checkpoint: Path) -> ExportResult:
+        from rlservo.export.commands.export import ExportResult
+
         kept = exported(checkpoint)
         path = shutil.copytree(kept.path, tmp_path / "exported" / checkpoint.name / "1")
         return ExportResult(path, kept.contract)

@@ -244,8 +244,8 @@ def test_a_second_browser_may_watch_on_a_phone_and_go(
     assert phone.page.evaluate("document.documentElement.scrollWidth") <= 390
     assert len(cockpit.server.get_clients()) == 2
     # The sheet with the panels covers three fifths of the screen: what the camera looks at is above it.
-    sheet = phone.page.get_by_text("frames/s").first.bounding_box()
-    assert sheet is not None and sheet["y"] > 0.4 * 844
+    sheet = wait_for(phone.page.get_by_text("frames/s").first.bounding_box, "the panels are drawn")
+    assert sheet["y"] > 0.4 * 844
     camera = cockpit.server.get_clients()[max(cockpit.server.get_clients())].camera
     view = drive.view
     for point in (view.stage.env.viewpoint()[1], view.after.robot, view.after.target):
