@@ -4,8 +4,8 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-# Unit tests: what starts no Ray, simulator, robot server, proxy or storage, trains nothing, does not wait for time to
-# pass.
+# Unit tests: what starts no Ray, simulator, robot server, proxy or storage, opens no browser, trains nothing, does not
+# wait for time to pass.
 UNITS := tests/serve_app tests/envs/test_registration.py tests/export/checkpoints/test_experiment.py \
 	tests/test_layout.py tests/test_package.py
 NOT_UNITS := $(addprefix --ignore=tests/serve_app/, ray_serve/test_haproxy_wrapper.py \
@@ -20,8 +20,8 @@ demo: setup  ## Export the two shipped checkpoints, serve them, drive both simul
 test: setup  ## All tests, in three processes: on two cores one of them often waits
 	$(BIN)/python -m pytest -n 3
 
-quick: setup  ## Unit tests, in a minute and a half on two cores
-	$(BIN)/python -m pytest -n 4 -m "not slow and not serve and not trained and not browser" $(NOT_UNITS) $(UNITS)
+quick: setup  ## Unit tests, in a minute on two cores
+	$(BIN)/python -m pytest -n 3 -m "not slow and not serve and not trained and not browser" $(NOT_UNITS) $(UNITS)
 
 check: setup  ## Lint, format and types, as CI runs them
 	$(BIN)/python .ci/alias_stubs.py

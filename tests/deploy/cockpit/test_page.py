@@ -30,7 +30,12 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import load_store
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
+# In this order: each finds the drive as the one before has left it; a ghost's plot stays as long as its cycles do.
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.random_order(disabled=True),
+]
 
 ENV = "rlservo/EndEffectorPositioningURSim-v0"
 ARROW_M = 0.19  # from the target to where its handle's arrow is taken
@@ -244,13 +249,18 @@ def test_a_second_browser_may_watch_on_a_phone_and_go(
     assert phone.page.evaluate("document.documentElement.scrollWidth") <= 390
     assert len(cockpit.server.get_clients()) == 2
     # The sheet with the panels covers three fifths of the screen: what the camera looks at is above it.
-    sheet = wait_for(phone.page.get_by_text("frames/s").first.bounding_box, "the panels are drawn")
+    line = phone.page.get_by_text("frames/s").first
+    sheet = wait_for(line.bounding_box, "the line is there, which is drawn anew twice a second")
     assert sheet["y"] > 0.4 * 844
     camera = cockpit.server.get_clients()[max(cockpit.server.get_clients())].camera
     view = drive.view
-    for point in (view.stage.env.viewpoint()[1], view.after.robot, view.after.target):
+
+    def is_above_the_sheet(point: Any) -> bool:
         x, y = cockpit.pixel(point, camera)
-        assert 0 < x < 390 and 0 < y < sheet["y"], f"{point} is drawn at {x:.0f}, {y:.0f}"
+        return bool(0 < x < 390 and 0 < y < sheet["y"])
+
+    for point in (view.stage.env.viewpoint()[1], view.after.robot, view.after.target):
+        wait_for(lambda point=point: is_above_the_sheet(point), f"{point} is drawn above the sheet", 30.0)
     phone.close()
     wait_for(lambda: len(cockpit.server.get_clients()) == 1, "the phone is gone")
     first = window.text()
