@@ -20,8 +20,8 @@ demo: setup  ## Export the two shipped checkpoints, serve them, drive both simul
 test: setup  ## All tests, in three processes: on two cores one of them often waits
 	$(BIN)/python -m pytest -n 3
 
-quick: setup  ## Unit tests: a hundred seconds of processor time, so about a minute on two quiet cores
-	$(BIN)/python -m pytest -n 3 -m "not slow and not serve and not trained and not browser" $(NOT_UNITS) $(UNITS)
+quick: setup  ## Unit tests, in a minute on two cores that nothing else uses
+	$(BIN)/python -m pytest -n 4 -m "not slow and not serve and not trained and not browser" $(NOT_UNITS) $(UNITS)
 
 check: setup  ## Lint, format and types, as CI runs them
 	$(BIN)/python .ci/alias_stubs.py

@@ -70,6 +70,9 @@ LONGEST = (
     "tests/system/test_demo.py", "tests/examples/test_on_a_cluster.py", "tests/system/test_serving_starts.py",
     "ports of server managers", "tests/serve_app/versions/test_remote_repository.py",
     "tests/export/rllib/test_new_stack.py", "sweep", "several nodes",
+    # of `make quick`
+    "tests/serve_app/protocols/test_access.py", "tests/serve_app/recording/test_recorder.py",
+    "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_api_key_file.py",
 )  # fmt: skip
 
 # Servers and Rays that tests share. One that nobody uses still takes a tenth of a core or more.
