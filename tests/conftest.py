@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import gc
-import inspect
 import os
 import sys
 from typing import Any
@@ -22,6 +20,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 pytest_plugins = [
+    "quick_rllib",  # its settings, for the tests that import RLlib
     "browser",
     "checkpoints",
     "bundles",
@@ -135,14 +134,6 @@ class SharedFixtures:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # A collection walks all that torch and RLlib have made, and by Python's own threshold one comes every 700 objects:
-    # a quarter of the time of their import.
-    gc.set_threshold(100_000, 20, 20)
-    # For each connector RLlib (ray 2.60) asks for the whole stack, by default with the source around all of its lines:
-    # a fifth of what the tests themselves took.
-    stack = pytest.MonkeyPatch()
-    stack.setattr(inspect, "stack", functools.partial(inspect.stack, context=0))
-    config.add_cleanup(stack.undo)
     config.pluginmanager.register(SharedFixtures())
 
 

@@ -1,6 +1,7 @@
 """Settings of a process that make RLlib start sooner, and change nothing else; importing this module sets them.
 
-Ray's workers of the tests' trainings import it first: `trainings.environment`.
+The tests' processes import it first (`conftest.py`), and so do Ray's workers of their trainings
+(`trainings.environment`).
 """
 
 import functools
