@@ -6,41 +6,29 @@ Prints, last, one JSON line: how each run ended and what it said.
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
-import runpy
 import secrets
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
-from multiprocessing import forkserver
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-os.environ.update(RAY_AUTH_MODE="token", RAY_enable_worker_prestart="0")
-os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(16))  # the trainers inherit it
+os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(16), RAY_enable_worker_prestart="0")
 
 import ray
 from ray.cluster_utils import Cluster
 
-from rlservo.serve_app.ray_serve.cluster_process import leave_out_extras
-from rlservo.serve_app.ray_serve.processes import MARK, end_marked
-
 TRAINER = Path(__file__).resolve().parents[2] / "examples" / "simple_trainer.py"
-FORKS = multiprocessing.get_context("forkserver")
 NODE_GROUP = "RAY_NODE_TYPE_NAME"  # what an autoscaler sets for the nodes it starts
 
 
 def main(folder: Path) -> None:
     results: dict[str, Any] = {}
-    import_once("quick_rllib", TRAINER.stem)
-    mark = os.environ[MARK] = secrets.token_hex(16)
-    leave_out_extras()  # the dashboard and its agents, log and autoscaler monitors: no trainer asks them anything
     Path("/tmp/ray").mkdir(exist_ok=True)  # Cluster writes its address there, whatever its own folder (ray 2.60)
     temporary = tempfile.mkdtemp(prefix="grow-", dir="/tmp")
     cluster = Cluster(
@@ -56,38 +44,27 @@ def main(folder: Path) -> None:
     finally:
         ray.shutdown()
         cluster.shutdown()
-        end_marked(mark)  # what stands for an agent outlives a raylet that was killed
         shutil.rmtree(temporary, ignore_errors=True)
     print(json.dumps(results))
-
-
-def import_once(*modules: str) -> None:
-    """Start the process that trainers are forked from: to import RLlib and torch takes each longer than to train."""
-    own = os.environ["PYTHONPATH"]
-    os.environ["PYTHONPATH"] = f"{TRAINER.parent}{os.pathsep}{own}"  # its `sys.path` is no other (Python 3.11)
-    FORKS.set_forkserver_preload(list(modules))
-    forkserver.ensure_running()
-    os.environ["PYTHONPATH"] = own
 
 
 class Trainer:
     """A trainer with this many environment runners; each has a core, and so has its driver."""
 
     def __init__(self, cluster: Cluster, folder: Path, runners: int, *more: str) -> None:
-        words = [
-            "--address", cluster.address, "--num-cpus", str(runners), "--stop-iters", "5",
+        command = [
+            sys.executable, str(TRAINER), "--address", cluster.address, "--num-cpus", str(runners), "--stop-iters", "5",
             "--set", "train_batch_size_per_learner=400", "--hidden", "16", "--checkpoint-frequency", "1",
             "--episodes", "1", "--set", "env_runner_health_probe_timeout_s=5", *more,
         ]  # fmt: skip
-        reads, writes = FORKS.Pipe(duplex=False)
-        with reads, writes:
-            self.process = FORKS.Process(target=run_trainer, args=(folder, writes, words, dict(os.environ)))
-            self.process.start()
-            self.output = os.fdopen(os.dup(reads.fileno()))
+        self.process = subprocess.Popen(
+            command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
         self.said = ""
 
     def lines(self) -> Iterator[str]:
-        for line in self.output:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
             self.said += line
             yield line
 
@@ -102,34 +79,17 @@ class Trainer:
         return -1.0
 
     def end(self) -> dict[str, Any]:
-        """Read to the end of what it says, killing it where that does not come."""
-        limit = threading.Timer(240, self.process.kill)
-        limit.start()
-        for _ in self.lines():
-            pass
-        self.process.join()
-        limit.cancel()
-        self.output.close()
-        return {"code": self.process.exitcode, "said": self.said}
-
-
-def run_trainer(folder: Path, output: Connection, words: list[str], environment: dict[str, str]) -> None:
-    """Run the script as the main program of this process."""
-    assert TRAINER.stem in sys.modules, "it was not imported before"
-    os.environ.clear()
-    os.environ.update(environment)
-    os.dup2(output.fileno(), 1)
-    output.close()
-    os.dup2(1, 2)
-    os.chdir(folder)
-    sys.argv = [str(TRAINER), *words]
-    runpy.run_path(str(TRAINER), run_name="__main__")
+        try:
+            rest, _ = self.process.communicate(timeout=240)
+        finally:
+            self.process.kill()
+            self.process.wait()
+        return {"code": self.process.returncode, "said": self.said + rest}
 
 
 def interrupted(trainer: Trainer) -> dict[str, Any]:
     trainer.seconds_until("waiting for")
-    assert trainer.process.pid is not None
-    os.kill(trainer.process.pid, signal.SIGINT)
+    trainer.process.send_signal(signal.SIGINT)
     return trainer.end()
 
 
