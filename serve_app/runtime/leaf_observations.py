@@ -9,6 +9,7 @@ it, too.
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from operator import ge, itemgetter, le
 from typing import Any, NoReturn
@@ -25,6 +26,8 @@ from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
 SMALL = 128  # elements up to which Python's own sum is faster than numpy's isfinite(...).all()
+NUMBERS = frozenset({float, int, bool})  # what `struct` reads as the number that it is
+PACKED = {"float32": "f", "float64": "d"}
 
 
 class LeafParser:
@@ -55,6 +58,9 @@ class LeafParser:
         self._names = tuple(element.name for element in space.elements)
         self._drift = drift
         self._until_drift = 1  # observations until the next one that is counted in
+        # The usual observation, a list of numbers, becomes an array in a fraction of numpy's time.
+        packs = self._ndim == 1 and space.size <= SMALL and space.dtype in PACKED
+        self._packer = struct.Struct(f"{space.size}{PACKED[space.dtype]}") if packs else None
         self._named = bool(self._names) and len(set(self._names)) == len(self._names)
 
     def parse(self, obs: Any) -> tuple[NDArray[Any], bool, str]:
@@ -62,6 +68,35 @@ class LeafParser:
 
         The notice is a sentence on what is out of bounds and used all the same, mostly empty. Raises ObservationError.
         """
+        numbers = self._pack(obs) if type(obs) is list else None
+        array, values, batch = self._read(obs) if numbers is None else (*numbers, False)
+        if self._drift is not None:
+            self._until_drift -= 1
+            if not self._until_drift:
+                self._until_drift = EVERY
+                self._drift.add(array)
+        if self._bounded:
+            if values is not None and len(array) == 1:
+                checked = self._pick(values)
+                if all(map(le, self._lows, checked)) and all(map(ge, self._highs, checked)):
+                    return array, batch, ""
+            array, notice = self._keep_bounds(array)
+            return array, batch, notice
+        return array, batch, ""
+
+    def _pack(self, obs: list[Any]) -> tuple[NDArray[Any], list[float]] | None:
+        """Return (array, its numbers) of a list of finite numbers; None for all else, which is for `_read`."""
+        if self._packer is None or not NUMBERS.issuperset(map(type, obs)):
+            return None
+        try:
+            array = np.frombuffer(self._packer.pack(*obs), self._dtype).reshape(self._one)
+        except (struct.error, OverflowError):  # more or fewer, or larger than a float can be
+            return None
+        values: list[float] = array.ravel().tolist()
+        return (array, values) if math.isfinite(sum(values)) else None
+
+    def _read(self, obs: Any) -> tuple[NDArray[Any], list[float] | None, bool]:
+        """Return (array, its numbers where they are few, whether `obs` was a batch), checked but for its bounds."""
         array: NDArray[Any]
         if type(obs) is np.ndarray:
             array = obs
@@ -87,19 +122,7 @@ class LeafParser:
                 self._check_finite(array)
         elif self._choices is not None:
             self._check_range(array, *self._choices)
-        if self._drift is not None:
-            self._until_drift -= 1
-            if not self._until_drift:
-                self._until_drift = EVERY
-                self._drift.add(array)
-        if self._bounded:
-            if values is not None and len(array) == 1:
-                checked = self._pick(values)
-                if all(map(le, self._lows, checked)) and all(map(ge, self._highs, checked)):
-                    return array, batch, ""
-            array, notice = self._keep_bounds(array)
-            return array, batch, notice
-        return array, batch, ""
+        return array, values, batch
 
     def _set_bounds(self, space: BoxSpec) -> bool:
         """Set the bounds with their slack; return whether there is anything to check."""
