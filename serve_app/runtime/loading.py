@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.bundle import CONTRACT_FILE, CONTRACT_KEY, GOLDEN_FILE, ONNX_FILE, Bundle
-from rlservo.export.contract.contract import REWARD, Contract, parse_contract
+from rlservo.export.contract.contract import REWARD, VALUE, Contract, parse_contract
 from rlservo.export.contract.errors import BundleError, BundleTamperedError, GoldenMismatchError, first_line, quoted
 from rlservo.export.contract.ort_session import open_ort_session
 from rlservo.export.contract.scores import split_scores
@@ -34,7 +34,7 @@ ONNX_TYPES = {
     **{f"tensor({name})": name for size in (8, 16, 32, 64) for name in (f"int{size}", f"uint{size}")},
 }  # fmt: skip
 
-Run = Callable[[list[str], dict[str, NDArray[Any]]], Any]
+Run = Callable[[Sequence[str], dict[str, NDArray[Any]]], Any]
 
 
 def check_contract(bundle: Bundle) -> None:
@@ -104,9 +104,14 @@ def _check_leaf(bundle: Bundle, name: str, space: LeafSpec) -> None:
             raise BundleError(f"{where} has {len(side)} bounds for {space.size} elements")
 
 
-def open_graph(bundle: Bundle, threads: int) -> onnxruntime.InferenceSession:
+def open_graph(bundle: Bundle, threads: int, *, acts_only: bool = False) -> onnxruntime.InferenceSession:
+    """Open the network; `acts_only`: without the value head. Raises BundleError, BundleTamperedError."""
     with bundle.verified_copy(ONNX_FILE) as file:
         try:
+            if acts_only and any(tensor.name == VALUE for tensor in bundle.contract.outputs):
+                from rlservo.serve_app.runtime.acting_graph import without_value
+
+                file.write_bytes(without_value(file.read_bytes()))
             return open_ort_session(file, threads)
         except Exception as error:  # onnxruntime's own exceptions share no base but Exception
             sentence = first_line(error).replace(str(file), bundle.onnx.name)
@@ -160,14 +165,18 @@ def check_copy(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> Non
         )
 
 
-def check_golden_vectors(bundle: Bundle, run: Run) -> None:
-    """Replay golden.npz and compare every output with the recorded one.
+def acting_outputs(contract: Contract) -> list[str]:
+    """Return the graph's outputs but for `value`."""
+    return [tensor.name for tensor in contract.outputs if tensor.name != VALUE]
+
+
+def check_golden_vectors(bundle: Bundle, run: Run, names: Sequence[str]) -> None:
+    """Replay golden.npz and compare the outputs of these names with the recorded ones.
 
     Floats agree within `max(contract parity rtol, GOLDEN_RTOL)` relative and `max(parity atol, GOLDEN_ATOL)` absolute;
     integers exactly, unless the choice was a tie within that tolerance. Raises GoldenMismatchError.
     """
     inputs, recorded = bundle.golden()
-    names = [tensor.name for tensor in bundle.contract.outputs]
     missing = ({tensor.name for tensor in bundle.contract.inputs} - set(inputs)) | (set(names) - set(recorded))
     if missing or any(array.ndim == 0 or len(array) == 0 for array in (*inputs.values(), *recorded.values())):
         raise BundleError(f"{bundle.path / GOLDEN_FILE} holds no samples of {', '.join(sorted(missing)) or 'a tensor'}")
@@ -188,7 +197,7 @@ def check_golden_vectors(bundle: Bundle, run: Run) -> None:
 def check_rows(bundle: Bundle, run: Run) -> None:
     """Refuse to compute observations together where that is something else than one by one. Raises BundleError."""
     inputs, _ = bundle.golden()
-    names = [tensor.name for tensor in bundle.contract.outputs]
+    names = acting_outputs(bundle.contract)
     rows = {tensor.name: np.resize(inputs[tensor.name], (3, *inputs[tensor.name].shape[1:]))
             for tensor in bundle.contract.inputs}  # fmt: skip
     one_by_one = [run(names, {name: array[row : row + 1] for name, array in rows.items()}) for row in range(3)]

@@ -126,7 +126,7 @@ class DroppableNetwork:
                 if time.monotonic() - self._failed_at < RETRY_S:
                     raise NetworkAwayError(self._failure)
                 try:
-                    ort_session = open_graph(self._bundle, self._threads)
+                    ort_session = open_graph(self._bundle, self._threads, acts_only=True)
                 except BundleError as error:
                     self._failed_at = time.monotonic()
                     self._failure = (

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from rlservo.export.contract.bundle import DEFAULT_LIMITS, ONNX_FILE, Bundle, BundleLimits, load_bundle
-from rlservo.export.contract.contract import Contract, Distribution
+from rlservo.export.contract.contract import VALUE, Contract, Distribution
 from rlservo.export.contract.errors import ActionError, RequestError, UsageError
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.export.contract.spaces import leaf_specs
@@ -29,6 +29,7 @@ from rlservo.serve_app.runtime.drift import Drift
 from rlservo.serve_app.runtime.exploration import Draw, draw_action
 from rlservo.serve_app.runtime.loading import (
     Run,
+    acting_outputs,
     check_contract,
     check_copy,
     check_golden_vectors,
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
     import onnxruntime
 
 logger = logging.getLogger(__name__)
-VALUE = "value"  # the graph's output of the critic, where it was exported
 SHOWN_HASH = 12  # hexadecimal digits: enough to tell the graphs apart that ever bear one name and version
 NOTICE_EVERY_S = 60.0  # an observation out of bounds comes a hundred times a second, and is worth a line a minute
 Network = Callable[[dict[str, NDArray[Any]]], dict[str, NDArray[Any]]]
@@ -121,6 +121,7 @@ class Policy(Closeable):
         self._contract = contract
         self._ort_session: onnxruntime.InferenceSession | DroppableNetwork | None = ort_session
         self._run: Run = ort_session.run
+        self._run_whole: Run | None = None  # with the value head, once that is asked for
         self._rng = np.random.default_rng()
         self.options = options
         self.draw: Draw | None = None
@@ -182,8 +183,13 @@ class Policy(Closeable):
         ort_session = open_graph(bundle, threads)
         check_graph(bundle, ort_session)
         check_copy(bundle, ort_session)
+        outputs = [tensor.name for tensor in bundle.contract.outputs]
         if check_golden:
-            check_golden_vectors(bundle, ort_session.run)
+            check_golden_vectors(bundle, ort_session.run, outputs)
+        if VALUE in outputs:
+            ort_session = open_graph(bundle, threads, acts_only=True)
+            if check_golden:
+                check_golden_vectors(bundle, ort_session.run, acting_outputs(bundle.contract))
         network = ort_session if memory is None else memory.add(bundle, ort_session, threads)
         return cls(bundle, network, options, graph_hash=bundle.sums[ONNX_FILE])
 
@@ -311,14 +317,20 @@ class Policy(Closeable):
         return Answer(action, inputs, self._state_tensors.next_state(computed, gave))
 
     def value(self, obs: Observation) -> NDArray[Any] | None:
-        """Return the critic's value of each observation `[batch]`; None where the graph has none, or remembers."""
+        """Return the critic's value of each observation `[batch]`; None where the graph has none, or remembers.
+
+        The first call opens the whole graph, of which acting needs a part. Raises what `parse` and `load` raise.
+        """
         if self.is_stateful or all(tensor.name != VALUE for tensor in self._contract.outputs):
             return None
+        if self._run_whole is None:
+            self._open()
+            self._run_whole = open_graph(self._bundle, 1).run
         feed, _, _ = self._observations.parse(obs)
         if {tensor.name for tensor in self._contract.inputs} != set(feed):
             return None  # it also sees rewards
-        value: NDArray[Any] = self._run([VALUE], feed)[0]
-        return value
+        value: Any = self._run_whole([VALUE], feed)[0]
+        return value  # type: ignore[no-any-return]
 
     def parse(self, obs: Observation) -> Observed:
         """Return an observation as the network's tensors. Raises ObservationError."""
@@ -365,7 +377,8 @@ class Policy(Closeable):
 
     def close(self) -> None:
         """Drop the graph; `act` raises UsageError from now on."""
-        self._run, self._ort_session = _refuse_closed, None
+        self._run = self._run_whole = _refuse_closed
+        self._ort_session = None
 
     def _open(self) -> onnxruntime.InferenceSession | DroppableNetwork:
         if self._ort_session is None:
@@ -435,5 +448,5 @@ class Policy(Closeable):
         return self.draw.action
 
 
-def _refuse_closed(_names: list[str], _feed: Mapping[str, Any]) -> NoReturn:
+def _refuse_closed(_names: Sequence[str], _feed: Mapping[str, Any]) -> NoReturn:
     raise UsageError("the policy has been closed: load it again to act")

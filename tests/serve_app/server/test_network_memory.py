@@ -172,11 +172,11 @@ def test_files_that_hang_hold_up_only_those_who_wait_for_them(folder: Path, monk
     go_on, reached, calls = threading.Event(), threading.Event(), []
     own = network_memory.open_graph
 
-    def hang(*given: Any) -> Any:
+    def hang(*given: Any, **options: Any) -> Any:
         calls.append(given)
         reached.set()
         assert go_on.wait(60)
-        return own(*given)
+        return own(*given, **options)
 
     core = core_of(folder, max_queue_ms=300)
     drop(core, "c")

@@ -1,0 +1,59 @@
+"""Graph without the value head, which no action needs.
+
+onnxruntime computes every output of a graph, whichever are asked for. A value head is as large as the rest, and its
+weights displace the rest from the processor's cache: of an action from two hidden layers of 256 it was a third.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rlservo.export.contract.contract import VALUE
+from rlservo.serve_app.wire.protobuf_messages import build_messages
+
+# What is looked at of ONNX's messages (onnx.proto); the rest is passed on as it came.
+MESSAGES = {
+    "Name": ("string name = 1",),
+    "Tensor": ("string name = 8",),
+    "Node": ("repeated string input = 1", "repeated string output = 2", "repeated Attribute attribute = 5"),
+    "Attribute": ("Graph g = 6", "repeated Graph graphs = 11"),
+    "Graph": ("repeated Node node = 1", "repeated Tensor initializer = 5", "repeated Name output = 12"),
+    "Model": ("Graph graph = 7",),
+}
+
+
+def without_value(model: bytes) -> bytes:
+    """Return a serialized ONNX model without its output `value` and what is computed for that alone."""
+    message = build_messages("rlservo.onnx", MESSAGES)["Model"].FromString(model)
+    graph = message.graph
+    _drop(graph.output, lambda output: output.name == VALUE)
+    needed = {output.name for output in graph.output}
+
+    def is_for_nothing(node: Any) -> bool:
+        if needed.isdisjoint(node.output):
+            return True
+        needed.update(name for name in _inputs(node) if name)
+        return False
+
+    _drop(graph.node, is_for_nothing)
+    _drop(graph.initializer, lambda tensor: tensor.name not in needed)
+    serialized: bytes = message.SerializeToString()
+    return serialized
+
+
+def _inputs(node: Any) -> Iterator[str]:
+    """Yield what a node takes, and what the graphs inside it may take from outside."""
+    yield from node.input
+    for attribute in node.attribute:
+        for graph in (attribute.g, *attribute.graphs):
+            yield from (output.name for output in graph.output)
+            for inner in graph.node:
+                yield from _inputs(inner)
+
+
+def _drop(field: Any, is_to_go: Callable[[Any], bool]) -> None:
+    """Delete messages of a repeated field; the last is asked about first: what a node takes was computed before it."""
+    for index in reversed(range(len(field))):
+        if is_to_go(field[index]):
+            del field[index]
