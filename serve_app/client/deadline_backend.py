@@ -6,6 +6,7 @@ loop's deadline is for the whole answer.
 
 from __future__ import annotations
 
+import contextlib
 import ssl
 import threading
 import time
@@ -13,6 +14,9 @@ from collections.abc import Iterable
 from typing import Any
 
 import httpcore
+
+MOST_HELD = 65536
+"""[bytes] of a request that are held until all of it is there."""
 
 
 class DeadlineBackend(httpcore.NetworkBackend):
@@ -67,15 +71,27 @@ class DeadlineBackend(httpcore.NetworkBackend):
 
 
 class _DeadlineStream(httpcore.NetworkStream):
+    """Sends a request's head with its body: httpcore writes them one by one, and the server would read twice."""
+
     def __init__(self, stream: httpcore.NetworkStream, backend: DeadlineBackend) -> None:
         self._stream = stream
         self._backend = backend
+        self._held = b""
 
     def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
+        if self._held:
+            with contextlib.suppress(httpcore.WriteError):  # as httpcore does: a server may have said why it closed
+                self._send(timeout)
         return self._stream.read(max_bytes, self._backend.remaining(timeout, httpcore.ReadTimeout))
 
     def write(self, buffer: bytes, timeout: float | None = None) -> None:
-        self._stream.write(buffer, self._backend.remaining(timeout, httpcore.WriteTimeout))
+        self._held += buffer
+        if len(self._held) > MOST_HELD:
+            self._send(timeout)
+
+    def _send(self, timeout: float | None) -> None:
+        held, self._held = self._held, b""
+        self._stream.write(held, self._backend.remaining(timeout, httpcore.WriteTimeout))
 
     def close(self) -> None:
         self._stream.close()
