@@ -27,7 +27,7 @@ from rlservo.export.contract.errors import PartlyAppliedError, RlservoError, Una
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import InferenceService
-from rlservo.serve_app.ray_serve import direct_port, http_connections, ingress, ray_parts, uvicorn_parts
+from rlservo.serve_app.ray_serve import direct_port, grpc_ingress, http_connections, ingress, ray_parts, uvicorn_parts
 from rlservo.serve_app.ray_serve.autoscaling import BUSY, Load
 from rlservo.serve_app.ray_serve.direct_server import DirectServer
 from rlservo.serve_app.ray_serve.gcs_ledger import GcsLedger
@@ -171,8 +171,11 @@ class PolicyServer(InferenceService):
             core.share_sessions(self._records, ReplicaPeers(self._id, "answer_peer", self._running))
         # By way of the module: Serve pickles this class with copies of the objects that it names.
         http_connections.leave_time_for_bodies(self._settings.body_timeout_s)
-        ingress.bypass.install(app, answers=self._settings.ahead_of_serve and _can_bypass_serve())
+        answers = self._settings.ahead_of_serve and _can_bypass_serve()
+        ingress.bypass.install(app, answers=answers)
         self.serve_grpc(core, local_only=is_loopback(self._host))
+        if answers:
+            grpc_ingress.bypass.install(self._grpc.answer)
         return app
 
     async def reconfigure(self, user_config: Any) -> None:
