@@ -204,9 +204,9 @@ class DirectConnection(TimedProtocol):
         if self.cycle is not None and not self.cycle.response_complete:
             self.cycle.keep_alive = False
 
-    def find_immediate(self, _scope: Scope) -> ASGIApp | None:
-        """Return what answers a request for an action, if it is one."""
-        return self._server.app.find_immediate(_scope)
+    def find_immediate(self, scope: Scope) -> ASGIApp | None:
+        """Return what answers a request for an action, if it is one; while draining, replies end their connection."""
+        return None if self._server.is_draining else self._server.app.find_immediate(scope)
 
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
         if self._server.is_draining:
@@ -226,11 +226,8 @@ class DirectApp:
         if match is None:
             return None
         if not self._app.admit_ahead():
-            return self._turn_away
+            return ingress.refuse_unread
         return functools.partial(self._app.answer_found, match)
-
-    async def _turn_away(self, _scope: Scope, _receive: Receive, send: Send) -> None:
-        await ingress.turn_away(send)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one connection or request."""

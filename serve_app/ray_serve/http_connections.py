@@ -10,7 +10,8 @@ uvicorn (0.54) bounds one phase of a connection, the idle time after a reply. Fo
 And it takes a head of any size. Of WebSockets see `websocket_connections.py`.
 
 A request for an action that came whole is answered at once where nothing has to wait (`eager_start.py`), in the turn of
-the event loop that reads it, and its reply is written in one piece.
+the event loop that reads it, and its reply is written in one piece. A head that comes again is not parsed again
+(`repeated_head.py`).
 
 `install` puts subclasses in place of the classes that uvicorn chooses, in each of Serve's processes that serves HTTP
 (`ingress.py`). One timer a connection checks its phase; a request costs two assignments. In front of the replicas
@@ -23,11 +24,12 @@ import asyncio
 import functools
 import socket
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from rlservo.serve_app.protocols.http_endpoint import REPLY, WholeBody
 from rlservo.serve_app.ray_serve import eager_start, uvicorn_parts
 from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
+from rlservo.serve_app.ray_serve.repeated_head import RepeatedHead
 from rlservo.serve_app.ray_serve.uvicorn_parts import (
     STATUS_LINE,
     HttpToolsProtocol,
@@ -49,6 +51,8 @@ LINGER_S = 1.0
 """[s] in which a client that still sends may take the reply: closed at once, what it sends would destroy the reply."""
 UNREAD_S = 10.0
 """[s] that sent bytes may wait for a client that does not read."""
+MOST_LESSONS = 8
+"""Heads of a connection that are looked at for whether the next is the same: a client may change it every time."""
 CHECK_PERIOD_S = 1.0
 """[s] between two checks of a connection's phase."""
 
@@ -87,6 +91,7 @@ class TimedProtocol(HttpToolsProtocol):
     """A connection that ends when one of its phases takes too long, and writes each reply at once."""
 
     body_s = BODY_S
+    find: Callable[[Scope], ASGIApp | None] = staticmethod(lambda _: None)
     _head_since: float | None = None  # since when a head is awaited; None while something else is
     _body_since = 0.0  # since when the request's body is awaited
     _timer: asyncio.TimerHandle | None = None
@@ -96,6 +101,10 @@ class TimedProtocol(HttpToolsProtocol):
     _on_lost: Callable[[], None] | None = None
     _is_first = False  # of the requests that are being read: those after it let other connections have their turn
     _awaited: tuple[Any, Any, ASGIApp] | None = None  # cycle, its application, what answers it at once when it is whole
+    _idle_since = 0.0  # when the last reply was complete
+    _known: RepeatedHead | None = None  # the head that is expected to come again
+    _lessons = MOST_LESSONS
+    _answered: Any = None  # the scope of the request that was answered at once in this read
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first head."""
@@ -117,10 +126,18 @@ class TimedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Read what has come; of a head, not more than may be."""
+        is_between = self._unread == 0 and (self.cycle is None or self.cycle.response_complete)
+        if is_between and self._known is not None:
+            found = self._known.read(data)
+            if found is not None and self._repeat(*found):
+                return
         self._unread += len(data)
-        self._is_first = True
+        self._is_first, self._answered = True, None
         super().data_received(data)
         self._is_first = False
+        if is_between and self._answered is not None:
+            self._lessons -= 1
+            self._known = RepeatedHead.learn(data, self._answered)
         if self._awaited is not None:  # more of it is to come
             cycle, app, _ = self._awaited
             self._awaited = None
@@ -128,6 +145,30 @@ class TimedProtocol(HttpToolsProtocol):
         if self._unread > MAX_HEAD_BYTES and self._head_since is not None and not self.transport.is_closing():
             self.transport.write(LARGE_REPLY)
             self.transport.close()
+
+    def _repeat(self, scope: Any, body: bytes) -> bool:
+        """Answer a request whose head need not be parsed; return False where it is to take the ordinary way."""
+        at_once = self.find_immediate(scope)
+        if at_once is None:
+            return False
+        self._replies.head = None
+        self.scope, self.headers = scope, scope["headers"]
+        self.cycle = cycle = EarlyEnd(
+            scope=scope,
+            transport=cast("asyncio.Transport", self._replies),
+            flow=self.flow,
+            logger=self.logger,
+            access_logger=self.access_logger,
+            access_log=self.access_log,
+            default_headers=self.server_state.default_headers,
+            message_event=asyncio.Event(),
+            expect_100_continue=False,
+            keep_alive=True,
+            on_response=self.on_response_complete,
+        )
+        cycle.more_body = False
+        self._answer(cycle, body, at_once)
+        return True
 
     def handle_websocket_upgrade(self) -> None:
         """Leave the connection to the WebSocket protocol, which sends pings."""
@@ -156,16 +197,34 @@ class TimedProtocol(HttpToolsProtocol):
         self._unread = 0
         super().on_message_complete()
         if self._awaited is not None:
-            self._answer(*self._awaited)
+            cycle, _, at_once = self._awaited
+            self._awaited, self._is_first = None, False
+            if self._lessons:
+                self._answered = {**cycle.scope}
+            self._answer(cycle, bytes(cycle.body), at_once)
 
     def on_response_complete(self) -> None:
         """Give a client that is still sending a moment to take its reply, and close."""
+        self._idle_since = self.loop.time()
+        if self.timeout_keep_alive_task is not None and not self.transport.is_closing():
+            self.server_state.total_requests += 1  # of a head that came again; the timer goes on
+            return
         super().on_response_complete()
         cycle: Any = self.cycle
         if cycle.response_complete and cycle.ends_early and not self.transport.is_closing():
             self._unset_keepalive_if_required()
             self._stop()
             self.loop.call_soon(self._linger)  # the reply may be held until the end of this turn (`joined_writes.py`)
+
+    def timeout_keep_alive_handler(self) -> None:
+        """Close a connection that has been idle for so long."""
+        left = self._idle_since + self.timeout_keep_alive - self.loop.time()
+        if left > 0 or not self.cycle.response_complete:
+            self.timeout_keep_alive_task = self.loop.call_later(
+                max(left, CHECK_PERIOD_S), self.timeout_keep_alive_handler
+            )
+        else:
+            super().timeout_keep_alive_handler()
 
     def _linger(self) -> None:
         if not self.transport.is_closing():
@@ -197,14 +256,11 @@ class TimedProtocol(HttpToolsProtocol):
                 return
         super()._start_asgi_task(cycle, app)
 
-    def find_immediate(self, _scope: Scope) -> ASGIApp | None:
+    def find_immediate(self, scope: Scope) -> ASGIApp | None:
         """Return what answers a request without the application's middleware, if anything does."""
-        return None
+        return self.find(scope)
 
-    def _answer(self, cycle: Any, _app: Any, at_once: ASGIApp) -> None:
-        self._awaited, self._is_first = None, False
-        body = bytes(cycle.body)
-
+    def _answer(self, cycle: Any, body: bytes, at_once: ASGIApp) -> None:
         def answer(scope: Scope, receive: Receive, send: Send) -> Any:
             return at_once(scope, WholeBody(body, receive), send)
 
@@ -285,9 +341,13 @@ def leave_time_for_bodies(seconds: float) -> None:
     TimedProtocol.body_s = max(BODY_S, seconds)
 
 
-def install() -> None:
-    """Let uvicorn's servers of this process use it. Raises RuntimeError for another uvicorn than is known here."""
+def install(find_immediate: Callable[[Scope], ASGIApp | None]) -> None:
+    """Let uvicorn's servers of this process use it, with what finds the requests that are answered at once.
+
+    Raises RuntimeError for another uvicorn than is known here.
+    """
     if auto.AutoHTTPProtocol is TimedProtocol:
         return
     uvicorn_parts.check()
+    TimedProtocol.find = staticmethod(find_immediate)
     auto.AutoHTTPProtocol = TimedProtocol

@@ -19,6 +19,7 @@ imported by Serve's proxies as well, so it imports little.
 from __future__ import annotations
 
 import asyncio
+import functools
 from typing import Any, Protocol
 
 from starlette.middleware import Middleware
@@ -81,6 +82,20 @@ class ServeBypass:
 bypass = ServeBypass()
 
 
+def find_immediate(scope: Scope) -> ASGIApp | None:
+    """Return what answers an HTTP request as `Ingress` would have it answered, without waiting; None where that may."""
+    found = bypass.find(scope)
+    if found is None or not bypass.answers:
+        return None
+    app, match = found
+    return functools.partial(app.answer_ahead, match) if app.admit_ahead() else refuse_unread
+
+
+async def refuse_unread(_scope: Scope, _receive: Receive, send: Send) -> None:
+    """Answer a request that nothing is read of."""
+    await turn_away(send)
+
+
 class Ingress:
     """Looks at every HTTP request and every WebSocket."""
 
@@ -117,7 +132,7 @@ async def turn_away(send: Send) -> None:
 
 def middlewares() -> list[Middleware]:
     """Return what Serve puts around each HTTP server it starts; it calls this before it binds the server's port."""
-    http_connections.install()
+    http_connections.install(find_immediate)
     closed_endpoints.install()
     if loopback_binding.is_wanted():
         loopback_binding.install()

@@ -49,6 +49,7 @@ METHODS: dict[type, tuple[str, ...]] = {
     HttpToolsProtocol: (
         *("_should_upgrade", "_start_asgi_task", "_unset_keepalive_if_required", "handle_websocket_upgrade"),
         *("on_message_begin", "on_headers_complete", "on_message_complete", "on_response_complete", "shutdown"),
+        "timeout_keep_alive_handler",
     ),
     RequestResponseCycle: ("run_asgi", "send"),
     WebSocketsSansIOProtocol: ("handle_cont", "handle_ping", "handle_pong", "receive", "send", "stop_keepalive"),
@@ -58,8 +59,9 @@ METHODS: dict[type, tuple[str, ...]] = {
 
 FIELDS: dict[type, tuple[str, ...]] = {
     HttpToolsProtocol: (
-        *("app", "config", "cycle", "headers", "loop", "parser", "scope", "tasks"),
-        *("timeout_keep_alive_task", "transport", "ws_protocol_class"),
+        *("access_log", "access_logger", "app", "config", "cycle", "flow", "headers", "logger", "loop", "parser"),
+        *("scope", "server_state", "tasks", "timeout_keep_alive", "timeout_keep_alive_task", "transport"),
+        "ws_protocol_class",
     ),
     RequestResponseCycle: (
         *("body", "default_headers", "disconnected", "flow", "keep_alive", "message_event", "more_body"),

@@ -409,7 +409,7 @@ def test_a_bug_in_a_canary_is_its_own(server: Server, monkeypatch: pytest.Monkey
 def test_a_canary_whose_network_cannot_be_opened_is_rolled_back(
     run: Any, server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: Any) -> Any:
+    def fail(*_: Any, **__: Any) -> Any:
         raise BundleError("policy.onnx is gone")
 
     monkeypatch.setattr(network_memory, "open_graph", fail)

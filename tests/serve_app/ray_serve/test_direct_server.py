@@ -27,6 +27,8 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve import direct_port, direct_server, http_connections
 from rlservo.serve_app.ray_serve.direct_server import DirectServer
 from rlservo.serve_app.ray_serve.ports import free_ports
+from rlservo.serve_app.ray_serve.repeated_head import RepeatedHead
+from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import load_policy
@@ -311,6 +313,95 @@ def test_a_request_leaves_nothing_to_the_garbage_collector(start: Callable[[], R
         finally:
             gc.enable()
     assert left < 10, "a collection over all of a replica takes milliseconds, in which nobody is answered"
+
+
+BODIES = [
+    *(json.dumps({"obs": [0.1 * number] * 27, "seq": number}).encode() for number in range(3)),
+    *(b'{"obs": [1]}', b"no JSON", b"", b'{"obs": NaN}', json.dumps({"obs": [1e300] * 27}).encode(), b" " * 5000),
+    *(json.dumps({"obs": values}).encode() for values in ([True] * 27, [0] * 27, ["1"] * 27, [[0.5] * 27] * 2, None)),
+    json.dumps({"obs": OBS, "deadline_ms": 0}).encode(),
+]
+
+
+def test_a_head_that_comes_again_is_answered_as_the_first(
+    start: Callable[[], Replica], port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is not parsed again; whatever the body holds, the reply is that to a connection's first request."""
+    start()
+    repeated: list[object] = []
+    read = RepeatedHead.read
+
+    def counted(self: RepeatedHead, data: bytes) -> Any:
+        found = read(self, data)
+        repeated.extend([found] if found else [])
+        return found
+
+    monkeypatch.setattr(RepeatedHead, "read", counted)
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=SOON_S)) as connection:
+        for body in BODIES * 2:
+            found, expected = ask_on(connection, body=body), ask(port, body=body)
+            for document in (found[1], expected[1]):
+                document.pop("infer_ms", None)
+                document.get("details", {}).pop("elapsed_ms", None)
+            assert found == expected
+        before = len(repeated)
+        assert ask_on(connection, authorization="Bearer no")[0] == 401
+        assert ask_on(connection)[0] == 200
+        assert before >= 2 * len(BODIES) and len(repeated) - before <= 2
+
+
+def test_a_key_is_checked_at_every_request(port: int, tmp_path: Path, ur5: Path) -> None:
+    store = store_of(load_policy(ur5))
+    limited, line = new_key("cell-8", rate=0.001, burst=3)
+    keys = tmp_path / "keys"
+    keys.write_text(f"{LINE}\n{line}\n")
+    settings = ServerSettings(api_keys_file=str(keys))
+    replica = Replica(create_app(lambda: store, settings), port, settings)
+    try:
+        with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=SOON_S)) as connection:
+            replies = [ask_on(connection, authorization=f"Bearer {limited}")[0] for _ in range(5)]
+            assert replies == [200, 200, 200, 429, 429]
+            assert [ask_on(connection)[0] for _ in range(3)] == [200] * 3
+            keys.write_text(f"{line}\n")
+            until(lambda: ask_on(connection)[0] == 401)
+    finally:
+        replica.end()
+
+
+def test_requests_that_wait_are_answered_on_their_connection(ur5: Path, port: int) -> None:
+    """Micro-batches: the reply comes in a later turn than the head that came again."""
+    policy = load_policy(ur5, options={"*": PolicyOptions(micro_batch=8)})
+    store, settings = store_of(policy), ServerSettings()
+    replica = Replica(create_app(lambda: store, settings), port, settings)
+
+    def drive(number: int) -> None:
+        with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=SOON_S)) as connection:
+            for step in range(40):
+                obs = [0.01 * number + 0.001 * step] * 27
+                status, reply = ask_on(connection, body=json.dumps({"obs": obs}).encode())
+                assert status == 200 and np.allclose(reply["action"], alone.act(obs), atol=1e-5)
+
+    try:
+        with load_policy(ur5) as alone, ThreadPoolExecutor(6) as pool:
+            list(pool.map(drive, range(6)))
+    finally:
+        replica.end()
+
+
+def test_only_an_idle_connection_is_closed(app: Any, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(direct_server, "KEEP_ALIVE_S", 2.0)
+    monkeypatch.setattr(http_connections, "CHECK_PERIOD_S", 0.1)
+    replica = Replica(app, port, SETTINGS)
+    try:
+        with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=SOON_S)) as connection:
+            for _ in range(8):  # for twice as long
+                assert ask_on(connection)[0] == 200
+                time.sleep(0.5)
+            began = time.monotonic()
+            assert connection.sock.recv(1) == b""
+            assert 0.5 < time.monotonic() - began < SOON_S
+    finally:
+        replica.end()
 
 
 def test_what_waited_until_a_replica_came_is_refused_as_late(start: Callable[[], Replica], port: int) -> None:

@@ -204,7 +204,7 @@ def test_a_uvicorn_without_what_it_uses_is_refused_by_name(
     monkeypatch.setitem(part, kind, (*part[kind], "_moved_elsewhere"))
     refused = rf"uvicorn {uvicorn.__version__} .* has no {kind.__name__}\._moved_elsewhere, "
     with pytest.raises(RuntimeError, match=refused):
-        http_connections.install()
+        http_connections.install(lambda _: None)
     assert auto.AutoHTTPProtocol is not TimedProtocol
 
 
