@@ -109,7 +109,7 @@ class Grpc:
         try:
             request = self._begin(method, context)
             if request.request_id is not None:
-                context.set_trailing_metadata([(REQUEST_ID, request.request_id)])  # in addition to Serve's own
+                context.set_trailing_metadata([(REQUEST_ID, request.request_id)])
             if method == "ModelInfer":
                 return await self._core.answer(self._codec, request, incoming)
             return METHODS[method](self._core, incoming)
@@ -399,7 +399,7 @@ def _fail(context: Any, error: Exception) -> None:
     trailing = [("rlservo-code", code), *given]
     if isinstance(error, UnavailableError):
         trailing.append(("retry-after", str(retry_after_s(error))))
-    context.set_trailing_metadata(trailing)  # in addition to Serve's
+    context.set_trailing_metadata(trailing)
 
 
 def _explain(error: Exception) -> tuple[grpc.StatusCode, str, str]:

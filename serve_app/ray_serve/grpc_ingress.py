@@ -32,6 +32,7 @@ UNARY = (
 )
 STREAMS = ("ModelStreamInfer",)
 Incoming = tuple[bytes, float | None]  # a request, and how many seconds its caller still waits for the answer
+APPLICATION = "application"  # metadata that names one of Serve's applications: Serve refuses another's
 LONGEST_S = 86400.0  # [s] gRPC says "no deadline" as one far away
 
 
@@ -79,7 +80,7 @@ def _with_deadline(
         remaining = context.time_remaining()
         incoming = (content, None if remaining is None or remaining > LONGEST_S else remaining)
         answer = bypass.find()
-        if answer is None:
+        if answer is None or any(key == APPLICATION for key, _ in context.invocation_metadata() or ()):
             return await serve(incoming, context)
         reply: bytes = (await answer(name, incoming, context)).SerializeToString()
         return reply

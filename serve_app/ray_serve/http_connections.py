@@ -101,7 +101,6 @@ class TimedProtocol(HttpToolsProtocol):
     _on_lost: Callable[[], None] | None = None
     _is_first = False  # of the requests that are being read: those after it let other connections have their turn
     _awaited: tuple[Any, Any, ASGIApp] | None = None  # cycle, its application, what answers it at once when it is whole
-    _idle_since = 0.0  # when the last reply was complete
     _known: RepeatedHead | None = None  # the head that is expected to come again
     _lessons = MOST_LESSONS
     _answered: Any = None  # the scope of the request that was answered at once in this read
@@ -126,7 +125,7 @@ class TimedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Read what has come; of a head, not more than may be."""
-        is_between = self._unread == 0 and (self.cycle is None or self.cycle.response_complete)
+        is_between = self._is_between()
         if is_between and self._known is not None:
             found = self._known.read(data)
             if found is not None and self._repeat(*found):
@@ -146,11 +145,17 @@ class TimedProtocol(HttpToolsProtocol):
             self.transport.write(LARGE_REPLY)
             self.transport.close()
 
+    def _is_between(self) -> bool:
+        """Whether a request has come whole and been answered, and the parser is in no other: a head may begin here."""
+        cycle = self.cycle
+        return cycle is not None and cycle.response_complete and not cycle.more_body and self._head_since is None
+
     def _repeat(self, scope: Any, body: bytes) -> bool:
         """Answer a request whose head need not be parsed; return False where it is to take the ordinary way."""
         at_once = self.find_immediate(scope)
         if at_once is None:
             return False
+        self._unset_keepalive_if_required()
         self._replies.head = None
         self.scope, self.headers = scope, scope["headers"]
         self.cycle = cycle = EarlyEnd(
@@ -205,26 +210,12 @@ class TimedProtocol(HttpToolsProtocol):
 
     def on_response_complete(self) -> None:
         """Give a client that is still sending a moment to take its reply, and close."""
-        self._idle_since = self.loop.time()
-        if self.timeout_keep_alive_task is not None and not self.transport.is_closing():
-            self.server_state.total_requests += 1  # of a head that came again; the timer goes on
-            return
         super().on_response_complete()
         cycle: Any = self.cycle
         if cycle.response_complete and cycle.ends_early and not self.transport.is_closing():
             self._unset_keepalive_if_required()
             self._stop()
             self.loop.call_soon(self._linger)  # the reply may be held until the end of this turn (`joined_writes.py`)
-
-    def timeout_keep_alive_handler(self) -> None:
-        """Close a connection that has been idle for so long."""
-        left = self._idle_since + self.timeout_keep_alive - self.loop.time()
-        if left > 0 or not self.cycle.response_complete:
-            self.timeout_keep_alive_task = self.loop.call_later(
-                max(left, CHECK_PERIOD_S), self.timeout_keep_alive_handler
-            )
-        else:
-            super().timeout_keep_alive_handler()
 
     def _linger(self) -> None:
         if not self.transport.is_closing():

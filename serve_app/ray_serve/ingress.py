@@ -19,11 +19,12 @@ imported by Serve's proxies as well, so it imports little.
 from __future__ import annotations
 
 import asyncio
-import functools
-from typing import Any, Protocol
+import os
+from typing import Any, Protocol, cast
 
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from rlservo.serve_app.ray_serve import closed_endpoints, http_connections, loopback_binding
 from rlservo.serve_app.server.access_checks import mend_headers
@@ -38,6 +39,7 @@ NOT_FOUND = (
     (b"content-type", b"application/json"),
     (b"content-length", b"%d" % len(closed_endpoints.NOTHING)),
 )
+FOUND = "rlservo.found"  # in a scope: the application and the route
 NO_WATCH = (b"x-request-disconnect-disabled", b"?1")
 
 
@@ -87,8 +89,22 @@ def find_immediate(scope: Scope) -> ASGIApp | None:
     found = bypass.find(scope)
     if found is None or not bypass.answers:
         return None
-    app, match = found
-    return functools.partial(app.answer_ahead, match) if app.admit_ahead() else refuse_unread
+    if not found[0].admit_ahead():
+        return refuse_unread
+    scope[FOUND] = found
+    return _answer_forwarded
+
+
+async def _answer_found(scope: Scope, receive: Receive, send: Send) -> None:
+    app, match = scope.pop(FOUND)
+    await app.answer_ahead(match, scope, receive, send)
+
+
+# uvicorn has one around its application, which is passed by here: behind HAProxy it tells who asked.
+_answer_forwarded = cast(
+    "ASGIApp",
+    ProxyHeadersMiddleware(cast("Any", _answer_found), os.environ.get("FORWARDED_ALLOW_IPS", "127.0.0.1,::1")),
+)
 
 
 async def refuse_unread(_scope: Scope, _receive: Receive, send: Send) -> None:

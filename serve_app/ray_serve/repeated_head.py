@@ -40,9 +40,11 @@ class RepeatedHead(NamedTuple):
         matches = list(VALUES.finditer(data, 0, end - 2))
         found = [(match[1].lower(), match[2]) for match in matches]
         odd = not OTHERWISE.isdisjoint(name for name, value in headers if (name, value.lower()) != KEPT)
-        if odd or names.count(LENGTH) != 1 or scope["http_version"] != "1.1":
+        if odd or scope["http_version"] != "1.1":
             return None
         if found != [header for header in headers if header[0] in VARYING]:
+            return None
+        if len(dict(found)) != len(found) or LENGTH not in dict(found):  # twice the same would be at one place
             return None
         starts = [match.start(2) for match in matches] + [end]
         ends = [0] + [match.end(2) for match in matches]

@@ -49,7 +49,6 @@ METHODS: dict[type, tuple[str, ...]] = {
     HttpToolsProtocol: (
         *("_should_upgrade", "_start_asgi_task", "_unset_keepalive_if_required", "handle_websocket_upgrade"),
         *("on_message_begin", "on_headers_complete", "on_message_complete", "on_response_complete", "shutdown"),
-        "timeout_keep_alive_handler",
     ),
     RequestResponseCycle: ("run_asgi", "send"),
     WebSocketsSansIOProtocol: ("handle_cont", "handle_ping", "handle_pong", "receive", "send", "stop_keepalive"),
@@ -60,7 +59,7 @@ METHODS: dict[type, tuple[str, ...]] = {
 FIELDS: dict[type, tuple[str, ...]] = {
     HttpToolsProtocol: (
         *("access_log", "access_logger", "app", "config", "cycle", "flow", "headers", "logger", "loop", "parser"),
-        *("scope", "server_state", "tasks", "timeout_keep_alive", "timeout_keep_alive_task", "transport"),
+        *("scope", "server_state", "tasks", "timeout_keep_alive_task", "transport"),
         "ws_protocol_class",
     ),
     RequestResponseCycle: (

@@ -18,7 +18,12 @@ MESSAGES = {
     "Tensor": ("string name = 8",),
     "Node": ("repeated string input = 1", "repeated string output = 2", "repeated Attribute attribute = 5"),
     "Attribute": ("Graph g = 6", "repeated Graph graphs = 11"),
-    "Graph": ("repeated Node node = 1", "repeated Tensor initializer = 5", "repeated Name output = 12"),
+    "Graph": (
+        "repeated Node node = 1",
+        "repeated Tensor initializer = 5",
+        "repeated Name input = 11",
+        "repeated Name output = 12",
+    ),
     "Model": ("Graph graph = 7",),
 }
 
@@ -37,7 +42,9 @@ def without_value(model: bytes) -> bytes:
         return False
 
     _drop(graph.node, is_for_nothing)
-    _drop(graph.initializer, lambda tensor: tensor.name not in needed)
+    dropped = {tensor.name for tensor in graph.initializer} - needed
+    for tensors in (graph.initializer, graph.input):  # an initializer may be listed as an input that has a default
+        _drop(tensors, lambda tensor: tensor.name in dropped)
     serialized: bytes = message.SerializeToString()
     return serialized
 

@@ -27,6 +27,7 @@ from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
 SMALL = 128  # elements up to which Python's own sum is faster than numpy's isfinite(...).all()
 NUMBERS = frozenset({float, int, bool})  # what `struct` reads as the number that it is
+LARGE = 2.0**53  # beyond it an integer is none that a float has, and numpy says which it takes
 PACKED = {"float32": "f", "float64": "d"}
 
 
@@ -88,12 +89,13 @@ class LeafParser:
         """Return (array, its numbers) of a list of finite numbers; None for all else, which is for `_read`."""
         if self._packer is None or not NUMBERS.issuperset(map(type, obs)):
             return None
+        array: NDArray[Any] = np.empty(self._one, self._dtype)
         try:
-            array = np.frombuffer(self._packer.pack(*obs), self._dtype).reshape(self._one)
+            self._packer.pack_into(array.data, 0, *obs)
         except (struct.error, OverflowError):  # more or fewer, or larger than a float can be
             return None
         values: list[float] = array.ravel().tolist()
-        return (array, values) if math.isfinite(sum(values)) else None
+        return (array, values) if sum(map(abs, values)) < LARGE else None
 
     def _read(self, obs: Any) -> tuple[NDArray[Any], list[float] | None, bool]:
         """Return (array, its numbers where they are few, whether `obs` was a batch), checked but for its bounds."""

@@ -280,6 +280,14 @@ def test_a_message_beyond_the_limit_is_refused_compressed_or_not(live_server: An
             assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
 
 
+def test_a_call_for_another_of_serves_applications_is_refused(live_server: Any) -> None:
+    with grpc.insecure_channel(f"127.0.0.1:{live_server.grpc_port}") as channel:
+        stub = channel.unary_unary("/inference.GRPCInferenceService/ServerLive")
+        with pytest.raises(grpc.RpcError) as caught:
+            stub(b"", metadata=(("application", "another"),), timeout=20)
+        assert caught.value.code() is grpc.StatusCode.NOT_FOUND and "another" in (caught.value.details() or "")
+
+
 def test_a_request_id_comes_back(live_server: Any) -> None:
     with grpc.insecure_channel(f"127.0.0.1:{live_server.grpc_port}") as channel:
         stub = channel.unary_unary("/inference.GRPCInferenceService/ServerLive")

@@ -26,8 +26,8 @@ from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve import direct_port, direct_server, http_connections
 from rlservo.serve_app.ray_serve.direct_server import DirectServer
+from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 from rlservo.serve_app.ray_serve.ports import free_ports
-from rlservo.serve_app.ray_serve.repeated_head import RepeatedHead
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
@@ -328,15 +328,14 @@ def test_a_head_that_comes_again_is_answered_as_the_first(
 ) -> None:
     """It is not parsed again; whatever the body holds, the reply is that to a connection's first request."""
     start()
-    repeated: list[object] = []
-    read = RepeatedHead.read
+    repeated: list[bytes] = []
+    repeat = TimedProtocol._repeat
 
-    def counted(self: RepeatedHead, data: bytes) -> Any:
-        found = read(self, data)
-        repeated.extend([found] if found else [])
-        return found
+    def counted(self: TimedProtocol, scope: Any, body: bytes) -> bool:
+        repeated.append(body)
+        return repeat(self, scope, body)
 
-    monkeypatch.setattr(RepeatedHead, "read", counted)
+    monkeypatch.setattr(TimedProtocol, "_repeat", counted)
     with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=SOON_S)) as connection:
         for body in BODIES * 2:
             found, expected = ask_on(connection, body=body), ask(port, body=body)
@@ -344,10 +343,9 @@ def test_a_head_that_comes_again_is_answered_as_the_first(
                 document.pop("infer_ms", None)
                 document.get("details", {}).pop("elapsed_ms", None)
             assert found == expected
-        before = len(repeated)
         assert ask_on(connection, authorization="Bearer no")[0] == 401
         assert ask_on(connection)[0] == 200
-        assert before >= 2 * len(BODIES) and len(repeated) - before <= 2
+    assert repeated == (BODIES * 2)[2:]
 
 
 def test_a_key_is_checked_at_every_request(port: int, tmp_path: Path, ur5: Path) -> None:

@@ -195,6 +195,39 @@ def test_keys_are_asked_for_without_serve_as_well(ur5: Path) -> None:
     run(scenario)
 
 
+@pytest.mark.parametrize(
+    ("asked_by", "forwarded", "peer"),
+    [
+        ("127.0.0.1", (b"203.0.113.9",), "203.0.113.9"),
+        ("127.0.0.1", (b"10.1.1.1", b"203.0.113.9"), "203.0.113.9"),  # the first is the client's own claim
+        ("127.0.0.1", (), "127.0.0.1"),
+        ("192.0.2.7", (b"203.0.113.9",), "192.0.2.7"),
+    ],
+)
+def test_who_was_refused_behind_the_proxy_is_logged(
+    ur5: Path, asked_by: str, forwarded: tuple[bytes, ...], peer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = store_of(load_policy(ur5))
+    app = create_app(lambda: store, ServerSettings(api_keys=new_key("robot")[1]))
+    peers: list[str | None] = []
+
+    async def scenario() -> None:
+        await opened(app)
+        monkeypatch.setattr(app._core, "record_failure", lambda *_, peer: peers.append(peer))
+        headers = tuple((b"x-forwarded-for", each) for each in forwarded)
+
+        async def at_once(scope: Scope, receive: Receive, send: Send) -> None:
+            scope["client"] = (asked_by, 4711)
+            answer = ingress_module.find_immediate(scope)
+            assert answer is not None
+            await answer(scope, receive, send)
+
+        assert (await ask(at_once, headers=headers))[0] == 401
+
+    run(scenario)
+    assert peers == [peer]
+
+
 def test_a_bug_outside_what_the_application_guards_is_logged_with_the_requests_id(
     app: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

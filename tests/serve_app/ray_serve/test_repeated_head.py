@@ -98,6 +98,7 @@ def test_anything_else_is_for_the_parser(other: bytes) -> None:
     "data",
     [
         request(lines=(*LINES, b"Content-Length: 13")),
+        request(lines=(*LINES, STAMPED)),
         request(lines=(*LINES, b"Expect: 100-continue")),
         request(lines=(*LINES, b"Connection: close")),
         request(lines=(*LINES, b"Connection: Upgrade", b"Upgrade: websocket")),

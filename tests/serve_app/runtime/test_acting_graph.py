@@ -48,6 +48,8 @@ def model() -> Any:
     graph = helper.make_graph(nodes, "policy", [obs], outputs, [*floats, condition])
     made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
     made.metadata_props.add(key="kept", value="yes")
+    for name in ("own", "weights"):  # as older exporters list them: inputs with a default
+        made.graph.input.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, np.shape(values[name])))
     onnx.checker.check_model(made)
     return made
 
@@ -57,6 +59,7 @@ def test_only_what_the_value_alone_needs_is_left_out() -> None:
     rest = onnx.load_from_string(without_value(whole.SerializeToString()))
     onnx.checker.check_model(rest)
     assert [output.name for output in rest.graph.output] == ["action"]
+    assert [tensor.name for tensor in rest.graph.input] == ["obs", "weights"]
     assert [node.op_type for node in rest.graph.node] == ["MatMul", "If", "Clip"]
     assert {tensor.name for tensor in rest.graph.initializer} == {"one", "two", "weights", "upper", "condition"}
     assert rest.metadata_props == whole.metadata_props and rest.opset_import == whole.opset_import

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import random
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -16,6 +17,7 @@ from rlservo.export.contract.bundle import read_contract
 from rlservo.export.contract.errors import ActionError, ObservationError, UsageError
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.runtime.leaf_observations import LeafParser
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
@@ -159,9 +161,32 @@ def test_a_served_policy_has_its_options_and_says_what_they_did(
         assert "state" not in alone
 
 
-def test_integer_boxes_of_their_dtypes_own_range_need_no_look() -> None:
-    from rlservo.serve_app.runtime.leaf_observations import LeafParser
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_lists_of_numbers_become_what_numpy_makes_of_them(dtype: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = LeafParser("p", BoxSpec(shape=(3,), dtype=dtype, low=None, high=None))
+    general = LeafParser("p", BoxSpec(shape=(3,), dtype=dtype, low=None, high=None))
+    monkeypatch.setattr(general, "_packer", None)
+    large = [2**24 + 1, 2**53 + 1, 2**60 + 2**36 + 1, -(2**63), 2**64, 2**70, 10**400]
+    floats = [0.1, -0.0, 1e-45, 1e-310, 3.4028235e38, 3.4028236e38, 1e39, 1e308, float("nan"), float("inf")]
+    others = [True, False, 0, -3, None, "1", [1.0], 1j, np.float32(0.1), np.int64(7)]
+    draw, taken = random.Random(0), 0
+    for _ in range(4000):
+        obs = draw.choices(
+            [0.5, 7, *draw.sample(large + floats, 2), draw.choice(others)], k=draw.choice((2, 3, 3, 3, 3))
+        )
+        results = []
+        for parser in (quick, general):
+            try:
+                array, batch, notice = parser.parse(obs)
+                results.append((array.tobytes(), array.shape, array.dtype, array.flags.writeable, batch, notice))
+            except ObservationError as error:
+                results.append((error.message, error.details))
+        assert repr(results[0]) == repr(results[1]), obs
+        taken += quick._pack(obs) is not None
+    assert taken > 500
 
+
+def test_integer_boxes_of_their_dtypes_own_range_need_no_look() -> None:
     image = LeafParser("p", BoxSpec(shape=(4, 4), dtype="uint8", low=0, high=255))
     assert not image._bounded
     narrow = LeafParser("p", BoxSpec(shape=(2,), dtype="int64", low=-5, high=200), options=PolicyOptions())

@@ -1,0 +1,220 @@
+"""Connections on which heads come again: whatever bytes come, the replies are those of one that parses every head."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import random
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import uvicorn
+from uvicorn.server import ServerState
+
+from rlservo.serve_app.protocols.http_endpoint import REPLY
+from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
+from rlservo.serve_app.ray_serve.repeated_head import RepeatedHead
+
+IDLE_S = 60
+OUTSIDE = b"by another way"
+
+
+class Transport(asyncio.Transport):
+    """A connection's bytes, in memory."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.written = b""
+        self.is_closed = False
+
+    def write(self, data: Any) -> None:
+        self.written += data
+
+    def is_closing(self) -> bool:
+        return self.is_closed
+
+    def close(self) -> None:
+        self.is_closed = True
+
+    def write_eof(self) -> None:
+        self.written += b"<end>"
+
+    def pause_reading(self) -> None: ...
+    def resume_reading(self) -> None: ...
+
+
+async def tell(scope: Any, receive: Any, send: Any) -> None:
+    """Reply with the request; wait first or leave the body where its path says so."""
+    body = b""
+    if scope["path"] == "/wait":
+        await asyncio.sleep(0)
+    if scope["path"] != "/unread":
+        body = (await receive())["body"]
+    headers = [[name.decode("latin-1"), value.decode("latin-1")] for name, value in scope["headers"]]
+    told = json.dumps([scope["path"], scope["query_string"].decode(), headers, body.decode("latin-1")]).encode()
+    lines = [(b"content-length", b"%d" % len(told))]
+    if REPLY in scope and scope[REPLY](200, lines, told):
+        return
+    await send({"type": "http.response.start", "status": 200, "headers": lines})
+    await send({"type": "http.response.body", "body": told})
+
+
+async def outside(scope: Any, receive: Any, send: Any) -> None:
+    """What answers requests that nothing answers at once; at /early before the body has come."""
+    while scope["path"] != "/early" and (await receive()).get("more_body"):
+        pass
+    await send({"type": "http.response.start", "status": 404, "headers": [(b"content-length", b"%d" % len(OUTSIDE))]})
+    await send({"type": "http.response.body", "body": OUTSIDE})
+
+
+def request(body: bytes, path: str = "/act", *lines: str, method: str = "POST") -> bytes:
+    head = (f"{method} {path} HTTP/1.1", "host: robot", *lines, f"content-length: {len(body)}", "", "")
+    return "\r\n".join(head).encode() + body
+
+
+def replies(pieces: list[bytes], turns: list[int], *, then: Callable[[TimedProtocol], None] | None = None) -> bytes:
+    """What a connection writes when these pieces are read, each with so many turns of the event loop after it."""
+
+    async def run() -> bytes:
+        config = uvicorn.Config(outside, lifespan="off", log_level="critical", timeout_keep_alive=IDLE_S)
+        config.load()
+        transport = Transport()
+        protocol = TimedProtocol(config, ServerState(), {}, asyncio.get_running_loop())
+        protocol.connection_made(transport)
+        for piece, count in zip(pieces, turns, strict=True):
+            if transport.is_closed:
+                break
+            protocol.data_received(piece)
+            for _ in range(count):
+                await asyncio.sleep(0)
+        for _ in range(50):
+            await asyncio.sleep(0)
+        if then is not None:
+            then(protocol)
+        written = transport.written + (b"<closed>" if transport.is_closed else b"")
+        protocol.connection_lost(None)
+        return written
+
+    return asyncio.run(run())
+
+
+@pytest.fixture(autouse=True)
+def repeated(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """The bodies that were answered without parsing their heads."""
+    found: list[bytes] = []
+    repeat = TimedProtocol._repeat
+
+    def counted(self: TimedProtocol, scope: Any, body: bytes) -> bool:
+        found.append(body)
+        return repeat(self, scope, body)
+
+    monkeypatch.setattr(TimedProtocol, "_repeat", counted)
+    monkeypatch.setattr(
+        TimedProtocol, "find", staticmethod(lambda scope: None if scope["path"] in ("/other", "/early") else tell)
+    )
+    return found
+
+
+def parsed(monkeypatch: pytest.MonkeyPatch, pieces: list[bytes], turns: list[int]) -> bytes:
+    """What is written where every head is parsed."""
+    with monkeypatch.context() as patch:
+        patch.setattr(RepeatedHead, "learn", lambda *_: None)
+        return replies(pieces, turns)
+
+
+def test_the_third_request_is_not_parsed_again(repeated: list[bytes]) -> None:
+    written = replies([request(b"%d" % number) for number in range(5)], [1] * 5)
+    assert written.count(b"200 OK") == 5 and repeated == [b"2", b"3", b"4"]
+
+
+def test_requests_sent_ahead_are_all_answered(repeated: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    pieces = [request(b"1"), request(b"2"), request(b"3"), request(b"4") * 4, request(b"5"), request(b"6")]
+    written = replies(pieces, [3] * 6)
+    assert written.count(b"200 OK") == 6 and written.count(OUTSIDE) == 3 and repeated == [b"3", b"6"]
+    assert written == parsed(monkeypatch, pieces, [3] * 6)
+
+
+@pytest.mark.parametrize(
+    "begun", ["POST /other HTTP/1.1\r\nx-pad: ", "POST /other HTTP/1.1\r\ncontent-length: 60\r\n\r\n"]
+)
+def test_a_request_inside_another_is_no_request(
+    begun: str, repeated: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A proxy takes these bytes for one request's: what they look like must not be answered as another's."""
+    pieces = [request(b"1"), request(b"2"), request(b"3") + begun.encode(), request(b"inside")]
+    written = replies(pieces, [3] * 4)
+    assert repeated == [] and b"inside" not in written
+    assert written == parsed(monkeypatch, pieces, [3] * 4)
+
+
+def test_nor_is_one_inside_a_body_that_was_not_waited_for(
+    repeated: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pieces = [request(b"1"), request(b"2"), request(b"x" * 200, "/early")[:-150], request(b"inside"), request(b"4")]
+    written = replies(pieces, [3] * 5)
+    assert repeated == [] and b"inside" not in written and OUTSIDE in written
+    assert written == parsed(monkeypatch, pieces, [3] * 5)
+
+
+def test_a_reply_that_ends_the_connection_ends_it(repeated: list[bytes]) -> None:
+    pieces = [request(b"1"), request(b"2"), request(b"3"), request(b"4", "/act", "connection: close"), request(b"5")]
+    written = replies(pieces, [1] * 5)
+    assert repeated == [b"3"] and written.endswith(b"<closed>") and written.count(b"200 OK") == 4
+    assert b"connection: close" in written
+
+
+def test_an_idle_connection_has_one_timer_and_a_lost_one_none(repeated: list[bytes]) -> None:
+    timers: list[Any] = []
+
+    def look(protocol: TimedProtocol) -> None:
+        timers.append(protocol.timeout_keep_alive_task)
+        left = protocol.timeout_keep_alive_task.when() - protocol.loop.time()  # type: ignore[union-attr]
+        assert IDLE_S - 5 < left <= IDLE_S
+
+    replies([request(b"1")] * 6, [1] * 6, then=look)
+    assert len(repeated) == 4 and timers[0].cancelled()
+
+
+def test_it_is_not_idle_while_a_request_is_answered(repeated: list[bytes]) -> None:
+    def ask(protocol: TimedProtocol) -> None:
+        assert protocol.timeout_keep_alive_task is not None
+        protocol.data_received(request(b"1", "/wait"))
+        assert protocol.timeout_keep_alive_task is None
+
+    replies([request(b"1", "/wait")] * 3, [5] * 3, then=ask)
+    assert len(repeated) == 2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_replies_are_the_same_however_bytes_come(
+    seed: int, repeated: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draw = random.Random(seed)
+    usual = [lambda: request(draw.randbytes(draw.randrange(30)))] * 40
+    unusual: list[Callable[[], bytes]] = [
+        lambda: request(b"a", "/wait"),
+        lambda: request(b"b", "/unread"),
+        lambda: request(b"c", "/other"),
+        lambda: request(b"early", "/early"),
+        lambda: request(b"d", "/act?q=1", "x-more: yes"),
+        lambda: request(request(b"inside"), "/other"),
+        lambda: request(b"", "/act", method="GET"),
+        lambda: (
+            request(b"e", "/act", "transfer-encoding: chunked").replace(b"content-length: 1\r\n", b"")[:-1]
+            + b"3\r\nabc\r\n0\r\n\r\n"
+        ),
+        lambda: b"\r\n",
+        lambda: request(b"f", "/act", "connection: close") if draw.random() < 0.1 else b"",
+        lambda: request(b"g").replace(b"1\r\n\r\n", b"99\r\n\r\n") if draw.random() < 0.1 else b"",
+        lambda: b"\x00" if draw.random() < 0.1 else b"",
+    ]
+    for _ in range(150):
+        pieces: list[bytes] = []
+        for _ in range(draw.randrange(4, 20)):
+            piece = b"".join(draw.choice(usual + unusual)() for _ in range(draw.choice((1,) * 9 + (2, 3))))
+            at = draw.randrange(len(piece) + 1) if draw.random() < 0.2 else len(piece)
+            pieces += [part for part in (piece[:at], piece[at:]) if part]
+        turns = draw.choices((0, 1, 4), k=len(pieces))
+        assert replies(pieces, turns) == parsed(monkeypatch, pieces, turns), (pieces, turns)
+    assert len(repeated) > 100
