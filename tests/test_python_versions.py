@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from cache import cached
+from environments import find_python
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("envs", "export", "serve_app", "deploy", "examples")
@@ -58,12 +58,8 @@ def test_every_source_is_in_the_oldest_pythons_grammar() -> None:
 
 
 def interpreter(minor: str) -> str:
-    """Return a Python 3.`minor` that starts, or skip: a version manager has names for ones that are switched off."""
-    names = [shutil.which(f"python3.{minor}"), *sorted(Path.home().glob(f".pyenv/versions/3.{minor}.*/bin/python3"))]
-    for name in filter(None, names):
-        if subprocess.run([str(name), "-c", ""], capture_output=True, timeout=60).returncode == 0:
-            return str(name)
-    pytest.skip(f"there is no Python 3.{minor} here")
+    """Return a Python 3.`minor` that starts, or skip."""
+    return find_python(minor) or pytest.skip(f"there is no Python 3.{minor} here")
 
 
 def requirements(*extras: str) -> list[str]:
