@@ -137,9 +137,11 @@ def client_environment() -> Callable[..., Path]:
 def robo_gym_python() -> Path:
     """Return the Python of an environment with robo-gym, and without Ray, MuJoCo and rlservo.
 
-    robo-gym pins a protobuf that Ray cannot use, and of which Python 3.10 is the last to have it compiled: without
-    that, reading a laser's 500 numbers a step is a third of its client's time. Where the environment cannot be built (no network, say) these tests
-    skip with the reason, unless RLSERVO_REQUIRE_ROBO_GYM is set, as it is in CI.
+    robo-gym pins a protobuf that Ray cannot use. Python 3.10, where there is one, is the last to have that compiled:
+    otherwise a client spends a third of its time reading a laser's 500 numbers a step.
+
+    Where the environment cannot be built (no network, say) these tests skip with the reason, unless
+    RLSERVO_REQUIRE_ROBO_GYM is set, as it is in CI.
     """
     try:
         return virtual_environment(*ROBO_GYM, *CLIENT, python=find_python("10") or sys.executable)
