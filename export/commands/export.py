@@ -105,8 +105,8 @@ def export_checkpoint(
     `checkpoint` is what `locate_checkpoint` takes, or a URI of such a folder. `name` defaults to the environment's (of
     several policies with the module's behind it), `version` to the next integer after the newest one present.
     `app_dir` holds the user's own classes, if the checkpoint needs any. `value` False leaves the value head out, which
-    costs a third of a small policy's time. `notify` gets one sentence for each thing a person should know (by default
-    they are logged), `progress` what is being done.
+    other servers compute for each action, too: a third of a small policy's time. `notify` gets one sentence for each
+    thing a person should know (by default they are logged), `progress` what is being done.
 
     Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
     cannot be exported, ParityError when the graph does not give RLlib's own actions. Nothing is left behind then.

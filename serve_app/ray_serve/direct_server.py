@@ -222,12 +222,7 @@ class DirectApp:
 
     def find_immediate(self, scope: Scope) -> ASGIApp | None:
         """Return what answers a request for an action, if it is one."""
-        match = self._app.find_direct(scope, scope["path"])
-        if match is None:
-            return None
-        if not self._app.admit_ahead():
-            return ingress.refuse_unread
-        return functools.partial(self._app.answer_found, match)
+        return None if self._app.find_direct(scope, scope["path"]) is None else self
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one connection or request."""

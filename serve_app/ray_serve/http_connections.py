@@ -217,6 +217,11 @@ class TimedProtocol(HttpToolsProtocol):
             self._stop()
             self.loop.call_soon(self._linger)  # the reply may be held until the end of this turn (`joined_writes.py`)
 
+    def shutdown(self) -> None:
+        """End the connection when what is being answered is written."""
+        turn.flush()  # a reply that is held counts as written
+        super().shutdown()
+
     def _linger(self) -> None:
         if not self.transport.is_closing():
             self.transport.write_eof()

@@ -39,7 +39,6 @@ NOT_FOUND = (
     (b"content-type", b"application/json"),
     (b"content-length", b"%d" % len(closed_endpoints.NOTHING)),
 )
-FOUND = "rlservo.found"  # in a scope: the application and the route
 NO_WATCH = (b"x-request-disconnect-disabled", b"?1")
 
 
@@ -89,15 +88,17 @@ def find_immediate(scope: Scope) -> ASGIApp | None:
     found = bypass.find(scope)
     if found is None or not bypass.answers:
         return None
-    if not found[0].admit_ahead():
-        return refuse_unread
-    scope[FOUND] = found
     return _answer_forwarded
 
 
 async def _answer_found(scope: Scope, receive: Receive, send: Send) -> None:
-    app, match = scope.pop(FOUND)
-    await app.answer_ahead(match, scope, receive, send)
+    found = bypass.find(scope)
+    assert found is not None
+    app, match = found
+    if app.admit_ahead():
+        await app.answer_ahead(match, scope, receive, send)
+    else:
+        await turn_away(send)
 
 
 # uvicorn has one around its application, which is passed by here: behind HAProxy it tells who asked.
@@ -105,11 +106,6 @@ _answer_forwarded = cast(
     "ASGIApp",
     ProxyHeadersMiddleware(cast("Any", _answer_found), os.environ.get("FORWARDED_ALLOW_IPS", "127.0.0.1,::1")),
 )
-
-
-async def refuse_unread(_scope: Scope, _receive: Receive, send: Send) -> None:
-    """Answer a request that nothing is read of."""
-    await turn_away(send)
 
 
 class Ingress:

@@ -33,15 +33,15 @@ def without_value(model: bytes) -> bytes:
     message = build_messages("rlservo.onnx", MESSAGES)["Model"].FromString(model)
     graph = message.graph
     _drop(graph.output, lambda output: output.name == VALUE)
-    needed = {output.name for output in graph.output}
-
-    def is_for_nothing(node: Any) -> bool:
-        if needed.isdisjoint(node.output):
-            return True
-        needed.update(name for name in _inputs(node) if name)
-        return False
-
-    _drop(graph.node, is_for_nothing)
+    makers = {name: node for node in graph.node for name in node.output}
+    needed: set[str] = set()
+    waiting = [output.name for output in graph.output]
+    while waiting:
+        name = waiting.pop()
+        if name and name not in needed:
+            needed.add(name)
+            waiting += _inputs(makers[name]) if name in makers else ()
+    _drop(graph.node, lambda node: needed.isdisjoint(node.output))
     dropped = {tensor.name for tensor in graph.initializer} - needed
     for tensors in (graph.initializer, graph.input):  # an initializer may be listed as an input that has a default
         _drop(tensors, lambda tensor: tensor.name in dropped)
@@ -60,7 +60,7 @@ def _inputs(node: Any) -> Iterator[str]:
 
 
 def _drop(field: Any, is_to_go: Callable[[Any], bool]) -> None:
-    """Delete messages of a repeated field; the last is asked about first: what a node takes was computed before it."""
+    """Delete messages of a repeated field."""
     for index in reversed(range(len(field))):
         if is_to_go(field[index]):
             del field[index]

@@ -35,6 +35,7 @@ from rlservo.serve_app.runtime.loading import (
     check_golden_vectors,
     check_graph,
     check_rows,
+    leaves_value_out,
     open_graph,
 )
 from rlservo.serve_app.runtime.network_memory import DroppableNetwork, NetworkMemory
@@ -186,7 +187,8 @@ class Policy(Closeable):
         outputs = [tensor.name for tensor in bundle.contract.outputs]
         if check_golden:
             check_golden_vectors(bundle, ort_session.run, outputs)
-        if VALUE in outputs:
+        if leaves_value_out(bundle):
+            del ort_session  # or both would be in memory
             ort_session = open_graph(bundle, threads, acts_only=True)
             if check_golden:
                 check_golden_vectors(bundle, ort_session.run, acting_outputs(bundle.contract))
@@ -319,13 +321,14 @@ class Policy(Closeable):
     def value(self, obs: Observation) -> NDArray[Any] | None:
         """Return the critic's value of each observation `[batch]`; None where the graph has none, or remembers.
 
-        The first call opens the whole graph, of which acting needs a part. Raises what `parse` and `load` raise.
+        The first call opens the whole graph, of which acting may need a part. Raises what `parse` and `load` raise.
         """
         if self.is_stateful or all(tensor.name != VALUE for tensor in self._contract.outputs):
             return None
         if self._run_whole is None:
-            self._open()
-            self._run_whole = open_graph(self._bundle, 1).run
+            run = open_graph(self._bundle, 1).run
+            self._open()  # unless it has been closed
+            self._run_whole = run
         feed, _, _ = self._observations.parse(obs)
         if {tensor.name for tensor in self._contract.inputs} != set(feed):
             return None  # it also sees rewards

@@ -13,6 +13,7 @@ import uvicorn
 from uvicorn.server import ServerState
 
 from rlservo.serve_app.protocols.http_endpoint import REPLY
+from rlservo.serve_app.ray_serve import ingress
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 from rlservo.serve_app.ray_serve.repeated_head import RepeatedHead
 
@@ -73,11 +74,13 @@ def request(body: bytes, path: str = "/act", *lines: str, method: str = "POST") 
     return "\r\n".join(head).encode() + body
 
 
-def replies(pieces: list[bytes], turns: list[int], *, then: Callable[[TimedProtocol], None] | None = None) -> bytes:
+def replies(
+    pieces: list[bytes], turns: list[int], *, app: Any = outside, then: Callable[[TimedProtocol], None] | None = None
+) -> bytes:
     """What a connection writes when these pieces are read, each with so many turns of the event loop after it."""
 
     async def run() -> bytes:
-        config = uvicorn.Config(outside, lifespan="off", log_level="critical", timeout_keep_alive=IDLE_S)
+        config = uvicorn.Config(app, lifespan="off", log_level="critical", timeout_keep_alive=IDLE_S)
         config.load()
         transport = Transport()
         protocol = TimedProtocol(config, ServerState(), {}, asyncio.get_running_loop())
@@ -184,6 +187,57 @@ def test_it_is_not_idle_while_a_request_is_answered(repeated: list[bytes]) -> No
 
     replies([request(b"1", "/wait")] * 3, [5] * 3, then=ask)
     assert len(repeated) == 2
+
+
+@pytest.mark.parametrize("cut", [0, 3])
+def test_a_request_that_is_turned_away_is_counted_once(cut: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where its body comes later than its head."""
+    turned: list[str] = []
+
+    class Full:
+        def find_ahead(self, scope: Any) -> Any:
+            return scope["path"]
+
+        def admit_ahead(self) -> bool:
+            turned.append("away")
+            return False
+
+        async def answer_ahead(self, match: Any, scope: Any, receive: Any, send: Any) -> None:
+            raise AssertionError
+
+    class Bypass(ingress.ServeBypass):
+        def find(self, scope: Any) -> Any:
+            return Full(), scope["path"]
+
+    monkeypatch.setattr(ingress, "bypass", Bypass())
+    ingress.bypass.answers = True
+    monkeypatch.setattr(TimedProtocol, "find", staticmethod(ingress.find_immediate))
+    content = request(b"body")
+    pieces = [content[: len(content) - cut], content[len(content) - cut :]]
+    written = replies(pieces, [3, 3], app=ingress.Ingress(outside))
+    assert written.count(b" 503 ") == 1 and turned == ["away"]
+
+
+def test_a_reply_that_is_held_is_written_before_the_server_stops() -> None:
+    """Under load replies wait for the end of the turn; the requests have been answered, sessions have moved."""
+
+    async def run() -> list[int]:
+        config = uvicorn.Config(outside, lifespan="off", log_level="critical")
+        config.load()
+        connections = []
+        for _ in range(3):
+            connections.append((TimedProtocol(config, ServerState(), {}, asyncio.get_running_loop()), Transport()))
+            connections[-1][0].connection_made(connections[-1][1])
+        for _ in range(2):  # the second turn holds: the one before had several
+            await asyncio.sleep(0)
+            for protocol, _ in connections:
+                protocol.data_received(request(b"1"))
+        for protocol, _ in connections:
+            protocol.shutdown()
+            protocol.connection_lost(None)
+        return [transport.written.count(b"200 OK") for _, transport in connections]
+
+    assert asyncio.run(run()) == [2, 2, 2]
 
 
 @pytest.mark.parametrize("seed", range(8))

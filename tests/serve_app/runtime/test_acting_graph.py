@@ -14,6 +14,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.runtime import loading
 from rlservo.serve_app.runtime.acting_graph import without_value
 from rlservo.serve_app.runtime.policy import Policy
 
@@ -68,6 +69,27 @@ def test_only_what_the_value_alone_needs_is_left_out() -> None:
         onnxruntime.InferenceSession(each.SerializeToString()).run(["action"], feed)[0] for each in (whole, rest)
     ]
     assert np.array_equal(*actions) and actions[0].tolist() == [[0.25, 1.0]]
+
+
+def test_nodes_may_come_in_any_order() -> None:
+    whole = model()
+    sorted_rest = onnx.load_from_string(without_value(whole.SerializeToString()))
+    nodes = list(whole.graph.node)[::-1]
+    del whole.graph.node[:]
+    whole.graph.node.extend(nodes)
+    rest = onnx.load_from_string(without_value(whole.SerializeToString()))
+    assert list(rest.graph.node) == list(sorted_rest.graph.node)[::-1]
+
+
+@pytest.mark.trained
+def test_a_large_graph_is_opened_as_it_is(exported: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Making it anew holds the interpreter's lock, in which nobody acts."""
+    folder = exported(SHIPPED).path
+    monkeypatch.setattr(loading, "LARGEST_MADE", 1000)
+    policy = Policy.load(folder)
+    assert policy.value(np.zeros(27)) is not None
+    assert isinstance(policy._ort_session, onnxruntime.InferenceSession)
+    assert "value" in {output.name for output in policy._ort_session.get_outputs()}
 
 
 @pytest.mark.trained
