@@ -50,6 +50,10 @@ class LoadError(Exception):
     """A server that answered something else than asked for."""
 
 
+class RefusedError(LoadError):
+    """A server that says it has too much to do."""
+
+
 class ClosedError(LoadError):
     """A server that closed a kept connection."""
 

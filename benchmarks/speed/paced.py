@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from speed.loads import INFER, Load, LoadError, WebSocketLine, infer_request
+from speed.loads import INFER, Load, LoadError, RefusedError, WebSocketLine, infer_request
 from speed.servers import Exchange
 
 SETTLE_S = 1.0  # before answers count
@@ -66,6 +66,8 @@ def http_robot(port: int, exchange: Exchange, due: float) -> Robot:
         head, ended, body = held.partition(b"\r\n\r\n")
         if not ended:
             return False
+        if head.startswith(b"HTTP/1.1 503"):
+            raise RefusedError("the server has too much to do")
         if not head.startswith(b"HTTP/1.1 200"):
             raise LoadError(f"the server answered {held[:300]!r}")
         length = int(head.lower().partition(b"content-length:")[2].partition(b"\r")[0])
