@@ -193,11 +193,10 @@ def carried(server: Server, rate_hz: float, seconds: float) -> tuple[int, float]
         before = cpu_by_role(server.members())
         try:
             load = paced(make, robots=robots, rate_hz=rate_hz, seconds=seconds)
-            is_in_time = load.p999_ms is not None and load.p999_ms <= 250 / rate_hz
         except RefusedError:
-            is_in_time = False
+            load = None
         after = cpu_by_role(server.members())
-        if is_in_time:
+        if load is not None and load.p999_ms is not None and load.p999_ms <= 250 / rate_hz:
             most = robots
             cores = sum(after[role] - before[role] for role in after) / (load.seconds + SETTLE_S)
             robots = 2 * robots if least_bad > MOST_ROBOTS else (robots + least_bad) // 2

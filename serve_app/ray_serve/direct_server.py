@@ -4,8 +4,8 @@ It has the application, its checks and limits, and the connections of the replic
 (`http_connections.py`). What HAProxy does for those is done here: connections are bounded, altogether and by address,
 and a request that waited for a replica to take its connection says since when.
 
-Connections are taken one in a turn of the event loop. Several replicas take from one queue (`direct_port.py`), and the
-one with less to do comes round sooner: that is how they share the load.
+Connections are taken one in a turn of the event loop, or a few where many are open. Several replicas take from one
+queue (`direct_port.py`), and the one with less to do comes round sooner: that is how they share the load.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
 logger = logging.getLogger(__name__)
 
 BACKLOG = 4096
+SHARE = 8  # for so many open connections, one more is taken in a turn
 MAX_CONNECTIONS = 4096  # beyond it, they wait in the kernel
 OVER = 32  # connections of an address beyond its bound that are answered 429; further ones are closed without a word
 KEEP_ALIVE_S = 90.0  # [s] that a connection may be idle, as on the replica's other port
@@ -110,12 +111,18 @@ class DirectServer:
     def _listen(self) -> None:
         if not self._is_listening and not self.is_draining:
             self._is_listening = True
-            self._loop.add_reader(self._listener, self._take)
+            self._loop.add_reader(self._listener, self._take_some)
 
     def _pause(self) -> None:
         if self._is_listening:
             self._is_listening = False
             self._loop.remove_reader(self._listener)
+
+    def _take_some(self) -> None:
+        """Take a connection; with many open, whose requests make a turn long, some more."""
+        for _ in range(1 + self._total // SHARE):
+            if not self._take() or not self._is_listening:
+                return
 
     def _take(self) -> bool:
         """Take one connection, if there is one."""

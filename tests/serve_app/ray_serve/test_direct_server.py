@@ -265,6 +265,28 @@ def test_the_connections_of_an_address_are_bounded_and_counted_until_they_end(
     until(lambda: accepted(port))
 
 
+@pytest.mark.parametrize(("already_open", "taken"), [(0, 1), (7, 1), (32, 5)])
+def test_a_few_connections_are_taken_in_a_turn_where_many_are_open(
+    app: Any, port: int, already_open: int, taken: int
+) -> None:
+    """One by one, the last of 64 that open at once would wait for 64 turns, each as long as what is open."""
+
+    async def run() -> int:
+        listener, _ = direct_port.open_port("127.0.0.1", port)
+        server = DirectServer(app, listener, SETTINGS)
+        server.start()
+        with contextlib.ExitStack() as stack:
+            for _ in range(10):
+                stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=SOON_S))
+            server._total = already_open
+            server._take_some()
+            now_open = server._total
+            await server.drain()
+        return now_open - already_open
+
+    assert asyncio.run(run()) == taken
+
+
 def accepted(port: int) -> bool:
     with contextlib.suppress(ConnectionError, http.client.HTTPException):
         return ask(port)[0] == 200
