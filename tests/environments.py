@@ -25,6 +25,7 @@ ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")
 # What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and
 # pip would settle that with an old robo-gym-server-modules that has no pin and does not work.
 CLIENT = ("httpcore>=1.0.6", "pydantic>=2.6")
+INSTALLED_S = 500
 
 
 @pytest.fixture(scope="session")
@@ -100,24 +101,35 @@ def find_python(minor: str) -> str | None:
     return None
 
 
-def virtual_environment(*packages: str, python: str = sys.executable) -> Path:
+def virtual_environment(*packages: str | Path, python: str = sys.executable, name: str = "") -> Path:
     """Return the Python of an environment with these packages, which cannot share ours; made once and kept.
 
-    Raises RuntimeError where pip cannot install them.
+    `packages` is what pip installs, its options and their files included; `name` is for the cache's folder, by default
+    the first package's. Raises RuntimeError where pip cannot install them.
     """
 
     def make(folder: Path) -> None:
-        subprocess.run([python, "-m", "venv", str(folder)], check=True, timeout=500)
-        # What a test imports is compiled then, and kept; all that there is takes a third of the processor's time.
-        install = [str(folder / "bin" / "python"), "-m", "pip", "install", "-q", "--no-compile", *packages]
-        done = subprocess.run(install, capture_output=True, text=True, timeout=500)
-        if done.returncode != 0:
-            raise RuntimeError(f"{', '.join(packages)} cannot be installed here: {done.stderr.strip()[-500:]}")
+        for command in (
+            # Our own pip installs: one in each environment takes longer to unpack than most packages.
+            [python, "-m", "venv", "--without-pip", str(folder)],
+            [*install_into(folder / "bin" / "python"), *map(str, packages)],
+        ):
+            done = subprocess.run(command, capture_output=True, text=True, timeout=INSTALLED_S)
+            if done.returncode != 0:
+                named = " ".join(map(str, packages))
+                raise RuntimeError(f"{named} cannot be installed here: {done.stderr.strip()[-500:]}")
 
-    name = re.match(r"[\w-]+", packages[0])
-    assert name is not None
     said = subprocess.run([python, "-VV"], capture_output=True, text=True, timeout=60).stdout
-    return cached(f"{name[0]}-environment", [*packages, said], make) / "bin" / "python"
+    name = name or re.split(r"[^\w-]", str(packages[0]))[0]
+    return cached(f"{name}-environment", [*packages, said], make) / "bin" / "python"
+
+
+def install_into(python: Path) -> list[str]:
+    """Return the beginning of a command with which our pip installs for another Python.
+
+    What a test imports is compiled then, and kept; compiling all that there is takes a third of the processor's time.
+    """
+    return [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-compile"]
 
 
 @pytest.fixture(scope="session")

@@ -6,19 +6,16 @@ import ast
 import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from cache import cached
-from environments import find_python
+from environments import find_python, virtual_environment
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("envs", "export", "serve_app", "deploy", "examples")
 OLDEST = (3, 10)
 CLASSIFIER = re.compile(r'"Programming Language :: Python :: 3\.(\d+)"')
-INSTALLED_S = 400
 SERVING = ("client", "serve", "sim", "record", "remote", "cockpit")  # what unit tests need of the extras
 TEST_TOOLS = ("pytest", "uvicorn", "httpx", "pyyaml", "jsonschema", "playwright", "moto")
 
@@ -70,22 +67,12 @@ def requirements(*extras: str) -> list[str]:
     return [line for line in named if not line.startswith("rlservo[")]
 
 
-def environment_of(minor: str, *options: str) -> Path:
+def environment_of(minor: str, *options: str | Path) -> Path:
     """Return the Python of an environment of Python 3.`minor`, or skip where there is none or pip cannot install."""
-    named = interpreter(minor)
-
-    def install(folder: Path) -> None:
-        for command in (
-            [named, "-m", "venv", "--without-pip", str(folder)],
-            [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet",
-             "--no-compile", *options],  # what is imported is compiled then
-        ):  # fmt: skip
-            done = subprocess.run(command, capture_output=True, text=True, timeout=INSTALLED_S)
-            if done.returncode != 0:
-                pytest.skip(f"Python 3.{minor} cannot have the requirements: {done.stderr.strip()[-300:]}")
-
-    said = subprocess.run([named, "-VV"], capture_output=True, text=True, timeout=60).stdout
-    return cached(f"python3.{minor}", [said, *options], install) / "bin" / "python"
+    try:
+        return virtual_environment(*options, python=interpreter(minor), name=f"python3.{minor}")
+    except RuntimeError as error:
+        pytest.skip(str(error))
 
 
 def linked_package(folder: Path) -> Path:
@@ -118,7 +105,7 @@ def test_unit_tests_pass_on_the_newest_python(tmp_path: Path) -> None:
     minor = max(CLASSIFIER.findall(project()), key=int)
     tools = [line for line in requirements("dev") if line.startswith(TEST_TOOLS)]
     needed = [*requirements(*SERVING), "onnx", "matplotlib", *tools]
-    python = environment_of(minor, "-c", str(ROOT / "constraints.txt"), *needed)
+    python = environment_of(minor, "-c", ROOT / "constraints.txt", *needed)
     path = linked_package(tmp_path)
     (path / "rlservo.pth").symlink_to(ROOT / "envs" / "rlservo-gymnasium.pth")
     (path / "sitecustomize.py").write_text(f"import site\nsite.addsitedir({str(path)!r})\n")

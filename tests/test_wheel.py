@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import venv
 import zipfile
 from pathlib import Path
 
 import pytest
 
-from cache import PYTHON, cached
+from environments import virtual_environment
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("envs", "export", "serve_app", "deploy")
@@ -40,29 +39,14 @@ def test_metadata_installs_no_developers_tools_and_has_no_placeholder(wheel: Pat
     assert "<this repository>" not in readme
 
 
-def pip(environment: Path) -> list[str]:
-    return [sys.executable, "-m", "pip", "--python", str(environment / "bin" / "python")]
-
-
 @pytest.mark.slow
 def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -> None:
-    constraints = ROOT / "constraints.txt"
-
-    def install(folder: Path) -> None:
-        venv.create(folder)
-        done = subprocess.run(
-            [*pip(folder), "install", "-q", "--no-compile", "-c", str(constraints), str(wheel)],
-            capture_output=True, text=True, timeout=500,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-
-    environment = cached("wheel-environment", [wheel.parent.name, constraints, PYTHON], install)
-    python = environment / "bin" / "python"
+    python = virtual_environment("-c", ROOT / "constraints.txt", wheel, name="wheel")
 
     def run(*command: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
 
-    listed = run(*pip(environment), "list", "--format=freeze").stdout.lower()
+    listed = run(sys.executable, "-m", "pip", "--python", str(python), "list", "--format=freeze").stdout.lower()
     assert "\nonnxruntime==" in f"\n{listed}"
     for heavy in ("torch", "ray", "gymnasium", "mujoco", "fastapi", "onnx"):
         assert f"\n{heavy}==" not in f"\n{listed}"
@@ -75,7 +59,7 @@ def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -
     program = "import sys; print(*sorted(name for name in sys.modules if 'rlservo' in name), 'typing' in sys.modules)"
     started = run(str(python), "-c", program)
     assert started.stdout.split() == ["rlservo", "rlservo.envs", "rlservo.envs.discovery", "False"]
-    rlservo = str(environment / "bin" / "rlservo")
+    rlservo = str(python.with_name("rlservo"))
     assert run(rlservo, "--version").stdout.startswith("rlservo ")
     refused = run(rlservo, "serve", ".")
     assert refused.returncode == 2

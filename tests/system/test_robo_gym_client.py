@@ -25,6 +25,7 @@ import pytest
 
 from bundles import SHIPPED
 from cockpits import cockpit_of, wait_for
+from environments import install_into
 from rlservo.envs.robot_server.manager import RobotServers, ServerManager
 from rlservo.envs.robot_server.server import RobotServer
 from rlservo.envs.robot_server.settings import URSettings
@@ -58,7 +59,7 @@ def url(shipped_server: ShippedServer) -> str:
 def light_client(robo_gym_python: Path, wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """rlservo as `pip install --no-deps .` puts it into robo-gym's environment; in a folder of its own."""
     installed = tmp_path_factory.mktemp("installed")
-    install = [str(robo_gym_python), "-m", "pip", "install", "-q", "--no-deps", "--target", str(installed), str(wheel)]
+    install = [*install_into(robo_gym_python), "--no-deps", "--target", str(installed), str(wheel)]
     done = subprocess.run(install, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return installed
