@@ -63,12 +63,17 @@ TOGETHER = {
     "tests/examples/test_training_scripts.py": "one Ray",
 }
 
-# What takes longest begins first: nobody waits for it in the end. The files with slow tests follow, then the rest.
+# What takes longest begins first, and what mostly waits early, beside what computes: nobody waits for it in the end. The
+# files with slow tests follow, then the rest.
 LONGEST = (
-    "one Ray", "cluster", "live server", "shipped server", "tests/deploy/cockpit/test_page.py",
-    "tests/system/test_demo.py", "tests/examples/test_on_a_cluster.py", "tests/system/test_serving_starts.py",
-    "ports of server managers", "tests/serve_app/versions/test_remote_repository.py",
-    "tests/export/rllib/test_new_stack.py", "sweep", "several nodes",
+    "live server", "one Ray", "cluster", "shipped server", "tests/test_python_versions.py",
+    "tests/serve_app/versions/test_remote_repository.py", "ports of server managers",
+    "tests/deploy/cockpit/test_page.py", "tests/examples/test_on_a_cluster.py", "tests/system/test_demo.py",
+    "tests/system/test_serving_starts.py", "tests/serve_app/ray_serve/test_haproxy_wrapper.py", "sweep",
+    "tests/system/test_serving_replicas.py", "tests/export/rllib/test_new_stack.py", "several nodes",
+    "tests/serve_app/client/test_bad_line.py", "tests/deploy/test_compose_server.py",
+    "tests/serve_app/ray_serve/test_http_connections.py", "tests/system/test_faults.py",
+    "tests/system/test_remote_repository.py", "tests/serve_app/ray_serve/test_direct_server.py",
     # of `make quick`
     "tests/serve_app/protocols/test_access.py", "tests/serve_app/recording/test_recorder.py",
     "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_api_key_file.py",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import operator
 import os
 import re
 import shutil
@@ -623,12 +624,15 @@ def test_servers_on_ports_next_to_each_other_have_replicas_on_others(
     assert min(taken) >= 30_000 and max(taken) < 32_768  # where Linux begins with outgoing connections
 
 
-def ask_in_threads(node: Node, seconds: float, clients: int = 4) -> tuple[int, list[str], list[str]]:
-    """Ask without end, once more at once when that failed; return (answers, failed first tries, failed second ones)."""
+def ask_in_threads(node: Node, seconds: float, turns: list[int]) -> tuple[int, list[str], list[str]]:
+    """Ask without end, once more at once when that failed; return (answers, failed first tries, failed second ones).
+
+    `turns` has an entry for each client: how many of its requests have ended, the second tries included.
+    """
     answered, first, second = 0, list[str](), list[str]()
     stop = time.monotonic() + seconds
 
-    def client() -> None:
+    def client(number: int) -> None:
         nonlocal answered
         while time.monotonic() < stop:
             for failures in (first, second):
@@ -637,9 +641,10 @@ def ask_in_threads(node: Node, seconds: float, clients: int = 4) -> tuple[int, l
                     answered += 1
                     break
                 failures.append(f"{status} {said}")
+            turns[number] += 1
             time.sleep(0.005)
 
-    threads = [threading.Thread(target=client) for _ in range(clients)]
+    threads = [threading.Thread(target=client, args=(number,)) for number in range(len(turns))]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -650,20 +655,24 @@ def ask_in_threads(node: Node, seconds: float, clients: int = 4) -> tuple[int, l
 def test_every_immediate_retry_is_served_while_haproxies_and_bridges_are_killed(node: Node) -> None:
     node.proxy(FULL)
     until(lambda: node.ask()[0] == 200)
-    kills = 0
+    kills, turns, ended = 0, [0] * 4, threading.Event()
 
     def kill() -> None:
         nonlocal kills
         while kills < 12:
             until(lambda: node.proxies() or node.bridges())
+            before = list(turns)
             for pid in (*node.proxies(), *node.bridges()):
                 os.kill(pid, signal.SIGKILL)
                 kills += 1
+            # A retry is for one kill: what this one meets has been asked again, and answered, before the next.
+            until(lambda before=before: ended.is_set() or all(map(operator.gt, turns, before)))
             time.sleep(0.3)
 
     killer = threading.Thread(target=kill)
     killer.start()
-    answered, first, second = ask_in_threads(node, 6.0)
+    answered, first, second = ask_in_threads(node, 6.0, turns)
+    ended.set()
     killer.join()
     assert kills >= 12 and second == [] and answered > 50
     assert not any(failure.endswith("ConnectionRefusedError") for failure in first)
@@ -738,7 +747,7 @@ def test_a_replica_that_hangs_is_left_and_its_requests_are_answered_by_another_o
     with socket.create_server(("127.0.0.1", node.stats), backlog=64):  # it takes what it is sent, and no more
         node.proxy(hung)
         until(lambda: node.ask()[0] in (200, 503))
-        answered, first, _ = ask_in_threads(node, 3.0)
+        answered, first, _ = ask_in_threads(node, 3.0, [0] * 4)
     assert answered > 20 and first == []
 
 
