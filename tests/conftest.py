@@ -63,8 +63,8 @@ TOGETHER = {
     "tests/examples/test_training_scripts.py": "one Ray",
 }
 
-# What takes longest begins first, and what mostly waits early, beside what computes: nobody waits for it in the end. The
-# files with slow tests follow, then the rest.
+# What takes longest begins first, and what mostly waits early, beside what computes: nobody waits for it in the end.
+# The files with slow tests follow, then the rest.
 LONGEST = (
     "live server", "one Ray", "cluster", "shipped server", "tests/test_python_versions.py",
     "tests/serve_app/versions/test_remote_repository.py", "ports of server managers",
