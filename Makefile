@@ -53,7 +53,7 @@ setup: $(STAMP)  ## Only the set-up
 $(STAMP): pyproject.toml constraints.txt setup.py envs/rlservo-gymnasium.pth
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet -c constraints.txt --upgrade pip  # Debian's resolves for ten minutes and more
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[all,dev]'
+	$(BIN)/python -m pip install -qq -c constraints.txt -e '.[all,dev]'  # errors alone: no page of setuptools' warnings
 	touch $(STAMP)
 
 clean:  ## Remove what the other targets made, .venv included
