@@ -47,31 +47,30 @@ def wheel() -> Path:
     return next(cached("wheel", [*made_of, versions("build")], build).glob("*.whl"))
 
 
-@pytest.fixture(scope="session")
-def image_environment(wheel: Path) -> Path:
+@pytest.fixture
+def image_environment(wheel: Path, tmp_path: Path) -> Path:
     """The virtual environment of deploy/Dockerfile: the wheel and what its extra `serve` requires, nothing else.
 
-    Linked to the packages that are installed here, file by file, so that it costs no download.
+    Linked to the packages that are installed here, file by file, so that it costs no download. Made anew each time, in
+    a second: one that is kept may outlive the packages that it links to.
     """
-
-    def make(folder: Path) -> None:
-        venv.create(folder)
-        site = folder / "lib" / PYTHON / "site-packages"
-        with zipfile.ZipFile(next(wheel.parent.glob("*.whl"))) as archive:
-            archive.extractall(site)
-        for distribution in _required("rlservo", {"serve"}):
-            own = distribution.name == "rlservo"  # its files are the wheel's
-            for file in () if own else distribution.files or ():
-                if ".." not in file.parts and "__pycache__" not in file.parts and not (site / file).exists():
-                    (site / file).parent.mkdir(parents=True, exist_ok=True)
-                    (site / file).symlink_to(distribution.locate_file(file).absolute())
-            for point in distribution.entry_points.select(group="console_scripts"):
-                script = folder / "bin" / point.name
-                program = f"import sys\nfrom {point.module} import {point.attr}\nsys.exit({point.attr}())\n"
-                script.write_text(f"#!{folder / 'bin' / 'python'}\n{program}")
-                script.chmod(0o755)
-
-    return cached("image-environment", [wheel.parent.name, ROOT / "constraints.txt", Path(__file__), PYTHON], make)
+    folder = tmp_path / "environment"
+    venv.create(folder)
+    site = folder / "lib" / PYTHON / "site-packages"
+    with zipfile.ZipFile(next(wheel.parent.glob("*.whl"))) as archive:
+        archive.extractall(site)
+    for distribution in _required("rlservo", {"serve"}):
+        own = distribution.name == "rlservo"  # its files are the wheel's
+        for file in () if own else distribution.files or ():
+            if ".." not in file.parts and "__pycache__" not in file.parts and not (site / file).exists():
+                (site / file).parent.mkdir(parents=True, exist_ok=True)
+                (site / file).symlink_to(distribution.locate_file(file).absolute())
+        for point in distribution.entry_points.select(group="console_scripts"):
+            script = folder / "bin" / point.name
+            program = f"import sys\nfrom {point.module} import {point.attr}\nsys.exit({point.attr}())\n"
+            script.write_text(f"#!{folder / 'bin' / 'python'}\n{program}")
+            script.chmod(0o755)
+    return folder
 
 
 def _required(name: str, extras: set[str]) -> list[metadata.Distribution]:
