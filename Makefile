@@ -17,8 +17,8 @@ NOT_UNITS := $(addprefix --ignore=tests/serve_app/, ray_serve/test_haproxy_wrapp
 demo: setup  ## Export the two shipped checkpoints, serve them, drive both simulators; a table and a picture in demo/
 	$(BIN)/rlservo demo --out demo
 
-test: setup  ## All tests, in three processes: on two cores one of them often waits
-	$(BIN)/python -m pytest -n 3
+test: setup  ## All tests, in four processes: on two cores two of them often wait
+	$(BIN)/python -m pytest -n 4
 
 quick: setup  ## Unit tests, in a minute on two cores that nothing else uses
 	$(BIN)/python -m pytest -n 4 -m "not slow and not serve and not trained and not browser" $(NOT_UNITS) $(UNITS)

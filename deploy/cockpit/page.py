@@ -24,7 +24,7 @@ from rlservo.export.contract.errors import UsageError
 HOST = "127.0.0.1"
 FRAME_S = 1 / 30
 NEARER = 0.62  # tan(45 / 2) / tan(75 / 2), about: MuJoCo's angle of view to viser's
-NARROW = 0.75  # of a window's width to its height, below which it is a phone's
+NARROW = 0.6  # width to height, below which a scene is a phone's; one beside a desktop's panel may be narrow as well
 FARTHER, SHEET = 1.7, 0.6  # what a phone's camera makes of that: distance, and height of the middle above the window's
 PANEL_S = 0.5  # between two refreshes of numbers and plots: drawn in software, one costs as much as a frame
 # Pages that may talk to the cockpit: its own, also through a forwarded port. Programs send no Origin.
@@ -64,9 +64,7 @@ def served_page(port: int, title: str) -> Iterator[viser.ViserServer]:
         server.scene.configure_environment_map(None)
         server.scene.add_light_hemisphere("/sky", ground_color=(190, 190, 190), intensity=1.5)
         server.gui.main_panel.dock_right()
-        server.on_client_connect(
-            lambda client: _aim(client.camera, server.initial_camera.position, server.initial_camera.look_at)
-        )
+        server.on_client_connect(partial(_keep_aimed, server.initial_camera))
         yield server
     finally:
         with _silence():
@@ -102,15 +100,31 @@ def aim_cameras(server: viser.ViserServer, position: Vector, look_at: Vector) ->
         _aim(client.camera, position, look_at)
 
 
+def _keep_aimed(initial: Any, client: viser.ClientHandle) -> None:
+    """Aim a new client's camera, a phone's also when the page, later, puts it where a desktop's begins."""
+
+    def aim_again(camera: viser.CameraHandle) -> None:
+        if np.allclose(camera.position, initial.position, atol=1e-3):
+            _aim(camera, initial.position, initial.look_at)
+
+    if _is_phone(client.camera):
+        client.camera.on_update(aim_again)
+    _aim(client.camera, initial.position, initial.look_at)
+
+
 def _aim(camera: viser.CameraHandle, position: Vector, look_at: Vector) -> None:
     """Aim a camera; on a phone so that its target is above the sheet with the panels, which covers three fifths."""
-    if camera.image_width < NARROW * camera.image_height:
+    if _is_phone(camera):
         way = FARTHER * (look_at - position)
         ahead = way / np.linalg.norm(way)
         up = np.array([0.0, 0.0, 1.0]) - ahead[2] * ahead
         down = SHEET * np.tan(camera.fov / 2) * np.linalg.norm(way) * up / np.linalg.norm(up)
         position, look_at = look_at - way - down, look_at - down
     camera.position, camera.look_at = position, look_at
+
+
+def _is_phone(camera: viser.CameraHandle) -> bool:
+    return camera.image_width < NARROW * camera.image_height
 
 
 def _check_port(port: int) -> None:
