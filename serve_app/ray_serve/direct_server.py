@@ -211,9 +211,9 @@ class DirectConnection(TimedProtocol):
         if self.cycle is not None and not self.cycle.response_complete:
             self.cycle.keep_alive = False
 
-    def find_immediate(self, scope: Scope) -> ASGIApp | None:
-        """Return what answers a request for an action, if it is one; while draining, replies end their connection."""
-        return None if self._server.is_draining else self._server.app.find_immediate(scope)
+    def is_immediate(self, scope: Scope) -> bool:
+        """Whether it is a request for an action; while draining, none is: replies end their connection."""
+        return not self._server.is_draining and self._server.app.is_immediate(scope)
 
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
         if self._server.is_draining:
@@ -227,9 +227,9 @@ class DirectApp:
     def __init__(self, app: PolicyApp) -> None:
         self._app = app
 
-    def find_immediate(self, scope: Scope) -> ASGIApp | None:
-        """Return what answers a request for an action, if it is one."""
-        return None if self._app.find_direct(scope, scope["path"]) is None else self
+    def is_immediate(self, scope: Scope) -> bool:
+        """Whether it is a request for an action."""
+        return self._app.find_direct(scope, scope["path"]) is not None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one connection or request."""

@@ -91,7 +91,7 @@ class TimedProtocol(HttpToolsProtocol):
     """A connection that ends when one of its phases takes too long, and writes each reply at once."""
 
     body_s = BODY_S
-    find: Callable[[Scope], ASGIApp | None] = staticmethod(lambda _: None)
+    is_request_immediate: Callable[[Scope], bool] = staticmethod(lambda _: False)
     _head_since: float | None = None  # since when a head is awaited; None while something else is
     _body_since = 0.0  # since when the request's body is awaited
     _timer: asyncio.TimerHandle | None = None
@@ -100,7 +100,7 @@ class TimedProtocol(HttpToolsProtocol):
     _refuse: ASGIApp | None = None  # answers the next request instead of the application, and ends the connection
     _on_lost: Callable[[], None] | None = None
     _is_first = False  # of the requests that are being read: those after it let other connections have their turn
-    _awaited: tuple[Any, Any, ASGIApp] | None = None  # cycle, its application, what answers it at once when it is whole
+    _awaited: Any = None  # the cycle of a request that is answered at once when it is whole
     _known: RepeatedHead | None = None  # the head that is expected to come again
     _lessons = MOST_LESSONS
     _answered: Any = None  # the scope of the request that was answered at once in this read
@@ -138,9 +138,8 @@ class TimedProtocol(HttpToolsProtocol):
             self._lessons -= 1
             self._known = RepeatedHead.learn(data, self._answered)
         if self._awaited is not None:  # more of it is to come
-            cycle, app, _ = self._awaited
-            self._awaited = None
-            super()._start_asgi_task(cycle, app)
+            cycle, self._awaited = self._awaited, None
+            super()._start_asgi_task(cycle, self.app)
         if self._unread > MAX_HEAD_BYTES and self._head_since is not None and not self.transport.is_closing():
             self.transport.write(LARGE_REPLY)
             self.transport.close()
@@ -152,8 +151,7 @@ class TimedProtocol(HttpToolsProtocol):
 
     def _repeat(self, scope: Any, body: bytes) -> bool:
         """Answer a request whose head need not be parsed; return False where it is to take the ordinary way."""
-        at_once = self.find_immediate(scope)
-        if at_once is None:
+        if not self.is_immediate(scope):
             return False
         self._unset_keepalive_if_required()
         self._replies.head = None
@@ -172,7 +170,7 @@ class TimedProtocol(HttpToolsProtocol):
             on_response=self.on_response_complete,
         )
         cycle.more_body = False
-        self._answer(cycle, body, at_once)
+        self._answer(cycle, body)
         return True
 
     def handle_websocket_upgrade(self) -> None:
@@ -202,11 +200,10 @@ class TimedProtocol(HttpToolsProtocol):
         self._unread = 0
         super().on_message_complete()
         if self._awaited is not None:
-            cycle, _, at_once = self._awaited
-            self._awaited, self._is_first = None, False
+            cycle, self._awaited, self._is_first = self._awaited, None, False
             if self._lessons:
                 self._answered = {**cycle.scope}
-            self._answer(cycle, bytes(cycle.body), at_once)
+            self._answer(cycle, bytes(cycle.body))
 
     def on_response_complete(self) -> None:
         """Give a client that is still sending a moment to take its reply, and close."""
@@ -244,21 +241,18 @@ class TimedProtocol(HttpToolsProtocol):
         if cycle.scope["method"] == "POST":  # of a HEAD there would be no body for its head to wait for
             self._replies.head = None
             cycle.transport = self._replies
-            at_once = None
-            if cycle.more_body and self._is_first and app is self.app:
-                at_once = self.find_immediate(cycle.scope)
-            if at_once is not None:
-                self._awaited = (cycle, app, at_once)
+            if cycle.more_body and self._is_first and app is self.app and self.is_immediate(cycle.scope):
+                self._awaited = cycle
                 return
         super()._start_asgi_task(cycle, app)
 
-    def find_immediate(self, scope: Scope) -> ASGIApp | None:
-        """Return what answers a request without the application's middleware, if anything does."""
-        return self.find(scope)
+    def is_immediate(self, scope: Scope) -> bool:
+        """Whether the application answers a request, once it is whole, without waiting for anything."""
+        return self.is_request_immediate(scope)
 
-    def _answer(self, cycle: Any, body: bytes, at_once: ASGIApp) -> None:
+    def _answer(self, cycle: Any, body: bytes) -> None:
         def answer(scope: Scope, receive: Receive, send: Send) -> Any:
-            return at_once(scope, WholeBody(body, receive), send)
+            return self.app(scope, WholeBody(body, receive), send)
 
         # The cycle leads to its scope, and this back: left there, every request would be for the garbage collector.
         cycle.scope[REPLY] = functools.partial(self._reply, cycle)
@@ -337,13 +331,13 @@ def leave_time_for_bodies(seconds: float) -> None:
     TimedProtocol.body_s = max(BODY_S, seconds)
 
 
-def install(find_immediate: Callable[[Scope], ASGIApp | None]) -> None:
-    """Let uvicorn's servers of this process use it, with what finds the requests that are answered at once.
+def install(is_immediate: Callable[[Scope], bool]) -> None:
+    """Let uvicorn's servers of this process use it; `is_immediate` knows the requests that are answered at once.
 
     Raises RuntimeError for another uvicorn than is known here.
     """
     if auto.AutoHTTPProtocol is TimedProtocol:
         return
     uvicorn_parts.check()
-    TimedProtocol.find = staticmethod(find_immediate)
+    TimedProtocol.is_request_immediate = staticmethod(is_immediate)
     auto.AutoHTTPProtocol = TimedProtocol

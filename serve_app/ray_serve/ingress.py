@@ -19,12 +19,10 @@ imported by Serve's proxies as well, so it imports little.
 from __future__ import annotations
 
 import asyncio
-import os
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
-from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from rlservo.serve_app.ray_serve import closed_endpoints, http_connections, loopback_binding
 from rlservo.serve_app.server.access_checks import mend_headers
@@ -83,29 +81,9 @@ class ServeBypass:
 bypass = ServeBypass()
 
 
-def find_immediate(scope: Scope) -> ASGIApp | None:
-    """Return what answers an HTTP request as `Ingress` would have it answered, without waiting; None where that may."""
-    found = bypass.find(scope)
-    if found is None or not bypass.answers:
-        return None
-    return _answer_forwarded
-
-
-async def _answer_found(scope: Scope, receive: Receive, send: Send) -> None:
-    found = bypass.find(scope)
-    assert found is not None
-    app, match = found
-    if app.admit_ahead():
-        await app.answer_ahead(match, scope, receive, send)
-    else:
-        await turn_away(send)
-
-
-# uvicorn has one around its application, which is passed by here: behind HAProxy it tells who asked.
-_answer_forwarded = cast(
-    "ASGIApp",
-    ProxyHeadersMiddleware(cast("Any", _answer_found), os.environ.get("FORWARDED_ALLOW_IPS", "127.0.0.1,::1")),
-)
+def is_immediate(scope: Scope) -> bool:
+    """Whether `Ingress` has the application answer an HTTP request, and nothing that may wait."""
+    return bypass.answers and bypass.find(scope) is not None
 
 
 class Ingress:
@@ -144,7 +122,7 @@ async def turn_away(send: Send) -> None:
 
 def middlewares() -> list[Middleware]:
     """Return what Serve puts around each HTTP server it starts; it calls this before it binds the server's port."""
-    http_connections.install(find_immediate)
+    http_connections.install(is_immediate)
     closed_endpoints.install()
     if loopback_binding.is_wanted():
         loopback_binding.install()

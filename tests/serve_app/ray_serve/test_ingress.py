@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import uvicorn
 from starlette.types import Message, Receive, Scope, Send
 
 from rlservo.serve_app.protocols.asgi_app import create_app
@@ -212,15 +213,16 @@ def test_who_was_refused_behind_the_proxy_is_logged(
     peers: list[str | None] = []
 
     async def scenario() -> None:
-        await opened(app)
+        _, ingress = await opened(app)
         monkeypatch.setattr(app._core, "record_failure", lambda *_, peer: peers.append(peer))
+        server = uvicorn.Config(ingress, log_config=None)  # as Serve makes it: uvicorn reads who was forwarded
+        server.load()
         headers = tuple((b"x-forwarded-for", each) for each in forwarded)
 
         async def at_once(scope: Scope, receive: Receive, send: Send) -> None:
             scope["client"] = (asked_by, 4711)
-            answer = ingress_module.find_immediate(scope)
-            assert answer is not None
-            await answer(scope, receive, send)
+            assert ingress_module.is_immediate(scope)
+            await server.loaded_app(scope, receive, send)
 
         assert (await ask(at_once, headers=headers))[0] == 401
 

@@ -69,13 +69,18 @@ async def outside(scope: Any, receive: Any, send: Any) -> None:
     await send({"type": "http.response.body", "body": OUTSIDE})
 
 
+async def answer(scope: Any, receive: Any, send: Any) -> None:
+    """Tell what is answered at once from the rest."""
+    await (tell if REPLY in scope else outside)(scope, receive, send)
+
+
 def request(body: bytes, path: str = "/act", *lines: str, method: str = "POST") -> bytes:
     head = (f"{method} {path} HTTP/1.1", "host: robot", *lines, f"content-length: {len(body)}", "", "")
     return "\r\n".join(head).encode() + body
 
 
 def replies(
-    pieces: list[bytes], turns: list[int], *, app: Any = outside, then: Callable[[TimedProtocol], None] | None = None
+    pieces: list[bytes], turns: list[int], *, app: Any = answer, then: Callable[[TimedProtocol], None] | None = None
 ) -> bytes:
     """What a connection writes when these pieces are read, each with so many turns of the event loop after it."""
 
@@ -113,9 +118,8 @@ def repeated(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
         return repeat(self, scope, body)
 
     monkeypatch.setattr(TimedProtocol, "_repeat", counted)
-    monkeypatch.setattr(
-        TimedProtocol, "find", staticmethod(lambda scope: None if scope["path"] in ("/other", "/early") else tell)
-    )
+    is_immediate = staticmethod(lambda scope: scope["path"] not in ("/other", "/early"))
+    monkeypatch.setattr(TimedProtocol, "is_request_immediate", is_immediate)
     return found
 
 
@@ -211,7 +215,7 @@ def test_a_request_that_is_turned_away_is_counted_once(cut: int, monkeypatch: py
 
     monkeypatch.setattr(ingress, "bypass", Bypass())
     ingress.bypass.answers = True
-    monkeypatch.setattr(TimedProtocol, "find", staticmethod(ingress.find_immediate))
+    monkeypatch.setattr(TimedProtocol, "is_request_immediate", staticmethod(ingress.is_immediate))
     content = request(b"body")
     pieces = [content[: len(content) - cut], content[len(content) - cut :]]
     written = replies(pieces, [3, 3], app=ingress.Ingress(outside))
@@ -222,7 +226,7 @@ def test_a_reply_that_is_held_is_written_before_the_server_stops() -> None:
     """Under load replies wait for the end of the turn; the requests have been answered, sessions have moved."""
 
     async def run() -> list[int]:
-        config = uvicorn.Config(outside, lifespan="off", log_level="critical")
+        config = uvicorn.Config(answer, lifespan="off", log_level="critical")
         config.load()
         connections = []
         for _ in range(3):
