@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
@@ -58,13 +59,36 @@ def ends_like_ctrl_c() -> Iterator[None]:
     def interrupt(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt
 
+    with _ends_handled_by(interrupt):
+        yield
+
+
+@contextmanager
+def ctrl_c_sets(stop: threading.Event) -> Iterator[None]:
+    """Let Ctrl-C, SIGTERM and a closed terminal set `stop`; a second one interrupts. Only in the main thread.
+
+    An interrupt comes wherever the program happens to be: in a library it may be swallowed, or leave a lock held.
+    Nobody inside may wait for `stop` in this thread: to set it takes a lock that waiting holds for moments.
+    """
+
+    def set_or_interrupt(_number: int, _frame: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    with _ends_handled_by(set_or_interrupt):
+        yield
+
+
+@contextmanager
+def _ends_handled_by(handler: Callable[[int, object], None]) -> Iterator[None]:
     # SIGINT as well: a shell's background job starts with it ignored.
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, handler_before in before.items():
+            signal.signal(number, handler_before)
 
 
 def note(line: str) -> None:

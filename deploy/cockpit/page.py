@@ -75,7 +75,8 @@ def show(shown: Shown, stop: threading.Event) -> None:
     """Draw until `stop`. A frame that is late is left out."""
     frames: deque[float] = deque(maxlen=60)
     due = refresh_at = time.perf_counter()
-    while not stop.wait(max(0.0, due - time.perf_counter())):
+    while not stop.is_set():
+        time.sleep(max(0.0, due - time.perf_counter()))  # not `stop.wait`: a handler of this thread may set it
         now = time.perf_counter()
         due = max(due + FRAME_S, now)
         shown.draw()

@@ -16,6 +16,7 @@ from rlservo.deploy.cockpit.panel import DrivePanel
 from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
 from rlservo.deploy.cockpit.policies import Choice, PolicySource
 from rlservo.deploy.cockpit.watch import WatchPanel
+from rlservo.deploy.terminal import ctrl_c_sets
 from rlservo.export.contract.errors import UnknownPolicyError, UsageError
 from rlservo.serve_app.versions.plan import PRODUCTION
 
@@ -32,9 +33,8 @@ def run_drive(
     port: int,
     seed: int | None,
     on_ready: OnReady,
-    stop: threading.Event | None = None,
 ) -> None:
-    """Let a policy drive a robot on a page until `stop`, or an interrupt. Everything that was opened is closed."""
+    """Let a policy drive a robot on a page until Ctrl-C. Everything that was opened is closed."""
     with ExitStack() as cleanup:
         cleanup.callback(source.close)
         choice = _first_choice(source, policy, version)
@@ -44,7 +44,7 @@ def run_drive(
         panel = DrivePanel(server, drive, source)
         cleanup.callback(panel.close)
         drive.start()
-        _serve(server, panel, on_ready, stop)
+        _serve(server, panel, on_ready)
 
 
 def run_playback(
@@ -55,15 +55,14 @@ def run_playback(
     env_id: str | None,
     port: int,
     on_ready: OnReady,
-    stop: threading.Event | None = None,
 ) -> None:
-    """Show a recording on a page until `stop`, or an interrupt."""
+    """Show a recording on a page until Ctrl-C."""
     tape = Tape(recording, bundle=bundle, policy=policy)
     with ExitStack() as cleanup:
         server = cleanup.enter_context(served_page(port, f"rlservo cockpit: {recording.name}"))
         panel = PlaybackPanel(server, tape, env_id=env_id)
         cleanup.callback(panel.close)
-        _serve(server, panel, on_ready, stop)
+        _serve(server, panel, on_ready)
 
 
 def run_watch(
@@ -72,19 +71,20 @@ def run_watch(
     env_arguments: Mapping[str, Any],
     port: int,
     on_ready: OnReady,
-    stop: threading.Event | None = None,
 ) -> None:
-    """Show what a robot server's simulation does until `stop`, or an interrupt."""
+    """Show what a robot server's simulation does until Ctrl-C."""
     with ExitStack() as cleanup:
         server = cleanup.enter_context(served_page(port, f"rlservo cockpit: {address}"))
         panel = WatchPanel(server, address, env_arguments)
         cleanup.callback(panel.close)
-        _serve(server, panel, on_ready, stop)
+        _serve(server, panel, on_ready)
 
 
-def _serve(server: viser.ViserServer, panel: Shown, on_ready: OnReady, stop: threading.Event | None) -> None:
-    on_ready(f"http://{HOST}:{server.get_port()}")
-    show(panel, stop or threading.Event())
+def _serve(server: viser.ViserServer, panel: Shown, on_ready: OnReady) -> None:
+    stop = threading.Event()
+    with ctrl_c_sets(stop):
+        on_ready(f"http://{HOST}:{server.get_port()}")
+        show(panel, stop)
 
 
 def _first_choice(source: PolicySource, policy: str | None, version: str | None) -> Choice:

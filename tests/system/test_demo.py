@@ -37,7 +37,7 @@ def test_demo_serves_a_page_until_ctrl_c_then_reaches_the_targets_and_leaves_not
     pytest.importorskip("viser", reason="the cockpit draws with viser")
     out = tmp_path / "demo"
     (port,) = free_ports(1)
-    command = [sys.executable, "-m", "rlservo.deploy.cli", "demo", "--out", str(out)]
+    command = [sys.executable, "-X", "faulthandler", "-m", "rlservo.deploy.cli", "demo", "--out", str(out)]
     with running([*command, "--cockpit", "--port", str(port)], port) as run:
         assert run.process.stdout is not None
         said = [next((line for line in run.process.stdout if line.startswith("cockpit at ")), "nothing")]
@@ -45,7 +45,11 @@ def test_demo_serves_a_page_until_ctrl_c_then_reaches_the_targets_and_leaves_not
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=60) as reply:
             assert reply.status == 200
         run.process.send_signal(signal.SIGINT)
-        assert run.process.wait(120) == 0
+        try:
+            assert run.process.wait(120) == 0
+        except subprocess.TimeoutExpired:
+            run.process.send_signal(signal.SIGABRT)  # faulthandler writes where its threads are
+            pytest.fail(f"still there after two minutes: {run.process.stdout.read()}")
     assert processes_naming(str(out)) == []
     (out / "demo.png").write_bytes(b"of an earlier demo")
     done = subprocess.run([*command, "--episodes", "4"], capture_output=True, text=True, timeout=900, cwd=ROOT)
