@@ -42,7 +42,7 @@ def store(recurrent: Path, ur5: Path) -> PolicyStore:
 
 @pytest.fixture(scope="module")
 def port(store: PolicyStore, served: Serve) -> Iterator[int]:
-    with served(create_app(lambda: store, ServerSettings(session_idle_s=2.0, max_sessions=8))) as port:
+    with served(create_app(lambda: store, ServerSettings(session_idle_s=2.0))) as port:
         yield port
 
 
@@ -240,15 +240,17 @@ def test_an_idle_session_is_evicted_and_its_client_learns_of_it(ask: Ask) -> Non
     assert session(ask, first, reset=True)[1]["action"] == begun
 
 
-def test_sessions_are_bounded_in_number(ask: Ask) -> None:
+def test_sessions_are_bounded_in_number(store: PolicyStore, served: Serve) -> None:
     (obs,) = observations("lstm_box", 1)
     body = {"obs": plain(obs), "reset": True}
-    statuses = [ask("/v1/policies/lstm_box/act", {**body, "session_id": f"many-{n}"})[0] for n in range(9)]
-    assert statuses[-1] == 503 and set(statuses[:7]) == {200}
-    assert ask("/v1/policies/lstm_box/act", {**body, "session_id": "many-0"})[0] == 200  # it has its place already
-    for n in range(9):
-        ask("/v1/policies/lstm_box/act", {"obs": plain(obs), "session_id": f"many-{n}", "end": True})
-    assert ask("/v1/policies/lstm_box/act", {**body, "session_id": "many-8", "end": True})[0] == 200
+    with served(create_app(lambda: store, ServerSettings(max_sessions=8))) as port:
+        ask = asking(port)
+        statuses = [ask("/v1/policies/lstm_box/act", {**body, "session_id": f"many-{n}"})[0] for n in range(9)]
+        assert statuses == [200] * 8 + [503]
+        assert ask("/v1/policies/lstm_box/act", {**body, "session_id": "many-0"})[0] == 200  # it has its place already
+        for n in range(9):
+            ask("/v1/policies/lstm_box/act", {"obs": plain(obs), "session_id": f"many-{n}", "end": True})
+        assert ask("/v1/policies/lstm_box/act", {**body, "session_id": "many-8", "end": True})[0] == 200
 
 
 def test_a_request_sent_twice_moves_the_memory_once_and_an_older_one_is_refused(ask: Ask, recurrent: Path) -> None:
