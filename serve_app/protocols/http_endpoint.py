@@ -23,8 +23,14 @@ from starlette.types import Message, Receive, Scope, Send
 from rlservo.export.contract.errors import ForbiddenError, RateLimitError, RlservoError, UnknownPolicyError
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.direct_routes import PostRoute, StreamRoute
-from rlservo.serve_app.protocols.http_errors import Headers, error_answer, http_error, send_error, too_large
-from rlservo.serve_app.protocols.websocket_stream import refuse_upgrade
+from rlservo.serve_app.protocols.http_errors import (
+    Headers,
+    error_answer,
+    http_error,
+    refuse_upgrade,
+    send_error,
+    too_large,
+)
 from rlservo.serve_app.server.access_checks import (
     HEADERS,
     LABEL,

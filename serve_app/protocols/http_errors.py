@@ -1,4 +1,4 @@
-"""HTTP status and body of each error, the same for every HTTP protocol."""
+"""HTTP status and body of each error, the same for every HTTP protocol; how a WebSocket is told of one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from starlette.responses import Response
-from starlette.types import Scope, Send
+from starlette.types import Receive, Scope, Send
 
 from rlservo.export.contract.errors import (
     ActionError,
@@ -32,6 +32,9 @@ from rlservo.serve_app.protocols import json_messages
 from rlservo.serve_app.server.request_path import BUG
 
 logger = logging.getLogger(__name__)
+
+DENIAL = "websocket.http.response"  # the ASGI extension that answers an upgrade with an HTTP error
+FAILED = 1011  # the close code openpi's server uses for every error
 
 STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; whatever does not fit is our fault: 500
     (ObservationError, 422),
@@ -127,6 +130,27 @@ async def send_error(send: Send, error: RlservoError, *, kind: str = "http.respo
     every = [(b"content-length", b"%d" % len(content)), *own, *headers]
     await send({"type": f"{kind}.start", "status": status, "headers": every})
     await send({"type": f"{kind}.body", "body": content})
+
+
+async def refuse_upgrade(
+    scope: Scope, receive: Receive, send: Send, error: RlservoError, headers: Headers = ()
+) -> None:
+    """Answer an upgrade with an HTTP error; where the server cannot send one, accept it and fail in our own way."""
+    await receive()  # websocket.connect
+    if DENIAL in scope.get("extensions", {}):
+        await send_error(send, error, kind=DENIAL, headers=headers)
+        return
+    await send({"type": "websocket.accept"})
+    await fail_stream(send, error_answer(error)[1])
+
+
+async def fail_stream(send: Send, content: bytes) -> None:
+    """End an open WebSocket with an error's body."""
+    try:
+        await send({"type": "websocket.send", "text": content.decode()})
+        await send({"type": "websocket.close", "code": FAILED, "reason": "see the text frame"})
+    except (OSError, RuntimeError):  # the client has gone meanwhile: nobody is left to tell
+        logger.debug("a stream's client went before its error could be sent")
 
 
 def error_models(*statuses: int) -> dict[int | str, dict[str, Any]]:

@@ -1,21 +1,36 @@
-"""JSON: body of an act request to `Request`, decision to a reply's body."""
+"""JSON: body of an act request to `Request`, decision to a reply's body.
+
+Options, and what is said of the episode, are the same fields in MessagePack, and in the Open Inference Protocol's
+`parameters`.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import orjson
 from starlette.types import Receive
 
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError
-from rlservo.serve_app.episodes.request import REQUEST_FIELDS, Request, parse_episode, parse_options
+from rlservo.serve_app.episodes.request import (
+    EPISODE_FIELDS,
+    LONGEST_SESSION_ID,
+    MAX_SEED,
+    REQUEST_FIELDS,
+    Episode,
+    Request,
+)
 from rlservo.serve_app.protocols.http_endpoint import Body, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers
-from rlservo.serve_app.protocols.json_messages import parse_json
+from rlservo.serve_app.protocols.json_messages import json_type, parse_json
 from rlservo.serve_app.protocols.media_types import check_media_type
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
 from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
 SUCH_AS = '{"obs": [...]}'
 
@@ -62,6 +77,64 @@ class JsonCodec:
         if "state" in fields:
             fields["state"] = _plain(fields["state"])
         return orjson.dumps(fields, option=orjson.OPT_SERIALIZE_NUMPY), JSON_HEADERS
+
+
+def parse_options(request: Request, document: Mapping[str, Any]) -> None:
+    """Set the request's options. Raises RequestError."""
+    explore = document.get("explore")
+    if explore is not None and type(explore) is not bool:
+        raise RequestError(f"'explore' must be true or false, got {json_type(explore)}")
+    request.explore = bool(explore)
+    request.seed = seed = parse_integer(document, "seed")
+    if seed is not None and not 0 <= seed <= MAX_SEED:
+        raise RequestError(f"'seed' must be in 0..{MAX_SEED}, got {json_type(seed)}")
+    request.seq = parse_integer(document, "seq")
+    request.deadline_ms = parse_finite(document, "deadline_ms", "a number of milliseconds")
+    request.timestamp = parse_finite(document, "timestamp", "a number of seconds")
+
+
+def parse_episode(document: Mapping[str, Any]) -> Episode | None:
+    """Return what a request says of its episode; None when it says nothing. Raises RequestError."""
+    if EPISODE_FIELDS.isdisjoint(document):
+        return None
+    found = {name: document[name] for name in EPISODE_FIELDS if document.get(name) is not None}
+    if not found:
+        return None
+    if type(found.get("state", {})) is not dict:
+        raise RequestError(f"'state' must be an object, state names to numbers, got {json_type(found['state'])}")
+    session_id = found.get("session_id", "-")
+    if type(session_id) is not str or not 0 < len(session_id) <= LONGEST_SESSION_ID:
+        raise RequestError(f"'session_id' must be a string of 1 to {LONGEST_SESSION_ID} characters")
+    for name in ("reset", "end", "truncated"):
+        if type(found.get(name, False)) is not bool:
+            raise RequestError(f"'{name}' must be true or false, got {json_type(found[name])}")
+    status = found.get("final_status", "-")
+    if type(status) is not str or not 0 < len(status) <= LONGEST_STATUS:
+        raise RequestError(f"'final_status' must be a string of 1 to {LONGEST_STATUS} characters")
+    return Episode(**found)
+
+
+def parse_integer(document: Mapping[str, Any], name: str) -> int | None:
+    """Return an optional integer field. Raises RequestError when it is something else."""
+    value = document.get(name)
+    if value is None or type(value) is int:
+        return value
+    raise RequestError(f"'{name}' must be an integer, got {json_type(value)}")
+
+
+def parse_finite(
+    document: Mapping[str, Any], name: str, expected: str, *, kinds: tuple[type, ...] = (int, float)
+) -> float | None:
+    """Return an optional field as a float. Raises RequestError when it is something else, or no float can hold it."""
+    value = document.get(name)
+    if value is None:
+        return None
+    if type(value) in kinds:
+        with contextlib.suppress(OverflowError):  # JSON's integers have no end
+            number = float(value)
+            if math.isfinite(number):
+                return number
+    raise RequestError(f"'{name}' must be {expected}, got {json_type(value)}")
 
 
 def _check_fields(document: dict[str, Any]) -> None:

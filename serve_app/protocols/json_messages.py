@@ -14,7 +14,7 @@ import orjson
 from pydantic import BaseModel, ConfigDict, Field
 
 from rlservo.export.contract.errors import RequestError
-from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, MAX_SEED, json_type
+from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, MAX_SEED
 from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
 LONGEST_LENIENT_BODY = 1 << 20  # a larger body with NaN in it is refused without saying where the NaN is
@@ -119,6 +119,18 @@ def parse_json(body: bytes | bytearray | memoryview, *, such_as: str) -> tuple[d
     if type(document) is not dict:
         raise RequestError(f"the request body must be a JSON object such as {such_as}, got {json_type(document)}")
     return document, non_finite
+
+
+def json_type(value: Any) -> str:
+    """Say what a JSON value is, for an error's sentence."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    names: dict[type, str] = {str: "a string", list: "a list", dict: "an object"}
+    if type(value) not in (int, float, *names):  # msgpack brings other things than JSON
+        return f"a {type(value).__name__}"
+    return names.get(type(value)) or f"the number {value!r:.40}"
 
 
 def encode_json(document: Mapping[str, Any]) -> bytes:

@@ -15,7 +15,8 @@ from starlette.types import Message
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RequestError, TooLargeError
 from rlservo.export.contract.spaces import DictSpec
-from rlservo.serve_app.episodes.request import REQUEST_FIELDS, Episode, Request, parse_episode, parse_options
+from rlservo.serve_app.episodes.request import REQUEST_FIELDS, Episode, Request
+from rlservo.serve_app.protocols.json_codec import parse_episode, parse_options
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
 from rlservo.serve_app.versions.policy_store import Decision

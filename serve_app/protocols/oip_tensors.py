@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError
-from rlservo.serve_app.episodes.request import json_type
+from rlservo.serve_app.protocols.json_messages import json_type
 
 DTYPES: dict[str, np.dtype[Any]] = {
     "BOOL": np.dtype("?"),

@@ -32,7 +32,7 @@ from rlservo.export.contract.errors import (
 from rlservo.serve_app.episodes.request import Request, new_episode_id
 from rlservo.serve_app.episodes.sessions import Session
 from rlservo.serve_app.protocols.direct_routes import StreamRoute
-from rlservo.serve_app.protocols.http_errors import Headers, encode_bug, error_answer, send_error
+from rlservo.serve_app.protocols.http_errors import encode_bug, error_answer, fail_stream, refuse_upgrade
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
 from rlservo.serve_app.server.access_checks import (
@@ -51,12 +51,10 @@ logger = logging.getLogger(__name__)
 
 STREAM_PATHS = ("/", "/v1/policies/{name}/stream", "/v1/policies/{name}/versions/{version}/stream")
 GOING_AWAY = 1001
-FAILED = 1011  # the close code openpi's server uses for every error
 KEEP = b"errors=keep"
 PROTOCOL = "websocket"
 SILENT = "silent for too long"
 REVOKED = (UnauthenticatedError, ForbiddenError)  # what the key of a stream may come to
-DENIAL = "websocket.http.response"  # the ASGI extension that answers an upgrade with an HTTP error
 
 
 def add_routes(core: Core, add_direct: Callable[[StreamRoute], None]) -> None:
@@ -101,7 +99,7 @@ class StreamEndpoint:
         try:
             core.open_stream(opening)
         except OverloadedError as error:
-            await _fail(send, error_answer(error)[1])
+            await fail_stream(send, error_answer(error)[1])
             return
         idle = IdleTimer(core.settings.stream_idle_s)
         opening.stream = Session(policy) if policy.is_stateful else None
@@ -116,12 +114,12 @@ class StreamEndpoint:
             core.record_failure(opening, IDLE, SILENT)
             await _close_idle(send)
         except RlservoError as error:
-            await _fail(send, error_answer(error)[1])
+            await fail_stream(send, error_answer(error)[1])
         except OSError:  # the client went while its reply was being sent: nobody is left to tell
             logger.debug("a stream's client went before its reply could be sent")
         except Exception:
             core.record_bug(opening)
-            await _fail(send, encode_bug())
+            await fail_stream(send, encode_bug())
         finally:
             idle.stop()
             if opening.stream is not None:
@@ -215,31 +213,11 @@ class IdleTimer:
             self._task.cancel()
 
 
-async def refuse_upgrade(
-    scope: Scope, receive: Receive, send: Send, error: RlservoError, headers: Headers = ()
-) -> None:
-    """Answer an upgrade with an HTTP error; where the server cannot send one, accept it and fail in our own way."""
-    await receive()  # websocket.connect
-    if DENIAL in scope.get("extensions", {}):
-        await send_error(send, error, kind=DENIAL, headers=headers)
-        return
-    await send({"type": "websocket.accept"})
-    await _fail(send, error_answer(error)[1])
-
-
 def _with_seq(content: bytes, seq: int | None) -> str:
     """Return an error's body with the number of the request that it answers."""
     if seq is None:
         return content.decode()
     return encode_json({**json.loads(content), "seq": seq}).decode()
-
-
-async def _fail(send: Send, content: bytes) -> None:
-    try:
-        await send({"type": "websocket.send", "text": content.decode()})
-        await send({"type": "websocket.close", "code": FAILED, "reason": "see the text frame"})
-    except (OSError, RuntimeError):  # the client has gone meanwhile: nobody is left to tell
-        logger.debug("a stream's client went before its error could be sent")
 
 
 async def _close_idle(send: Send) -> None:

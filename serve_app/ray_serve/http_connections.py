@@ -9,9 +9,8 @@ uvicorn (0.54) bounds one phase of a connection, the idle time after a reply. Fo
 
 And it takes a head of any size. Of WebSockets see `websocket_connections.py`.
 
-A request for an action that came whole is answered at once where nothing has to wait (`eager_start.py`), in the turn of
-the event loop that reads it, and its reply is written in one piece. A head that comes again is not parsed again
-(`repeated_head.py`).
+A request for an action that came whole is answered at once where nothing has to wait, in the turn of the event loop
+that reads it, and its reply is written in one piece. A head that comes again is not parsed again.
 
 `install` puts subclasses in place of the classes that uvicorn chooses, in each of Serve's processes that serves HTTP
 (`ingress.py`). One timer a connection checks its phase; a request costs two assignments. In front of the replicas
@@ -22,14 +21,16 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import re
 import socket
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+import sys
+import types
+from collections.abc import Callable, Coroutine, Generator
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from rlservo.serve_app.protocols.http_endpoint import REPLY, WholeBody
-from rlservo.serve_app.ray_serve import eager_start, uvicorn_parts
+from rlservo.serve_app.ray_serve import uvicorn_parts
 from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
-from rlservo.serve_app.ray_serve.repeated_head import RepeatedHead
 from rlservo.serve_app.ray_serve.uvicorn_parts import (
     STATUS_LINE,
     HttpToolsProtocol,
@@ -37,6 +38,7 @@ from rlservo.serve_app.ray_serve.uvicorn_parts import (
     auto,
 )
 from rlservo.serve_app.ray_serve.websocket_connections import BoundedStream
+from rlservo.serve_app.wire.request_stamp import STAMP
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
@@ -56,6 +58,14 @@ MOST_LESSONS = 8
 CHECK_PERIOD_S = 1.0
 """[s] between two checks of a connection's phase."""
 
+LENGTH = b"content-length"  # of a repeated head, as all of these
+VARYING = (LENGTH, STAMP.encode())
+VALUES = re.compile(rb"(?<=\r\n)(%s|%s): ?([^\r\n]+)(?=\r\n)" % VARYING, re.IGNORECASE)
+LONGEST_VALUE = 128  # of such a value
+CHANGING = frozenset({b"transfer-encoding", b"expect", b"upgrade", b"connection"})
+"""Headers that change how a body is read, or what becomes of the connection."""
+KEEP_ALIVE = (b"connection", b"keep-alive")  # which changes nothing
+
 LATE = b'{"error":"the request did not arrive in time","code":"deadline-passed"}'
 LATE_REPLY = (
     b"HTTP/1.1 408 Request Timeout\r\ncontent-type: application/json\r\nconnection: close\r\n"
@@ -70,6 +80,67 @@ LARGE_REPLY = (
     b"HTTP/1.1 431 Request Header Fields Too Large\r\ncontent-type: application/json\r\nconnection: close\r\n"
     b"content-length: %d\r\n\r\n%s" % (len(HEAD_TOO_LARGE), HEAD_TOO_LARGE)
 )
+
+
+class RepeatedHead(NamedTuple):
+    """What the parser made of a head, and where its varying values are.
+
+    A robot asks a hundred times a second, and only the body's length varies; reading a head costs more than all else
+    that a connection does: a dozen calls from the parser into Python. What it made of one holds for every other that
+    is the same byte by byte, but for two values that are looked at here: how long the body is, and a proxy's stamp.
+    All other requests are for the parser.
+    """
+
+    begin: bytes
+    """Up to the first of them."""
+    values: tuple[tuple[int, bytes, bytes], ...]
+    """Of each: its header's place and name, and the bytes from its end to the next one, or to the body."""
+    scope: dict[str, Any]
+    """Of the request that had it."""
+
+    @classmethod
+    def learn(cls, data: bytes, scope: Any) -> RepeatedHead | None:
+        """Return what is known of the head of `data`, a whole request of this `scope`; None for an unusual one."""
+        headers = scope["headers"]
+        names = [name for name, _ in headers]
+        end = data.find(b"\r\n\r\n") + 4
+        matches = list(VALUES.finditer(data, 0, end - 2))
+        found = [(match[1].lower(), match[2]) for match in matches]
+        odd = not CHANGING.isdisjoint(name for name, value in headers if (name, value.lower()) != KEEP_ALIVE)
+        if odd or scope["http_version"] != "1.1":
+            return None
+        if found != [header for header in headers if header[0] in VARYING]:
+            return None
+        if len(dict(found)) != len(found) or LENGTH not in dict(found):  # twice the same would be at one place
+            return None
+        starts = [match.start(2) for match in matches] + [end]
+        ends = [0] + [match.end(2) for match in matches]
+        begin, *rests = (data[since:until] for since, until in zip(ends, starts, strict=True))
+        values = tuple((names.index(name), name, rest) for (name, _), rest in zip(found, rests, strict=True))
+        known = cls(begin, values, {**scope, "headers": [*headers]})
+        return known if known.read(data) else None
+
+    def read(self, data: bytes) -> tuple[dict[str, Any], bytes] | None:
+        """Return (scope, body) of `data` where that is one whole request with this head."""
+        if not data.startswith(self.begin):
+            return None
+        at, length, headers = len(self.begin), -1, self.scope["headers"].copy()
+        for place, name, rest in self.values:
+            end = data.find(b"\r", at, at + LONGEST_VALUE)
+            if end < 0 or not data.startswith(rest, end):
+                return None
+            value = data[at:end]
+            if name == LENGTH:
+                if not value.isdigit():
+                    return None
+                length = int(value)
+            elif not value.replace(b"-", b"").isalnum():
+                return None
+            headers[place] = (name, value)
+            at = end + len(rest)
+        if len(data) - at != length:
+            return None
+        return {**self.scope, "headers": headers}, data[at:]
 
 
 class EarlyEnd(RequestResponseCycle):
@@ -139,7 +210,7 @@ class TimedProtocol(HttpToolsProtocol):
             self._known = RepeatedHead.learn(data, self._answered)
         if self._awaited is not None:  # more of it is to come
             cycle, self._awaited = self._awaited, None
-            super()._start_asgi_task(cycle, self.app)
+            super()._start_asgi_task(cycle, cast("Any", self.app))
         if self._unread > MAX_HEAD_BYTES and self._head_since is not None and not self.transport.is_closing():
             self.transport.write(LARGE_REPLY)
             self.transport.close()
@@ -251,12 +322,14 @@ class TimedProtocol(HttpToolsProtocol):
         return self.is_request_immediate(scope)
 
     def _answer(self, cycle: Any, body: bytes) -> None:
+        app: Any = self.app
+
         def answer(scope: Scope, receive: Receive, send: Send) -> Any:
-            return self.app(scope, WholeBody(body, receive), send)
+            return app(scope, WholeBody(body, receive), send)
 
         # The cycle leads to its scope, and this back: left there, every request would be for the garbage collector.
         cycle.scope[REPLY] = functools.partial(self._reply, cycle)
-        task = eager_start.start(cycle.run_asgi(answer), self.loop)
+        task = start_at_once(cycle.run_asgi(answer), self.loop)
         if task is None:
             cycle.scope.pop(REPLY, None)
         else:
@@ -303,6 +376,38 @@ class TimedProtocol(HttpToolsProtocol):
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
+
+
+def start_at_once(coroutine: Coroutine[Any, Any, None], loop: asyncio.AbstractEventLoop) -> asyncio.Task[None] | None:
+    """Run a coroutine until it waits for the first time; return the task that goes on with it, None where it is over.
+
+    Most answers never wait, and then cost no task, no turn of the loop and no callback. Python 3.12 has tasks that
+    begin so; before, up to there it is in no task (`asyncio.current_task`).
+    """
+    if sys.version_info >= (3, 12):
+        task = asyncio.Task(coroutine, loop=loop, eager_start=True)
+        return None if task.done() else task
+    try:
+        waits_for = coroutine.send(None)
+    except StopIteration:
+        return None
+    rest: Any = _go_on(coroutine, waits_for)  # a coroutine for asyncio, and a generator by its type
+    return loop.create_task(rest)
+
+
+@types.coroutine
+def _go_on(coroutine: Coroutine[Any, Any, None], waits_for: Any) -> Generator[Any, Any, None]:
+    """Wait for what a coroutine waits for, and pass on to it what comes of that."""
+    resume: Callable[[], Any]
+    while True:
+        try:
+            resume = functools.partial(coroutine.send, (yield waits_for))
+        except BaseException as error:
+            resume = functools.partial(coroutine.throw, error)
+        try:
+            waits_for = resume()
+        except StopIteration:
+            return
 
 
 def _has_body(scope: Any) -> bool:

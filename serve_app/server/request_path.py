@@ -251,8 +251,8 @@ class RequestPath:
         `Episodes.act` raise.
         """
         store, name, obs = self.store(), request.policy, request.obs
-        if request.deadline_ms is not None:
-            check_deadline(request)
+        if request.deadline_ms is not None and (time.perf_counter() - request.received) * 1e3 >= request.deadline_ms:
+            check_deadline(request)  # raises: it is later by now
         single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
         if (len(obs) if single else most_rows(obs)) > self._max_batch:
             self._check_batch(store, request)

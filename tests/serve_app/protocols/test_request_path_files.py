@@ -22,7 +22,7 @@ from onnxruntime import InferenceSession
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve import ingress as ingress_module
-from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
+from rlservo.serve_app.ray_serve.http_connections import RepeatedHead, TimedProtocol
 from rlservo.serve_app.ray_serve.ingress import Ingress, ServeBypass
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
@@ -69,30 +69,37 @@ class PassedFiles:
 
 @pytest.fixture
 def bypass(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServeBypass]:
-    """The process's bypass, for one test."""
+    """The process's bypass, for one test, and what connections of replicas answer at once by it."""
     monkeypatch.setattr(ingress_module, "bypass", ServeBypass())
+    monkeypatch.setattr(TimedProtocol, "is_request_immediate", staticmethod(ingress_module.is_immediate))
     yield ingress_module.bypass
 
 
-async def pass_through(ur5: Path, bypass: ServeBypass, listener: socket.socket, ask: Ask, lines: str) -> list[str]:
-    """Return our files that a request passes, in the order of the first call in each; `lines` are the server's keys."""
+async def pass_through(
+    ur5: Path, bypass: ServeBypass, listener: socket.socket, ask: Ask, lines: str
+) -> list[list[str]]:
+    """Return our files that each of a connection's later requests passes, in the order of the first call in each.
+
+    `lines` are the server's keys.
+    """
     store = store_of(Policy.load(ur5))
     app = create_app(lambda: store, ServerSettings(api_keys=lines))
     bypass.install(app)
     config = uvicorn.Config(Ingress(app), http=TimedProtocol, log_level="critical", lifespan="off", access_log=False)
     server = uvicorn.Server(config)
     serving = asyncio.create_task(server.serve(sockets=[listener]))
-    passed = PassedFiles()
-    for number in range(3):  # the first tells the prefix, by way of Serve
-        sys.setprofile(passed if number == 2 else None)  # of this thread, and so not of a client in another
+    await ask()  # by way of Serve: it tells the prefix
+    each = [PassedFiles() for _ in range(4)]
+    for passed in each:
+        sys.setprofile(passed)  # of this thread, and so not of a client in another
         try:
             await ask()
         finally:
             sys.setprofile(None)
     server.should_exit = True
     await serving
-    assert passed.reached_network
-    return list(passed.files)
+    assert all(passed.reached_network for passed in each)
+    return [list(passed.files) for passed in each]
 
 
 @pytest.mark.parametrize("key", [False, True], ids=["open", "keyed"])
@@ -119,14 +126,25 @@ def test_a_json_request_passes_nine_files_between_socket_and_network(ur5: Path, 
         socket.create_server(("127.0.0.1", 0)) as listener,
         contextlib.closing(http.client.HTTPConnection(*listener.getsockname())) as connection,
     ):
-        files = asyncio.run(pass_through(ur5, bypass, listener, ask, LINE if key else ""))
-    assert sorted(files) == sorted(NINE)
-    assert files[0] == NINE[0]
-    assert files[-1] == NINE[-1]  # what is nearest to the network
+        requests = asyncio.run(pass_through(ur5, bypass, listener, ask, LINE if key else ""))
+    for files in requests:
+        assert sorted(files) == sorted(NINE)
+        assert files[0] == NINE[0]
+        assert files[-1] == NINE[-1]  # what is nearest to the network
 
 
-def test_a_request_of_our_client_passes_a_tenth_file_which_parses_its_options(ur5: Path, bypass: ServeBypass) -> None:
-    """It has a number, a deadline, its episode's label and a key."""
+def test_so_does_one_of_our_client(ur5: Path, bypass: ServeBypass, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has a number, a deadline, its episode's label and a key, and from the third on a head that is known."""
+    repeated = 0
+    read = RepeatedHead.read
+
+    def counted(self: RepeatedHead, data: bytes) -> Any:
+        nonlocal repeated
+        found = read(self, data)
+        repeated += found is not None
+        return found
+
+    monkeypatch.setattr(RepeatedHead, "read", counted)
     with (
         socket.create_server(("127.0.0.1", 0)) as listener,
         PolicyClient(f"http://127.0.0.1:{listener.getsockname()[1]}", "ur5", api_key=KEY) as client,
@@ -135,5 +153,7 @@ def test_a_request_of_our_client_passes_a_tenth_file_which_parses_its_options(ur
         async def ask() -> None:
             await asyncio.to_thread(client.act, np.array(OBS, np.float32))
 
-        files = asyncio.run(pass_through(ur5, bypass, listener, ask, LINE))
-    assert sorted(files) == sorted([*NINE, "serve_app/episodes/request.py"])
+        requests = asyncio.run(pass_through(ur5, bypass, listener, ask, LINE))
+    for files in requests:
+        assert sorted(files) == sorted(NINE)
+    assert repeated >= 2

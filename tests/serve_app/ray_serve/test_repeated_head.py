@@ -8,7 +8,7 @@ from typing import Any
 import httptools
 import pytest
 
-from rlservo.serve_app.ray_serve.repeated_head import RepeatedHead
+from rlservo.serve_app.ray_serve.http_connections import RepeatedHead
 from rlservo.serve_app.wire.request_stamp import STAMP
 
 Header = tuple[bytes, bytes]

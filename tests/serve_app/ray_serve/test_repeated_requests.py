@@ -14,8 +14,7 @@ from uvicorn.server import ServerState
 
 from rlservo.serve_app.protocols.http_endpoint import REPLY
 from rlservo.serve_app.ray_serve import ingress
-from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
-from rlservo.serve_app.ray_serve.repeated_head import RepeatedHead
+from rlservo.serve_app.ray_serve.http_connections import RepeatedHead, TimedProtocol
 
 IDLE_S = 60
 OUTSIDE = b"by another way"

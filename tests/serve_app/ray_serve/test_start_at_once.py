@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rlservo.serve_app.ray_serve.eager_start import start
+from rlservo.serve_app.ray_serve.http_connections import start_at_once
 
 
 def run(scenario: Callable[[asyncio.AbstractEventLoop], Coroutine[Any, Any, None]]) -> None:
@@ -28,7 +28,7 @@ def test_one_that_waits_for_nothing_is_over_at_once() -> None:
         async def answer() -> None:
             seen.append(await inner())
 
-        assert start(answer(), loop) is None and seen == [1]
+        assert start_at_once(answer(), loop) is None and seen == [1]
 
     run(scenario)
 
@@ -48,7 +48,7 @@ def test_one_that_waits_goes_on_in_a_task_with_what_it_waited_for() -> None:
 
         failing = loop.create_future()
         failing.set_exception(KeyError("x"))
-        task = start(answer(), loop)
+        task = start_at_once(answer(), loop)
         assert task is not None and seen == []
         loop.call_soon(future.set_result, "given")
         await task
@@ -72,14 +72,14 @@ def test_one_that_waits_can_be_cancelled_and_fails_as_its_task() -> None:
             await asyncio.sleep(0)
             raise ValueError("no")
 
-        task = start(answer(), loop)
+        task = start_at_once(answer(), loop)
         assert task is not None
         await asyncio.sleep(0)
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await task
         assert seen == ["cancelled"]
-        failed = start(fail(), loop)
+        failed = start_at_once(fail(), loop)
         assert failed is not None
         with pytest.raises(ValueError, match="no"):
             await failed
