@@ -22,6 +22,7 @@ OPERATIONS = Path(__file__).resolve().parents[3] / "docs" / "operations.md"
 
 
 def take_away(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    ray_parts.check()  # imports all of them: one that is imported without the other's name would itself be missing
     module, _, attributes = name.partition(":")
     *owners, last = attributes.split(".")
     owner = ray_parts.find(f"{module}:{'.'.join(owners)}") if owners else importlib.import_module(module)

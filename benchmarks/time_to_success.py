@@ -1,0 +1,197 @@
+"""Measure how long training takes until 95 of the last 100 episodes succeed, beside Stable-Baselines3's PPO.
+
+    python benchmarks/time_to_success.py                          # both, UR5, ten to twenty minutes on two cores
+    python benchmarks/time_to_success.py --seeds 0 1 2 --only rllib
+    python benchmarks/time_to_success.py --set training.lr=0.0005 --only rllib
+
+Task and settings are those of a policy that ships (`examples/checkpoints/NAME/training.yaml`); RLlib samples with one
+process a core, as `training_inference_ur.py` does. Stable-Baselines3 (`pip install stable-baselines3`) gets the same
+environment, network, batches and rates, its own VecNormalize, and all environments in one process or one each. Success
+is that of training, with exploration. Table and plot are written to `bench/time_to_success.json` and `.png`.
+"""
+
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Generator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
+
+import shared.training_run as training_run  # before Ray  # isort: skip
+import evaluate_shipped
+import gymnasium
+import numpy as np
+import torch
+import train_shipped
+
+WINDOW = 100  # episodes
+SUCCESS = 0.95
+
+
+@dataclass
+class Run:
+    """One training; a point of the curve is (environment steps, seconds, success of the last episodes)."""
+
+    trainer: str
+    seed: int
+    curve: list[tuple[int, float, float]] = field(default_factory=list)
+
+    @property
+    def reached(self) -> tuple[int, float] | None:
+        """Steps and seconds until enough of the last episodes succeeded; None where they never did."""
+        return next(((steps, seconds) for steps, seconds, success in self.curve if success >= SUCCESS), None)
+
+
+Points = Generator[tuple[int, float, float], None, None]
+
+
+def rllib(settings: dict[str, Any], seed: int) -> Points:
+    """Train with RLlib."""
+    config = train_shipped.algorithm_config(settings, seed)
+    runners = sampling_processes()
+    config.env_runners(num_env_runners=runners, num_envs_per_env_runner=settings["envs"] // runners)
+    with training_run.stopping(config.build_algo()) as algorithm:
+        for row in train_shipped.iterations(algorithm, WINDOW):
+            yield row.env_steps, row.wall_s, row.success if row.episodes >= WINDOW else 0.0
+
+
+def sampling_processes() -> int:
+    """Return how many sample: as many as there are cores, since sampling and learning take turns."""
+    return os.cpu_count() or 1
+
+
+def stable_baselines(settings: dict[str, Any], seed: int, *, processes: bool) -> Points:
+    """Train with Stable-Baselines3's PPO."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+    training, model, count = settings["training"], settings["model"], settings["envs"]
+
+    def make() -> gymnasium.Env[Any, Any]:
+        import rlservo.envs  # noqa: F401  # in a new process
+
+        made: gymnasium.Env[Any, Any] = Monitor(
+            gymnasium.make(settings["env"], disable_env_checker=True, **settings["env_config"])
+        )
+        return made
+
+    environments: list[Callable[[], gymnasium.Env[Any, Any]]] = [make] * count
+    vector = SubprocVecEnv(environments) if processes else DummyVecEnv(environments)
+    normalised = VecNormalize(vector, norm_reward=False)
+    steps_at, rates = (
+        zip(*training["lr"], strict=True) if isinstance(training["lr"], list) else ((0,), (training["lr"],))
+    )
+    done = 0
+    algorithm = PPO(
+        "MlpPolicy",
+        normalised,
+        learning_rate=lambda _: float(np.interp(done, steps_at, rates)),
+        n_steps=training["train_batch_size_per_learner"] // count,
+        batch_size=training["minibatch_size"],
+        n_epochs=training["num_epochs"],
+        gamma=training["gamma"],
+        gae_lambda=training["lambda_"],
+        clip_range=training["clip_param"],
+        max_grad_norm=training["grad_clip"],
+        policy_kwargs={
+            "net_arch": {"pi": model["fcnet_hiddens"], "vf": model["fcnet_hiddens"]},
+            "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[model["fcnet_activation"]],
+        },
+        seed=seed,
+        device="cpu",
+        stats_window_size=WINDOW,
+    )
+    began = time.monotonic()
+    try:
+        while True:
+            algorithm.learn(training["train_batch_size_per_learner"], reset_num_timesteps=False)
+            done = algorithm.num_timesteps
+            successes = algorithm.ep_success_buffer or ()
+            success = float(np.mean(successes)) if len(successes) == WINDOW else 0.0
+            yield done, time.monotonic() - began, success
+    finally:
+        normalised.close()
+
+
+TRAINERS: dict[str, Callable[[dict[str, Any], int], Points]] = {
+    "rllib": rllib,
+    "sb3": lambda settings, seed: stable_baselines(settings, seed, processes=False),
+    "sb3-processes": lambda settings, seed: stable_baselines(settings, seed, processes=True),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", nargs="?", default="ur5_positioning", choices=evaluate_shipped.shipped_names())
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--only", choices=TRAINERS, nargs="+", default=list(TRAINERS))
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as train_shipped.py's")
+    parser.add_argument("--out", type=Path, default=Path("bench"))
+    args = parser.parse_args()
+    settings = evaluate_shipped.load_settings(args.name)
+    for change in args.set:
+        try:
+            train_shipped.change_setting(settings, change)
+        except ValueError as error:
+            parser.error(f"--set {change}: {error}")
+    trainers = list(args.only)
+    if importlib.util.find_spec("stable_baselines3") is None:
+        print("Stable-Baselines3 is not installed (pip install stable-baselines3): RLlib alone")
+        trainers = [name for name in trainers if name == "rllib"]
+    args.out.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 would measure the machine's other work
+    torch.set_num_threads(1)
+    training_run.pickle_by_value(train_shipped)  # its callback, in processes that do not find it
+    runs: list[Run] = []
+    with training_run.ray_session(num_cpus=sampling_processes() + 1):
+        for seed in args.seeds:
+            for trainer in trainers:
+                runs.append(Run(trainer, seed))
+                with contextlib.closing(TRAINERS[trainer](settings, seed)) as points:
+                    for steps, seconds, success in points:
+                        runs[-1].curve.append((steps, seconds, success))
+                        print(f"{trainer}, seed {seed}: {steps:>10,} steps {seconds:6.0f} s {success:6.1%}", flush=True)
+                        if success >= SUCCESS or steps >= settings["stop"]["env_steps"]:
+                            break
+                write(runs, args.name, args.out)
+    for run in runs:
+        steps, seconds = run.reached or run.curve[-1][:2]
+        said = f"{SUCCESS:.0%} after" if run.reached else "never, in"
+        print(
+            f"{run.trainer}, seed {run.seed}: {said} {steps:,} steps, {seconds:.0f} s ({steps / seconds:,.0f} steps/s)"
+        )
+
+
+def write(runs: list[Run], name: str, out: Path) -> None:
+    """Write what has been measured so far."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    (out / "time_to_success.json").write_text(json.dumps([asdict(run) for run in runs]) + "\n")
+    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
+    for run in runs:
+        _, seconds, success = zip(*run.curve, strict=True)
+        axes.plot(np.divide(seconds, 60.0), np.multiply(success, 100.0), label=f"{run.trainer}, seed {run.seed}")
+    axes.axhline(100.0 * SUCCESS, color="0.7", linewidth=1)
+    axes.set(xlabel="minutes", ylabel=f"success of the last {WINDOW} episodes [%]", title=f"PPO, {name}")
+    axes.legend()
+    figure.savefig(out / "time_to_success.png", dpi=110)
+    pyplot.close(figure)
+
+
+if __name__ == "__main__":
+    training_run.main_with_sentences(main, __file__)

@@ -1,0 +1,63 @@
+"""The benchmark of how long training takes: when it stops, what it says and writes. Nothing is trained here."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import time_to_success
+
+
+@pytest.fixture
+def closed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The seeds whose training was ended; each gains a tenth of success in a second."""
+    ended: list[int] = []
+
+    def train(settings: dict[str, Any], seed: int) -> Generator[tuple[int, float, float], None, None]:
+        try:
+            for second in range(1, 100):
+                yield 1000 * second, float(second), min(second / 10, settings["training"]["gamma"])
+        finally:
+            ended.append(seed)
+
+    monkeypatch.setattr(time_to_success, "TRAINERS", {"rllib": train, "sb3": train, "sb3-processes": train})
+    monkeypatch.setattr(time_to_success.training_run, "ray_session", lambda **_: contextlib.nullcontext())
+    monkeypatch.setattr(time_to_success.importlib.util, "find_spec", lambda name: None)
+    return ended
+
+
+def run(monkeypatch: pytest.MonkeyPatch, out: Path, *words: str) -> list[Any]:
+    monkeypatch.setattr("sys.argv", ["time_to_success.py", "--out", str(out), *words])
+    time_to_success.main()
+    runs: list[Any] = json.loads((out / "time_to_success.json").read_text())
+    assert (out / "time_to_success.png").read_bytes().startswith(b"\x89PNG")
+    return runs
+
+
+def test_it_ends_when_enough_succeed(
+    closed: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = run(monkeypatch, tmp_path, "--seeds", "0", "7")
+    assert [(each["trainer"], each["seed"], len(each["curve"])) for each in runs] == [
+        ("rllib", 0, 10),
+        ("rllib", 7, 10),
+    ]
+    said = capsys.readouterr().out
+    assert "Stable-Baselines3 is not installed" in said
+    assert "rllib, seed 7: 95% after 10,000 steps, 10 s (1,000 steps/s)" in said
+    assert closed == [0, 7]
+
+
+def test_or_after_the_settings_steps(
+    closed: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(monkeypatch, tmp_path, "--set", "training.gamma=0.9", "--set", "stop.env_steps=20000")
+    assert "rllib, seed 0: never, in 20,000 steps, 20 s" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stopped:
+        run(monkeypatch, tmp_path, "--set", "training.speed=1")
+    assert stopped.value.code == 2 and "expected KEY=VALUE" in capsys.readouterr().err
+    assert closed == [0]
