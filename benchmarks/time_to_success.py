@@ -5,9 +5,11 @@
     python benchmarks/time_to_success.py --set training.lr=0.0005 --only rllib
 
 Task and settings are those of a policy that ships (`examples/checkpoints/NAME/training.yaml`); RLlib samples with one
-process a core, as `training_inference_ur.py` does. Stable-Baselines3 (`pip install stable-baselines3`) gets the same
-environment, network, batches and rates, its own VecNormalize, and all environments in one process or one each. Success
-is that of training, with exploration. Table and plot are written to `bench/time_to_success.json` and `.png`.
+process a core. Stable-Baselines3 (`pip install stable-baselines3`) gets the same environment, network, batches, rates
+and weight of the value's loss, its own VecNormalize, torch's threads, and all environments in one process or one each;
+RLlib's KL term and bound of the value's loss it does not have. Success is that of training, with exploration; RLlib's
+last episodes are whole iterations', so some more than 100. Table and plot are written to `bench/time_to_success.json`
+and `.png`.
 """
 
 # pyright: reportMissingImports=false
@@ -59,16 +61,17 @@ Points = Generator[tuple[int, float, float], None, None]
 def rllib(settings: dict[str, Any], seed: int) -> Points:
     """Train with RLlib."""
     config = train_shipped.algorithm_config(settings, seed)
-    runners = sampling_processes()
+    runners = sampling_processes(settings["envs"])
     config.env_runners(num_env_runners=runners, num_envs_per_env_runner=settings["envs"] // runners)
-    with training_run.stopping(config.build_algo()) as algorithm:
+    torch.set_num_threads(1)
+    with training_run.ray_session(num_cpus=runners + 1), training_run.stopping(config.build_algo()) as algorithm:
         for row in train_shipped.iterations(algorithm, WINDOW):
             yield row.env_steps, row.wall_s, row.success if row.episodes >= WINDOW else 0.0
 
 
-def sampling_processes() -> int:
-    """Return how many sample: as many as there are cores, since sampling and learning take turns."""
-    return os.cpu_count() or 1
+def sampling_processes(envs: int) -> int:
+    """Return how many sample: one a core, since sampling and learning take turns, with as many environments each."""
+    return max(count for count in range(1, (os.cpu_count() or 1) + 1) if envs % count == 0)
 
 
 def stable_baselines(settings: dict[str, Any], seed: int, *, processes: bool) -> Points:
@@ -94,6 +97,7 @@ def stable_baselines(settings: dict[str, Any], seed: int, *, processes: bool) ->
         zip(*training["lr"], strict=True) if isinstance(training["lr"], list) else ((0,), (training["lr"],))
     )
     done = 0
+    torch.set_num_threads(os.cpu_count() or 1)
     algorithm = PPO(
         "MlpPolicy",
         normalised,
@@ -104,6 +108,7 @@ def stable_baselines(settings: dict[str, Any], seed: int, *, processes: bool) ->
         gamma=training["gamma"],
         gae_lambda=training["lambda_"],
         clip_range=training["clip_param"],
+        vf_coef=training.get("vf_loss_coeff", 1.0),
         max_grad_norm=training["grad_clip"],
         policy_kwargs={
             "net_arch": {"pi": model["fcnet_hiddens"], "vf": model["fcnet_hiddens"]},
@@ -132,9 +137,19 @@ TRAINERS: dict[str, Callable[[dict[str, Any], int], Points]] = {
 }
 
 
+def comparable() -> list[str]:
+    """Return the policies that both can train: by PPO, from the beginning, without a memory."""
+    every = {name: evaluate_shipped.load_settings(name) for name in evaluate_shipped.shipped_names()}
+    return [
+        name
+        for name, settings in every.items()
+        if settings["algorithm"] == "PPO" and "begin" not in settings and not settings["model"].get("use_lstm")
+    ]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("name", nargs="?", default="ur5_positioning", choices=evaluate_shipped.shipped_names())
+    parser.add_argument("name", nargs="?", default="ur5_positioning", choices=comparable())
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--only", choices=TRAINERS, nargs="+", default=list(TRAINERS))
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as train_shipped.py's")
@@ -152,20 +167,18 @@ def main() -> None:
         trainers = [name for name in trainers if name == "rllib"]
     args.out.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 would measure the machine's other work
-    torch.set_num_threads(1)
     training_run.pickle_by_value(train_shipped)  # its callback, in processes that do not find it
     runs: list[Run] = []
-    with training_run.ray_session(num_cpus=sampling_processes() + 1):
-        for seed in args.seeds:
-            for trainer in trainers:
-                runs.append(Run(trainer, seed))
-                with contextlib.closing(TRAINERS[trainer](settings, seed)) as points:
-                    for steps, seconds, success in points:
-                        runs[-1].curve.append((steps, seconds, success))
-                        print(f"{trainer}, seed {seed}: {steps:>10,} steps {seconds:6.0f} s {success:6.1%}", flush=True)
-                        if success >= SUCCESS or steps >= settings["stop"]["env_steps"]:
-                            break
-                write(runs, args.name, args.out)
+    for seed in args.seeds:
+        for trainer in trainers:
+            runs.append(Run(trainer, seed))
+            with contextlib.closing(TRAINERS[trainer](settings, seed)) as points:
+                for steps, seconds, success in points:
+                    runs[-1].curve.append((steps, seconds, success))
+                    print(f"{trainer}, seed {seed}: {steps:>10,} steps {seconds:6.0f} s {success:6.1%}", flush=True)
+                    if success >= SUCCESS or steps >= settings["stop"]["env_steps"]:
+                        break
+            write(runs, args.name, args.out)
     for run in runs:
         steps, seconds = run.reached or run.curve[-1][:2]
         said = f"{SUCCESS:.0%} after" if run.reached else "never, in"

@@ -70,10 +70,13 @@ def ctrl_c_sets(stop: threading.Event) -> Iterator[None]:
     An interrupt comes wherever the program happens to be: in a library it may be swallowed, or leave a lock held.
     Nobody inside may wait for `stop` in this thread: to set it takes a lock that waiting holds for moments.
     """
+    was_asked = False  # not `stop.is_set`: two signals may come together, and this be interrupted by itself
 
     def set_or_interrupt(_number: int, _frame: object) -> None:
-        if stop.is_set():
+        nonlocal was_asked
+        if was_asked:
             raise KeyboardInterrupt
+        was_asked = True
         stop.set()
 
     with _ends_handled_by(set_or_interrupt):

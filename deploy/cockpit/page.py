@@ -9,6 +9,7 @@ import re
 import socket
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Iterator
 from functools import partial
@@ -24,11 +25,14 @@ from rlservo.export.contract.errors import UsageError
 HOST = "127.0.0.1"
 FRAME_S = 1 / 30
 NEARER = 0.62  # tan(45 / 2) / tan(75 / 2), about: MuJoCo's angle of view to viser's
-NARROW = 0.6  # width to height, below which a scene is a phone's; one beside a desktop's panel may be narrow as well
+NARROW = 0.75  # of a window's width to its height, below which it is a phone's
 FARTHER, SHEET = 1.7, 0.6  # what a phone's camera makes of that: distance, and height of the middle above the window's
 PANEL_S = 0.5  # between two refreshes of numbers and plots: drawn in software, one costs as much as a frame
 # Pages that may talk to the cockpit: its own, also through a forwarded port. Programs send no Origin.
 ORIGINS = [re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?"), None]
+
+
+_phones: weakref.WeakSet[viser.ClientHandle] = weakref.WeakSet()
 
 
 class Shown(Protocol):
@@ -108,24 +112,22 @@ def _keep_aimed(initial: Any, client: viser.ClientHandle) -> None:
         if np.allclose(camera.position, initial.position, atol=1e-3):
             _aim(camera, initial.position, initial.look_at)
 
-    if _is_phone(client.camera):
+    # Decided now: later the panels beside it leave a desktop's scene narrow as well.
+    if client.camera.image_width < NARROW * client.camera.image_height:
+        _phones.add(client)
         client.camera.on_update(aim_again)
     _aim(client.camera, initial.position, initial.look_at)
 
 
 def _aim(camera: viser.CameraHandle, position: Vector, look_at: Vector) -> None:
     """Aim a camera; on a phone so that its target is above the sheet with the panels, which covers three fifths."""
-    if _is_phone(camera):
+    if camera.client in _phones:
         way = FARTHER * (look_at - position)
         ahead = way / np.linalg.norm(way)
         up = np.array([0.0, 0.0, 1.0]) - ahead[2] * ahead
         down = SHEET * np.tan(camera.fov / 2) * np.linalg.norm(way) * up / np.linalg.norm(up)
         position, look_at = look_at - way - down, look_at - down
     camera.position, camera.look_at = position, look_at
-
-
-def _is_phone(camera: viser.CameraHandle) -> bool:
-    return camera.image_width < NARROW * camera.image_height
 
 
 def _check_port(port: int) -> None:

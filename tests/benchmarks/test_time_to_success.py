@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Generator
 from pathlib import Path
@@ -25,7 +24,6 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
             ended.append(seed)
 
     monkeypatch.setattr(time_to_success, "TRAINERS", {"rllib": train, "sb3": train, "sb3-processes": train})
-    monkeypatch.setattr(time_to_success.training_run, "ray_session", lambda **_: contextlib.nullcontext())
     monkeypatch.setattr(time_to_success.importlib.util, "find_spec", lambda name: None)
     return ended
 
@@ -61,3 +59,15 @@ def test_or_after_the_settings_steps(
         run(monkeypatch, tmp_path, "--set", "training.speed=1")
     assert stopped.value.code == 2 and "expected KEY=VALUE" in capsys.readouterr().err
     assert closed == [0]
+
+
+def test_what_is_compared_is_what_both_can_train() -> None:
+    names = time_to_success.comparable()
+    assert {"ur5_positioning", "mir100_navigation"} <= set(names)
+    assert not {"cartpole_dqn", "pendulum_sac", "ur_positioning", "mir100_sparse_fixes"} & set(names)
+
+
+@pytest.mark.parametrize(("cores", "processes"), [(1, 1), (2, 2), (12, 8), (24, 16)])
+def test_every_process_has_as_many_environments(cores: int, processes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: cores)
+    assert time_to_success.sampling_processes(16) == processes
