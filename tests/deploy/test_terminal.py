@@ -1,4 +1,4 @@
-"""What ends a program: signals, and what is left of their handling afterwards."""
+"""Signals that end a program, and the handlers that are there afterwards."""
 
 from __future__ import annotations
 
