@@ -30,6 +30,8 @@ from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
 from rlservo.export.contract.errors import UsageError
 
+SUMS = ("mean_array", "sum_sq_diff_array")  # of a running filter
+
 
 def use_batched_connectors(config: Any, *, observation_filter: bool) -> None:
     """Put these pieces in the place of RLlib's in an `AlgorithmConfig`.
@@ -87,6 +89,7 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
         )
         _check_filter()
         self._device = device
+        self._before: Any = None  # the statistics that were set last
 
     def recompute_output_observation_space(self, input_observation_space: Any, input_action_space: Any) -> Any:
         return super().recompute_output_observation_space(_check_box(input_observation_space), input_action_space)
@@ -108,6 +111,21 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
             rows.append(row)
         batch[Columns.OBS] = _tensor(rows, rl_module, self._device)
         return batch
+
+    def get_state(self, components: Any = None, **kwargs: Any) -> Any:
+        if self._filters is not None:
+            running: Any = self._filters[None]
+            _tell_what_is_new(running.running_stats, self._before)
+        return super().get_state(components, **kwargs)
+
+    def set_state(self, state: Any) -> None:
+        super().set_state(state)
+        filters: Any = self._filters
+        self._before = filters[None].running_stats.copy()
+
+    def reset_state(self) -> None:
+        super().reset_state()
+        self._before = None
 
 
 class NormalizeAndClipActions(module_to_env.NormalizeAndClipActions):
@@ -181,20 +199,31 @@ def _array(value: Any) -> Any:
 
 
 def _push(stats: RunningStat, row: Any) -> None:
-    """Do what `RunningStat.push` does, operation by operation, without copies and checks."""
+    """Do what `RunningStat.push` does, operation by operation, without copies, checks and what is new (below)."""
     stats.num_pushes += 1
-    stats.num_pushes_delta += 1
     if stats.num_pushes == 1:
         stats.mean_array[...] = row
-        stats.mean_delta_array[...] = row
         return
     delta = row - stats.mean_array
-    step = delta / stats.num_pushes
-    stats.mean_array += step
-    stats.mean_delta_array += step
+    stats.mean_array += delta / stats.num_pushes
     delta *= row - stats.mean_array
     stats.sum_sq_diff_array += delta
-    stats.sum_sq_diff_delta_array += delta
+
+
+def _tell_what_is_new(stats: RunningStat, before: RunningStat | None) -> None:
+    """Let the deltas be count, mean and spread of the observations since `before`.
+
+    So `RunningStat.update`, which merges several runners, takes them. RLlib's own are by how much all observations'
+    mean and spread have changed: merged, they pull the mean towards 0 (two runners need half as many steps more).
+    """
+    before = RunningStat(stats.shape) if before is None else before
+    new = stats.num_pushes - before.num_pushes
+    share = stats.num_pushes / new if new else 0.0
+    moved = (stats.mean_array - before.mean_array) * share
+    spread = stats.sum_sq_diff_array - before.sum_sq_diff_array - moved**2 * (before.num_pushes / (share or 1.0))
+    stats.num_pushes_delta = new
+    stats.mean_delta_array = before.mean_array + moved
+    stats.sum_sq_diff_delta_array = spread
 
 
 @functools.cache
@@ -206,8 +235,8 @@ def _check_filter() -> None:
         for row in np.random.default_rng(0).normal(2.0, 5.0, (9, 3)).astype(np.float32):
             _push(ours.running_stats, row)
             same = theirs(row).tobytes() == _filtered(row, ours).tobytes()
-            stats, own = theirs.running_stats.to_state(), ours.running_stats.to_state()
-            if not same or stats != own:
+            stats, own = theirs.running_stats, ours.running_stats
+            if not same or any(getattr(stats, name).tobytes() != getattr(own, name).tobytes() for name in SUMS):
                 raise ValueError
         for name in ("_filters", "_update_stats"):
             if not hasattr(env_to_module.MeanStdFilter(), name):
