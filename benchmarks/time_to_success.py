@@ -3,13 +3,15 @@
     python benchmarks/time_to_success.py                          # both, UR5, ten to twenty minutes on two cores
     python benchmarks/time_to_success.py --seeds 0 1 2 --only rllib
     python benchmarks/time_to_success.py --set training.lr=0.0005 --only rllib
+    python benchmarks/time_to_success.py --variants quick         # with settings of ur5_variants.yaml
+    python benchmarks/time_to_success.py --variants all --only rllib --seeds 2 --set stop.env_steps=310000  # the sweep
 
-Task and settings are those of a policy that ships (`examples/checkpoints/NAME/training.yaml`); RLlib samples with one
-process a core. Stable-Baselines3 (`pip install stable-baselines3`) gets the same environment, network, batches, rates
-and weight of the value's loss, its own VecNormalize, torch's threads, and all environments in one process or one each;
-RLlib's KL term and bound of the value's loss it does not have. Success is that of training, with exploration; RLlib's
-last episodes are whole iterations', so some more than 100. Table and plot are written to `bench/time_to_success.json`
-and `.png`.
+Task and settings are those of a policy that ships (`examples/checkpoints/NAME/training.yaml`), or variants of them;
+RLlib samples with one process a core. Stable-Baselines3 (`pip install stable-baselines3`) gets the same environment,
+network, batches, rates and weight of the value's loss, its own VecNormalize, torch's threads, and all environments in
+one process or one each; RLlib's KL term and bound of the value's loss it does not have, and its first weights and one
+standard deviation are always those of `quick`. Success is that of training, with exploration; RLlib's last episodes are
+whole iterations', so some more than 100. Table and plot are written to `bench/time_to_success.json` and `.png`.
 """
 
 # pyright: reportMissingImports=false
@@ -19,6 +21,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib.util
+import itertools
 import json
 import os
 import sys
@@ -36,7 +39,9 @@ import gymnasium
 import numpy as np
 import torch
 import train_shipped
+import yaml
 
+VARIANTS = Path(__file__).resolve().parent / "ur5_variants.yaml"
 WINDOW = 100  # episodes
 SUCCESS = 0.95
 
@@ -147,11 +152,33 @@ def comparable() -> list[str]:
     ]
 
 
+def variants_of(settings: dict[str, Any], names: list[str]) -> dict[str, dict[str, Any]]:
+    """Return the settings by the variants' names, which `ur5_variants.yaml` has. Raises ValueError."""
+    if not names:
+        return {"": settings}
+    every: dict[str, dict[str, Any]] = yaml.safe_load(VARIANTS.read_text(encoding="utf-8"))
+    unknown = [name for name in names if name not in (*every, "all")]
+    if unknown:
+        raise ValueError(f"--variants {unknown[0]}: expected all, or some of {', '.join(every)}")
+    return {
+        name: {
+            **settings,
+            **{
+                part: {**settings.get(part, {}), **new} if isinstance(new, dict) else new
+                for part, new in changes.items()
+            },
+        }
+        for name, changes in every.items()
+        if name in names or "all" in names
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", nargs="?", default="ur5_positioning", choices=comparable())
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--only", choices=TRAINERS, nargs="+", default=list(TRAINERS))
+    parser.add_argument("--variants", nargs="+", default=[], metavar="NAME", help=f"of {VARIANTS.name}, or all")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as train_shipped.py's")
     parser.add_argument("--out", type=Path, default=Path("bench"))
     args = parser.parse_args()
@@ -161,6 +188,10 @@ def main() -> None:
             train_shipped.change_setting(settings, change)
         except ValueError as error:
             parser.error(f"--set {change}: {error}")
+    try:
+        variants = variants_of(settings, args.variants)
+    except ValueError as error:
+        parser.error(str(error))
     trainers = list(args.only)
     if importlib.util.find_spec("stable_baselines3") is None:
         print("Stable-Baselines3 is not installed (pip install stable-baselines3): RLlib alone")
@@ -169,19 +200,19 @@ def main() -> None:
     os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 would measure the machine's other work
     training_run.pickle_by_value(train_shipped)  # its callback, in processes that do not find it
     runs: list[Run] = []
-    for seed in args.seeds:
-        for trainer in trainers:
-            runs.append(Run(trainer, seed))
-            with contextlib.closing(TRAINERS[trainer](settings, seed)) as points:
-                for steps, seconds, success in points:
-                    runs[-1].curve.append((steps, seconds, success))
-                    print(f"{trainer}, seed {seed}: {steps:>10,} steps {seconds:6.0f} s {success:6.1%}", flush=True)
-                    if success >= SUCCESS or steps >= settings["stop"]["env_steps"]:
-                        break
-            write(runs, args.name, args.out)
+    for seed, (variant, chosen), trainer in itertools.product(args.seeds, variants.items(), trainers):
+        run = Run(" ".join(filter(None, (trainer, variant))), seed)
+        runs.append(run)
+        with contextlib.closing(TRAINERS[trainer](chosen, seed)) as points:
+            for steps, seconds, success in points:
+                run.curve.append((steps, seconds, success))
+                print(f"{run.trainer}, seed {seed}: {steps:>10,} steps {seconds:6.0f} s {success:6.1%}", flush=True)
+                if success >= SUCCESS or steps >= chosen["stop"]["env_steps"]:
+                    break
+        write(runs, args.name, args.out)
     for run in runs:
         steps, seconds = run.reached or run.curve[-1][:2]
-        said = f"{SUCCESS:.0%} after" if run.reached else "never, in"
+        said = f"{SUCCESS:.0%} after" if run.reached else f"{run.curve[-1][2]:.0%} in the end,"
         print(
             f"{run.trainer}, seed {run.seed}: {said} {steps:,} steps, {seconds:.0f} s ({steps / seconds:,.0f} steps/s)"
         )

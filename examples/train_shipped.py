@@ -6,8 +6,8 @@
 for one run. The run goes to `runs/NAME`: the best checkpoint so far (by the mean of the last episodes or, where the
 settings have `validation`, by episodes of the exported policy, without exploration), `curve.csv` and `curve.png`.
 `--install` then puts the pruned checkpoint and the curve beside the settings. One process, one thread: RLlib samples in
-the driver, because two sampling processes get `MeanStdFilter` statistics merged wrongly (docs/decisions.md). How good a
-policy is afterwards `evaluate_shipped.py` tells, on other seeds.
+the driver, so that a run gives the same numbers again. How good a policy is afterwards `evaluate_shipped.py` tells, on
+other seeds.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 FILTER = "env_to_module_connector"
 MODULE = "learner_group/learner/rl_module/default_policy"  # where a checkpoint has its network
 MILESTONE = 0.95  # the success rate whose time is printed
+GAINS = {"encoder": 2**0.5, "pi": 0.01, "vf": 1.0}  # of orthogonal weights, by the network's parts
 SUMS = ("episodes", "judged", "return", "length", "success")
 
 
@@ -85,12 +86,33 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
         min_sample_timesteps_per_iteration=settings.get("steps_per_iteration", 0),
     )
     config.callbacks(on_episode_end=_log_episode)
+    if settings.get("initial_weights") == "orthogonal":
+        config.callbacks(on_algorithm_init=_draw_orthogonal)
     config.debugging(seed=seed, log_level="ERROR")
     return config
 
 
 def _mean_std_filter(*_: Any) -> MeanStdFilter:
     return MeanStdFilter()
+
+
+def _draw_orthogonal(*, algorithm: Algorithm, **_: Any) -> None:
+    """Begin as Stable-Baselines3's PPO does: orthogonal weights, so small ones last that the first actions are noise.
+
+    RLlib (2.60) has no setting for the weights of its heads. Source: Andrychowicz et al., What matters for on-policy
+    deep actor-critic methods, 2021, section 3.2.
+    """
+
+    def draw(learner: Any, *_: Any) -> None:
+        for name, layer in learner.module["default_policy"].named_modules():
+            if isinstance(layer, torch.nn.Linear):
+                torch.nn.init.orthogonal_(layer.weight, GAINS[name.partition(".")[0]])
+                torch.nn.init.zeros_(layer.bias)
+
+    learners, runners = algorithm.learner_group, algorithm.env_runner_group
+    assert learners is not None and runners is not None
+    learners.foreach_learner(draw)
+    runners.sync_weights(from_worker_or_learner_group=learners, inference_only=True)
 
 
 def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any = None, **_: Any) -> None:

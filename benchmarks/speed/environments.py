@@ -1,6 +1,7 @@
 """An environment of its own for each peer, installed from PyPI or npm on demand and kept in the user's cache.
 
-Every package is pinned (`benchmarks/peers/requirements/`), and an environment is made anew when its list changes.
+Every package is pinned (`benchmarks/peers/requirements/`), and an environment is made anew when its list changes. The
+lists are complete, so nothing is resolved, which Debian's pip takes minutes for; none has torch and its gigabytes.
 """
 
 from __future__ import annotations
@@ -17,8 +18,6 @@ PEERS = Path(__file__).resolve().parent.parent / "peers"
 REQUIREMENTS = PEERS / "requirements"
 INSTALL_S = 900.0
 COMPLETE = ".complete"  # written last: an environment without it is half of one
-# None of these peers needs torch. Should a new version want it, pip says so instead of fetching gigabytes of CUDA.
-NO_TORCH = "torch<0\n"
 
 
 class InstallError(Exception):
@@ -36,11 +35,9 @@ def python_of(name: str) -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / COMPLETE).exists():
             shutil.rmtree(folder, ignore_errors=True)
-            constraints = root / "constraints.txt"
-            constraints.write_text(NO_TORCH)
-            pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+            pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
             run([sys.executable, "-m", "venv", str(folder)], name)
-            run([*pip, "-c", str(constraints), "-r", str(requirements)], name)
+            run([*pip, "-r", str(requirements)], name)
             (folder / COMPLETE).touch()
     return python
 

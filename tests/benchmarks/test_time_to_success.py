@@ -54,7 +54,7 @@ def test_or_after_the_settings_steps(
     closed: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(monkeypatch, tmp_path, "--set", "training.gamma=0.9", "--set", "stop.env_steps=20000")
-    assert "rllib, seed 0: never, in 20,000 steps, 20 s" in capsys.readouterr().out
+    assert "rllib, seed 0: 90% in the end, 20,000 steps, 20 s" in capsys.readouterr().out
     with pytest.raises(SystemExit) as stopped:
         run(monkeypatch, tmp_path, "--set", "training.speed=1")
     assert stopped.value.code == 2 and "expected KEY=VALUE" in capsys.readouterr().err
@@ -71,3 +71,20 @@ def test_what_is_compared_is_what_both_can_train() -> None:
 def test_every_process_has_as_many_environments(cores: int, processes: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.cpu_count", lambda: cores)
     assert time_to_success.sampling_processes(16) == processes
+
+
+def test_variants_change_what_they_name(
+    closed: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = time_to_success.evaluate_shipped.load_settings("ur5_positioning")
+    variants = time_to_success.variants_of(settings, ["all"])
+    assert variants["small"]["model"] == {**settings["model"], "fcnet_hiddens": [64, 64]}
+    assert variants["small"]["training"] == {**settings["training"], "lr": 0.0007, "use_kl_loss": False}
+    assert variants["quick"]["initial_weights"] == "orthogonal"
+    for chosen in variants.values():
+        time_to_success.train_shipped.algorithm_config(chosen, 0)  # RLlib refuses what it does not know
+    runs = run(monkeypatch, tmp_path, "--variants", "quick", "small, relu")
+    assert [each["trainer"] for each in runs] == ["rllib small, relu", "rllib quick"]
+    with pytest.raises(SystemExit):
+        run(monkeypatch, tmp_path, "--variants", "slow")
+    assert "--variants slow: expected all, or some of wide, wide, lr 1e-3" in capsys.readouterr().err
