@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Generator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import time_to_success
+import torch
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
 
 @pytest.fixture
@@ -82,9 +86,25 @@ def test_variants_change_what_they_name(
     assert variants["small"]["training"] == {**settings["training"], "lr": 0.0007, "use_kl_loss": False}
     assert variants["quick"]["initial_weights"] == "orthogonal"
     for chosen in variants.values():
-        time_to_success.train_shipped.algorithm_config(chosen, 0)  # RLlib refuses what it does not know
+        PPOConfig().training(**chosen["training"])  # RLlib refuses what it does not know
+        DefaultModelConfig(**chosen["model"])
     runs = run(monkeypatch, tmp_path, "--variants", "quick", "small, relu")
     assert [each["trainer"] for each in runs] == ["rllib small, relu", "rllib quick"]
     with pytest.raises(SystemExit):
         run(monkeypatch, tmp_path, "--variants", "slow")
     assert "--variants slow: expected all, or some of wide, wide, lr 1e-3" in capsys.readouterr().err
+
+
+def test_orthogonal_weights_reach_the_runners() -> None:
+    parts = {"encoder": torch.nn.Linear(4, 8), "pi": torch.nn.Linear(8, 2), "vf": torch.nn.Linear(8, 1)}
+    learner = SimpleNamespace(module={"default_policy": torch.nn.ModuleDict(parts)})
+    learners = SimpleNamespace(foreach_learner=lambda function: function(learner))
+    synced: list[Any] = []
+    runners = SimpleNamespace(sync_weights=lambda **options: synced.append(options["from_worker_or_learner_group"]))
+    time_to_success.train_shipped._draw_orthogonal(
+        algorithm=SimpleNamespace(learner_group=learners, env_runner_group=runners)
+    )
+    for name, gain in (("encoder", 2**0.5), ("pi", 0.01), ("vf", 1.0)):
+        sizes = torch.linalg.svdvals(parts[name].weight)
+        assert torch.allclose(sizes, torch.full_like(sizes, gain), rtol=1e-4) and not parts[name].bias.any()
+    assert synced == [learners]
