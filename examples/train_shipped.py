@@ -97,10 +97,10 @@ def _mean_std_filter(*_: Any) -> MeanStdFilter:
 
 
 def _draw_orthogonal(*, algorithm: Algorithm, **_: Any) -> None:
-    """Begin as Stable-Baselines3's PPO does: orthogonal weights, so small ones last that the first actions are noise.
+    """Draw the weights as Stable-Baselines3's PPO does: orthogonal, the policy's last layer small.
 
-    RLlib (2.60) has no setting for the weights of its heads. Source: Andrychowicz et al., What matters for on-policy
-    deep actor-critic methods, 2021, section 3.2.
+    The first actions are then noise around 0, whatever is observed. RLlib (2.60) has no setting for the weights of its
+    heads. Source: Andrychowicz et al., What matters for on-policy deep actor-critic methods, 2021, section 3.2.
     """
 
     def draw(learner: Any, *_: Any) -> None:
