@@ -152,25 +152,22 @@ def comparable() -> list[str]:
     ]
 
 
-def variants_of(settings: dict[str, Any], names: list[str]) -> dict[str, dict[str, Any]]:
-    """Return the settings by the variants' names, which `ur5_variants.yaml` has. Raises ValueError."""
-    if not names:
-        return {"": settings}
+def variants_of(name: str, variants: list[str]) -> dict[str, dict[str, Any]]:
+    """Return a policy's settings by the variants' names, changed as `ur5_variants.yaml` says; "" unchanged for none.
+
+    Raises ValueError for a name that is not there.
+    """
     every: dict[str, dict[str, Any]] = yaml.safe_load(VARIANTS.read_text(encoding="utf-8"))
-    unknown = [name for name in names if name not in (*every, "all")]
+    unknown = [variant for variant in variants if variant not in (*every, "all")]
     if unknown:
-        raise ValueError(f"--variants {unknown[0]}: expected all, or some of {', '.join(every)}")
-    return {
-        name: {
-            **settings,
-            **{
-                part: {**settings.get(part, {}), **new} if isinstance(new, dict) else new
-                for part, new in changes.items()
-            },
-        }
-        for name, changes in every.items()
-        if name in names or "all" in names
-    }
+        raise ValueError(f"--variants {unknown[0]}: expected all, or some of {', '.join(map(repr, every))}")
+    chosen = {variant: changes for variant, changes in every.items() if variant in variants or "all" in variants}
+    found = {}
+    for variant, changes in (chosen or {"": {}}).items():
+        settings = found[variant] = evaluate_shipped.load_settings(name)
+        for part, new in changes.items():
+            settings[part] = settings[part] | new if isinstance(new, dict) else new
+    return found
 
 
 def main() -> None:
@@ -182,16 +179,15 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as train_shipped.py's")
     parser.add_argument("--out", type=Path, default=Path("bench"))
     args = parser.parse_args()
-    settings = evaluate_shipped.load_settings(args.name)
-    for change in args.set:
+    try:
+        variants = variants_of(args.name, args.variants)
+    except ValueError as error:
+        parser.error(str(error))
+    for settings, change in itertools.product(variants.values(), args.set):
         try:
             train_shipped.change_setting(settings, change)
         except ValueError as error:
             parser.error(f"--set {change}: {error}")
-    try:
-        variants = variants_of(settings, args.variants)
-    except ValueError as error:
-        parser.error(str(error))
     trainers = list(args.only)
     if importlib.util.find_spec("stable_baselines3") is None:
         print("Stable-Baselines3 is not installed (pip install stable-baselines3): RLlib alone")

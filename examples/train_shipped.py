@@ -86,7 +86,7 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
         min_sample_timesteps_per_iteration=settings.get("steps_per_iteration", 0),
     )
     config.callbacks(on_episode_end=_log_episode)
-    if settings.get("initial_weights") == "orthogonal":
+    if settings.get("orthogonal_weights"):
         config.callbacks(on_algorithm_init=_draw_orthogonal)
     config.debugging(seed=seed, log_level="ERROR")
     return config

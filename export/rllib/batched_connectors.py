@@ -214,7 +214,7 @@ def _tell_what_is_new(stats: RunningStat, before: RunningStat | None) -> None:
     """Let the deltas be count, mean and spread of the observations since `before`.
 
     So `RunningStat.update`, which merges several runners, takes them. RLlib's own are by how much all observations'
-    mean and spread have changed: merged, they pull the mean towards 0 (two runners need half as many steps more).
+    mean and spread have changed: merged, they pull the mean towards 0.
     """
     before = RunningStat(stats.shape) if before is None else before
     new = stats.num_pushes - before.num_pushes

@@ -81,18 +81,20 @@ def test_variants_change_what_they_name(
     closed: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = time_to_success.evaluate_shipped.load_settings("ur5_positioning")
-    variants = time_to_success.variants_of(settings, ["all"])
+    variants = time_to_success.variants_of("ur5_positioning", ["all"])
     assert variants["small"]["model"] == {**settings["model"], "fcnet_hiddens": [64, 64]}
     assert variants["small"]["training"] == {**settings["training"], "lr": 0.0007, "use_kl_loss": False}
-    assert variants["quick"]["initial_weights"] == "orthogonal"
+    assert variants["quick"]["orthogonal_weights"] is True
     for chosen in variants.values():
         PPOConfig().training(**chosen["training"])  # RLlib refuses what it does not know
         DefaultModelConfig(**chosen["model"])
     runs = run(monkeypatch, tmp_path, "--variants", "quick", "small, relu")
     assert [each["trainer"] for each in runs] == ["rllib small, relu", "rllib quick"]
+    run(monkeypatch, tmp_path, "--variants", "quick", "--set", "training.gamma=0.5", "--set", "stop.env_steps=9000")
+    assert "rllib quick, seed 0: 50% in the end, 9,000 steps" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         run(monkeypatch, tmp_path, "--variants", "slow")
-    assert "--variants slow: expected all, or some of wide, wide, lr 1e-3" in capsys.readouterr().err
+    assert "--variants slow: expected all, or some of 'wide', 'wide, lr 1e-3', " in capsys.readouterr().err
 
 
 def test_orthogonal_weights_reach_the_runners() -> None:
