@@ -183,11 +183,12 @@ def main() -> None:
         variants = variants_of(args.name, args.variants)
     except ValueError as error:
         parser.error(str(error))
-    for settings, change in itertools.product(variants.values(), args.set):
-        try:
-            train_shipped.change_setting(settings, change)
-        except ValueError as error:
-            parser.error(f"--set {change}: {error}")
+    for settings in variants.values():
+        for change in args.set:
+            try:
+                train_shipped.change_setting(settings, change)
+            except ValueError as error:
+                parser.error(f"--set {change}: {error}")
     trainers = list(args.only)
     if importlib.util.find_spec("stable_baselines3") is None:
         print("Stable-Baselines3 is not installed (pip install stable-baselines3): RLlib alone")
