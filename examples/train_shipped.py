@@ -74,7 +74,8 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
         rollout_fragment_length=settings.get("rollout_fragment_length", "auto"),
     )
     if not settings.get("model", {}).get("use_lstm"):  # the same numbers, sooner
-        use_batched_connectors(config, observation_filter=settings["filter"])
+        stacking = settings.get("frame_stacking", {})  # {num_frames, every}
+        use_batched_connectors(config, observation_filter=settings["filter"], **stacking)
     elif settings["filter"]:
         config.env_runners(env_to_module_connector=cast(Any, _mean_std_filter))
     config.learners(num_learners=0, num_gpus_per_learner=0)

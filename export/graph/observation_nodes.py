@@ -160,16 +160,19 @@ class FilterNode(ObservationNode):
 
 
 class FrameStackNode(ObservationNode):
-    """The last frames side by side; the state holds all but the newest."""
+    """The last frames side by side; the state holds all but the newest, those between, too."""
 
     def __init__(self, step: FrameStack) -> None:
         super().__init__()
-        self.depth = step.shape[2]
+        self.depth = step.shape[-1]
+        self.every = step.every
 
     def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:
-        stacked = torch.cat((state["frames"], obs), dim=3)
-        state["frames"] = stacked[:, :, :, self.depth :]
-        return stacked
+        stacked = torch.cat((state["frames"], obs), dim=-1)
+        state["frames"] = stacked[..., self.depth :]
+        if self.every == 1:
+            return stacked
+        return stacked.unflatten(-1, (-1, self.depth))[..., :: self.every, :].flatten(-2)
 
 
 class PreviousNode(ObservationNode):

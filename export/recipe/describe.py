@@ -71,10 +71,11 @@ def observation_step(step: ObservationStep) -> BakedStep:
     if isinstance(step, Preprocess):
         return _preprocess_step(step)
     if isinstance(step, FrameStack):
+        apart = f", {step.every} steps apart," if step.every > 1 else ""
         return BakedStep(
             step="frame_stack",
-            detail=f"the last {step.frames} observations side by side, zeros before the episode's start",
-            values={"frames": step.frames},
+            detail=f"the last {step.frames} observations{apart} side by side, zeros before the episode's start",
+            values={"frames": step.frames, **({"every": step.every} if step.every > 1 else {})},
         )
     if isinstance(step, Previous):
         parts = [f"the last {step.actions} actions, one-hot"] if step.actions else []

@@ -58,11 +58,15 @@ class Flatten:
 
 @dataclass(frozen=True)
 class FrameStack:
-    """RLlib's FrameStacking: the last `frames` observations `[..., 1]` side by side on the third axis, zeros before."""
+    """FrameStacking: the last `frames` observations, `every` steps apart, side by side on the last axis, zeros before.
+
+    RLlib's own has images `[height, width, 1]`, the batched connectors' vectors.
+    """
 
     frames: int
     shape: tuple[int, ...]
     dtype: str
+    every: int = 1
 
 
 @dataclass(frozen=True)
@@ -155,7 +159,7 @@ class Recipe:
         carried: list[StateLeaf] = []
         for step in self.steps:
             if isinstance(step, FrameStack):
-                past = (*step.shape[:2], (step.frames - 1) * step.shape[2], *step.shape[3:])
+                past = (*step.shape[:-1], (step.frames - 1) * step.every * step.shape[-1])
                 carried.append(StateLeaf("frames", np.zeros(past, step.dtype), "frames"))
             elif isinstance(step, Previous):
                 if step.actions:

@@ -2,7 +2,7 @@
 
 RLlib (2.60) passes each environment's observation and action through ten pieces, one by one and each timed, which takes
 as long as the simulator or longer. These give the same numbers, bit by bit. They do where an observation is a Box, an
-action a Box, Discrete or MultiDiscrete, and the network has no memory:
+action a Box, Discrete or MultiDiscrete, and the network is no LSTM or the like:
 
     use_batched_connectors(config, observation_filter=True)
 
@@ -33,16 +33,19 @@ from rlservo.export.contract.errors import UsageError
 SUMS = ("mean_array", "sum_sq_diff_array")  # of a running filter
 
 
-def use_batched_connectors(config: Any, *, observation_filter: bool) -> None:
+def use_batched_connectors(config: Any, *, observation_filter: bool, num_frames: int = 1, every: int = 1) -> None:
     """Put these pieces in the place of RLlib's in an `AlgorithmConfig`.
 
-    `observation_filter` is whether observations go through a MeanStdFilter. Connectors of the configuration's own are
-    replaced. How actions are scaled it must say before, with `environment(normalize_actions=..., clip_actions=...)`.
+    `observation_filter` is whether observations go through a MeanStdFilter; the network sees the last `num_frames` of
+    them, `every` steps apart. Connectors of the configuration's own are replaced. How actions are scaled it must say
+    before, with `environment(normalize_actions=..., clip_actions=...)`.
     """
     scaling = {"normalize_actions": config.normalize_actions, "clip_actions": config.clip_actions}
 
-    def before(_env: Any, _spaces: Any, device: Any) -> ConnectorV2:
-        return MeanStdFilter(device=device) if observation_filter else BatchedObservations(device=device)
+    def before(_env: Any, _spaces: Any, device: Any) -> list[ConnectorV2]:
+        first = MeanStdFilter if observation_filter else BatchedObservations
+        stacking = [FrameStacking(num_frames=num_frames, every=every, device=device)] if num_frames > 1 else []
+        return [first(device=device), *stacking]
 
     def after(_env: Any, _spaces: Any) -> ConnectorV2:
         return NormalizeAndClipActions(**scaling)
@@ -52,6 +55,7 @@ def use_batched_connectors(config: Any, *, observation_filter: bool) -> None:
         module_to_env_connector=after,
         add_default_connectors_to_env_to_module_pipeline=False,
         add_default_connectors_to_module_to_env_pipeline=False,
+        episode_lookback_horizon=max(config.episode_lookback_horizon, (num_frames - 1) * every),
     )
 
 
@@ -126,6 +130,51 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
     def reset_state(self) -> None:
         super().reset_state()
         self._before = None
+
+
+class FrameStacking(ConnectorV2):
+    """The last `num_frames` vectors side by side, `every` steps apart, the newest last; zeros before the episode's start.
+
+    RLlib's own takes images alone, and stacks them for the learner a second time: here the episode keeps the stack. What
+    came before is read from the episode, so that `episode_lookback_horizon` must reach as far back.
+    """
+
+    def __init__(
+        self,
+        input_observation_space: Any = None,
+        input_action_space: Any = None,
+        *,
+        num_frames: int,
+        every: int = 1,
+        device: Any = None,
+        **kwargs: Any,
+    ) -> None:
+        self.num_frames = num_frames
+        self.every = every
+        self._device = device
+        super().__init__(input_observation_space, input_action_space, **kwargs)
+
+    def recompute_output_observation_space(self, input_observation_space: Any, input_action_space: Any) -> Any:
+        del input_action_space
+        space = _check_box(input_observation_space)
+        if len(space.shape) != 1:
+            raise UsageError(f"observations are {space}: frames are stacked of vectors; RLlib's FrameStacking has images")
+        return Box(np.tile(space.low, self.num_frames), np.tile(space.high, self.num_frames), dtype=space.dtype)
+
+    def __call__(self, *, rl_module: Any, batch: dict[str, Any], episodes: list[Any], **_: Any) -> dict[str, Any]:
+        space: Any = self.input_observation_space
+        size = space.shape[0]
+        before_the_start = np.zeros(size, space.dtype)
+        ages = range((self.num_frames - 1) * self.every, -1, -self.every)
+        rows = []
+        for episode in episodes:
+            seen = episode.observations.data  # the newest alone is not stacked yet; a stack's last part is its own frame
+            frames = [seen[-1 - age][-size:] if age < len(seen) else before_the_start for age in ages]
+            seen[-1] = row = np.concatenate(frames)
+            episode.observation_space = self.observation_space
+            rows.append(row)
+        batch[Columns.OBS] = _tensor(rows, rl_module, self._device)
+        return batch
 
 
 class NormalizeAndClipActions(module_to_env.NormalizeAndClipActions):

@@ -82,14 +82,13 @@ def read_observation_steps(env_to_module: Any, files: CheckpointFiles, slot: Age
     for piece in env_to_module.connectors:
         step = _observation_step(piece, files, slot)
         name = type(piece).__name__
-        if step is not None and batched_by:
+        is_batched = type(piece).__module__ == BATCHED_CONNECTORS  # and batches what was changed before it
+        if step is not None and batched_by and not is_batched:
             raise UnsupportedError(
                 f"the env-to-module connector {name} comes after {batched_by}, which has handed the observation on "
                 "already: what RLlib does then depends on the step before, which is not exported"
             )
-        if type(piece).__module__ == BATCHED_CONNECTORS or (
-            name in BATCHES_OBSERVATION and _comes_from_rllib(type(piece))
-        ):
+        if is_batched or (name in BATCHES_OBSERVATION and _comes_from_rllib(type(piece))):
             batched_by = name
         if step is not None:
             steps.append(step)
@@ -145,7 +144,8 @@ def _observation_step(piece: Any, files: CheckpointFiles, slot: AgentSlot) -> Ob
         flattened = private_names.get(piece, "_agent_ids")  # none: all agents'
         return _flatten(piece, space) if slot.agent is None or slot.agent in (flattened or [slot.agent]) else None
     if kind.__name__ == "FrameStacking":
-        return FrameStack(int(piece.num_frames), tuple(space.shape), str(space.dtype))
+        # The batched connectors' has `every`; RLlib's own takes neighbouring frames.
+        return FrameStack(int(piece.num_frames), tuple(space.shape), str(space.dtype), int(getattr(piece, "every", 1)))
     if kind.__name__ == "PrevActionsPrevRewards":
         choices = slot.part(piece.input_action_space)
         if not isinstance(choices, Discrete):

@@ -42,6 +42,7 @@ sys.path[:0] = [str(HERE / "app"), str(HERE)]
 import zoo_rules  # noqa: E402  # pyright: ignore[reportMissingImports]
 import zoo_spaces  # noqa: E402  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
 import zoo_team  # noqa: E402  # pyright: ignore[reportMissingImports]
+from rlservo.export.rllib.batched_connectors import use_batched_connectors  # noqa: E402
 from train_zoo import leaves, ray_for_training, record  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 SMALL = DefaultModelConfig(fcnet_hiddens=[16])
@@ -84,6 +85,12 @@ def ppo(obs: str, action: str, *before: Any, model: Any = SMALL, spec: Any = Non
     config = spaces_env(PPOConfig(), obs, action, *before, after=after)
     config.training(train_batch_size=64, minibatch_size=32, num_epochs=1)
     return config.rl_module(rl_module_spec=spec) if spec else config.rl_module(model_config=model)
+
+
+def stacked_vectors() -> Any:
+    config = ppo("vector", "box")
+    use_batched_connectors(config, observation_filter=True, num_frames=3, every=2)
+    return config
 
 
 def off_policy(config: Any, obs: str, action: str, *before: Any, model: Any = SMALL, **training: Any) -> Any:
@@ -243,6 +250,7 @@ def configurations(out: Path) -> dict[str, Any]:
         "image": ppo("image", "discrete", model=CNN),
         "byte_image": ppo("byte_image", "discrete", spec=RLModuleSpec(module_class=zoo_spaces.ByteImageModule)),
         "stacked": ppo("gray", "discrete", stacked, model=CNN).learners(learner_connector=stacked_for_learning),
+        "stacked_vectors": stacked_vectors(),
         "act_multi_discrete": ppo("vector", "multi_discrete"),
         "act_dict": ppo("vector", "dict"),
         "act_tuple": ppo("vector", "tuple"),

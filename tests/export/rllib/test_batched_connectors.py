@@ -20,10 +20,10 @@ from rlservo.export.rllib import batched_connectors
 from rlservo.export.rllib.batched_connectors import _check_filter, supports, use_batched_connectors
 
 
-def runner(config: Any, env: str, envs: int, *, batched: bool, filtered: bool = False) -> Any:
+def runner(config: Any, env: str, envs: int, *, batched: bool, filtered: bool = False, **frames: int) -> Any:
     config.environment(env).env_runners(num_env_runners=0, num_envs_per_env_runner=envs).debugging(seed=3)
     if batched:
-        use_batched_connectors(config, observation_filter=filtered)
+        use_batched_connectors(config, observation_filter=filtered, **frames)
     elif filtered:
         config.env_runners(env_to_module_connector=lambda *_: MeanStdFilter())
     for seed in (random.seed, np.random.seed, torch.manual_seed):
@@ -101,6 +101,31 @@ def test_runners_are_merged_to_the_statistics_of_all_observations(monkeypatch: p
         assert stats.num_pushes == len(seen)
         np.testing.assert_allclose(stats.mean_array, np.mean(seen, axis=0), rtol=1e-9)
         np.testing.assert_allclose(stats.std, np.std(seen, axis=0, ddof=1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("filtered", [True, False])
+def test_frames_are_those_of_the_episode_so_far_also_where_it_is_cut(filtered: bool) -> None:
+    one = runner(PPOConfig(), "CartPole-v1", 3, batched=True, filtered=filtered, num_frames=3, every=2)
+    chunks: dict[str, list[Any]] = {}
+    for _ in range(30):
+        for chunk in one.sample(num_timesteps=7):
+            rows = chunk.get_observations()
+            chunks.setdefault(chunk.id_, []).append(rows if chunk.t_started == 0 else rows[1:])
+    compared = 0
+    for parts in chunks.values():
+        rows = np.concatenate(parts)
+        assert rows.shape[1] == 12 and rows.dtype == np.float32
+        frames = np.vstack([np.zeros((4, 4), np.float32), rows[:, 8:]])
+        np.testing.assert_array_equal(rows, np.hstack([frames[:-4], frames[2:-2], frames[4:]]))
+        compared += len(parts) > 2
+    assert compared > 3, "too few episodes were cut"
+    assert one.module.observation_space.shape == (12,)
+
+
+def test_images_are_not_stacked_as_vectors() -> None:
+    image = gymnasium.spaces.Box(0.0, 1.0, (8, 8, 1))
+    with pytest.raises(UsageError, match=r"frames are stacked of vectors; RLlib's FrameStacking has images"):
+        batched_connectors.FrameStacking(image, gymnasium.spaces.Discrete(2), num_frames=2)
 
 
 def test_actions_are_clipped_where_they_are_not_scaled() -> None:

@@ -36,7 +36,7 @@ from rlservo.export.rllib.restore import restore
 from rlservo.export.rllib.restored_policy import RestoredPolicy
 from rlservo.serve_app.runtime.policy import Policy
 
-RECURRENT = ["lstm_box", "lstm_discrete", "lstm_previous", "previous", "user_gru", "appo_lstm", "stacked", "act_nested",
+RECURRENT = ["lstm_box", "lstm_discrete", "lstm_previous", "previous", "user_gru", "appo_lstm", "stacked", "stacked_vectors", "act_nested",
              "dqn_lstm"]  # fmt: skip
 STATELESS = [
     "obs_discrete", "obs_below_zero", "obs_multi_discrete", "obs_multi_binary", "obs_integers",
