@@ -172,7 +172,8 @@ class FrameStackNode(ObservationNode):
         state["frames"] = stacked[..., self.depth :]
         if self.every == 1:
             return stacked
-        return stacked.unflatten(-1, (-1, self.depth))[..., :: self.every, :].flatten(-2)
+        frames = stacked.reshape(*stacked.shape[:-1], -1, self.depth)
+        return frames[..., :: self.every, :].flatten(-2)
 
 
 class PreviousNode(ObservationNode):

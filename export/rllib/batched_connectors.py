@@ -133,10 +133,10 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
 
 
 class FrameStacking(ConnectorV2):
-    """The last `num_frames` vectors side by side, `every` steps apart, the newest last; zeros before the episode's start.
+    """The last `num_frames` vectors side by side, `every` steps apart, the newest last; zeros before the episode.
 
-    RLlib's own takes images alone, and stacks them for the learner a second time: here the episode keeps the stack. What
-    came before is read from the episode, so that `episode_lookback_horizon` must reach as far back.
+    RLlib's own takes images alone, and stacks them for the learner a second time: here the episode keeps the stack.
+    What came before is read from the episode, so that `episode_lookback_horizon` must reach as far back.
     """
 
     def __init__(
@@ -158,7 +158,9 @@ class FrameStacking(ConnectorV2):
         del input_action_space
         space = _check_box(input_observation_space)
         if len(space.shape) != 1:
-            raise UsageError(f"observations are {space}: frames are stacked of vectors; RLlib's FrameStacking has images")
+            raise UsageError(
+                f"observations are {space}: frames are stacked of vectors; RLlib's FrameStacking has images"
+            )
         return Box(np.tile(space.low, self.num_frames), np.tile(space.high, self.num_frames), dtype=space.dtype)
 
     def __call__(self, *, rl_module: Any, batch: dict[str, Any], episodes: list[Any], **_: Any) -> dict[str, Any]:
@@ -168,7 +170,7 @@ class FrameStacking(ConnectorV2):
         ages = range((self.num_frames - 1) * self.every, -1, -self.every)
         rows = []
         for episode in episodes:
-            seen = episode.observations.data  # the newest alone is not stacked yet; a stack's last part is its own frame
+            seen = episode.observations.data  # stacks, but for the newest; a stack's last part is its own frame
             frames = [seen[-1 - age][-size:] if age < len(seen) else before_the_start for age in ages]
             seen[-1] = row = np.concatenate(frames)
             episode.observation_space = self.observation_space

@@ -42,8 +42,9 @@ sys.path[:0] = [str(HERE / "app"), str(HERE)]
 import zoo_rules  # noqa: E402  # pyright: ignore[reportMissingImports]
 import zoo_spaces  # noqa: E402  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
 import zoo_team  # noqa: E402  # pyright: ignore[reportMissingImports]
-from rlservo.export.rllib.batched_connectors import use_batched_connectors  # noqa: E402
 from train_zoo import leaves, ray_for_training, record  # noqa: E402  # pyright: ignore[reportMissingImports]
+
+from rlservo.export.rllib.batched_connectors import use_batched_connectors  # noqa: E402
 
 SMALL = DefaultModelConfig(fcnet_hiddens=[16])
 LSTM = DefaultModelConfig(fcnet_hiddens=[8], use_lstm=True, lstm_cell_size=8, max_seq_len=10)

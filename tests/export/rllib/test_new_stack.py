@@ -36,8 +36,8 @@ from rlservo.export.rllib.restore import restore
 from rlservo.export.rllib.restored_policy import RestoredPolicy
 from rlservo.serve_app.runtime.policy import Policy
 
-RECURRENT = ["lstm_box", "lstm_discrete", "lstm_previous", "previous", "user_gru", "appo_lstm", "stacked", "stacked_vectors", "act_nested",
-             "dqn_lstm"]  # fmt: skip
+RECURRENT = ["lstm_box", "lstm_discrete", "lstm_previous", "previous", "user_gru", "appo_lstm", "stacked",
+             "stacked_vectors", "act_nested", "dqn_lstm"]  # fmt: skip
 STATELESS = [
     "obs_discrete", "obs_below_zero", "obs_multi_discrete", "obs_multi_binary", "obs_integers",
     "obs_integers_filtered_first", "obs_bytes", "obs_dict", "obs_tuple", "obs_nested", "dict_module", "greedy_module",
