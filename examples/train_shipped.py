@@ -34,7 +34,9 @@ import yaml
 from ray import cloudpickle
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.connectors.env_to_module import MeanStdFilter
+from ray.rllib.core.columns import Columns
 from ray.rllib.utils.filter import RunningStat
 from ray.tune.registry import get_trainable_cls
 from shared.training_run import main_with_sentences, ray_session
@@ -74,13 +76,22 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
         rollout_fragment_length=settings.get("rollout_fragment_length", "auto"),
     )
     if not settings.get("model", {}).get("use_lstm"):  # the same numbers, sooner
-        stacking = settings.get("frame_stacking", {})  # {num_frames, every}
-        use_batched_connectors(config, observation_filter=settings["filter"], **stacking)
+        names = tuple(settings.get("logarithm_of", ()))
+        logarithm_of = _columns(settings, names)[0] if names else []
+        use_batched_connectors(
+            config,
+            observation_filter=settings["filter"],
+            logarithm_of=logarithm_of,
+            **settings.get("frame_stacking", {}),  # num_frames and every
+        )
     elif settings["filter"]:
         config.env_runners(env_to_module_connector=cast(Any, _mean_std_filter))
     config.learners(num_learners=0, num_gpus_per_learner=0)
     config.rl_module(model_config=settings.get("model", {}))
     config.training(**settings.get("training", {}))
+    if coefficient := settings.get("bounds_loss_coeff"):
+        config.training(learner_class=LearnerWithBounds)
+        config.learners(learner_config_dict={"bounds_loss_coeff": coefficient})
     config.reporting(
         # Off-policy algorithms report by default once a second, however much that is.
         min_time_s_per_iteration=0,
@@ -91,6 +102,20 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
         config.callbacks(on_algorithm_init=_draw_orthogonal)
     config.debugging(seed=seed, log_level="ERROR")
     return config
+
+
+class LearnerWithBounds(PPOTorchLearner):
+    """PPO whose Gaussian's mean is drawn back into the action's bounds, by the square of how far it is outside.
+
+    Actions are clipped there: with a mean of -2 whatever is drawn is -1, so that nothing is learned of driving slower.
+    rl_games, with which Isaac Gym's robots were trained, has it as `bounds_loss_coef`.
+    """
+
+    def compute_loss_for_module(self, *, module_id: str, config: Any, batch: dict[str, Any], fwd_out: Any) -> Any:
+        loss = super().compute_loss_for_module(module_id=module_id, config=config, batch=batch, fwd_out=fwd_out)
+        mean, _ = fwd_out[Columns.ACTION_DIST_INPUTS].chunk(2, dim=-1)
+        outside = torch.relu(mean.abs() - 1.0)
+        return loss + config.learner_config_dict["bounds_loss_coeff"] * outside.square().sum(dim=-1).mean()
 
 
 def _mean_std_filter(*_: Any) -> MeanStdFilter:
@@ -240,7 +265,7 @@ def _columns(settings: dict[str, Any], names: tuple[str, ...]) -> tuple[list[int
     env.close()
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise ValueError(f"--forget {unknown[0]}: expected some of {', '.join(known)}")
+        raise ValueError(f"observed element {unknown[0]}: expected some of {', '.join(known)}")
     return [known.index(name) for name in names], len(known)
 
 

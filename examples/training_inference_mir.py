@@ -4,7 +4,8 @@
 
 Without obstacles by default; `--obstacles` trains robo-gym's obstacle avoidance instead. The settings are those in
 examples/checkpoints/mir100_navigation/training.yaml and mir100_obstacle_avoidance/training.yaml. This script made the
-first of the two policies; the second is of train_shipped.py, which also judges checkpoints without exploration.
+first of the two policies; the second is of train_shipped.py, which gives the network the logarithm of the distances,
+keeps its mean within the action's bounds, lets a collision cost more, and judges checkpoints without exploration.
 """
 
 from __future__ import annotations
@@ -17,7 +18,12 @@ from shared.training_run import main_with_sentences
 
 NAVIGATION = shipped_task("mir100_navigation")
 # Its file stops at a success rate, which this script does not; no return is as high as this one.
-OBSTACLES = replace(shipped_task("mir100_obstacle_avoidance"), stop_reward=1000.0)
+OBSTACLES = replace(
+    shipped_task("mir100_obstacle_avoidance"),
+    env_id="rlservo/ObstacleAvoidanceMir100Sim-v0",
+    env_config=NAVIGATION.env_config,
+    stop_reward=1000.0,
+)
 
 
 def main() -> None:

@@ -65,6 +65,7 @@ class Mir100Navigation(RenderedEnv):
         rs_address: str | None = None,
         rs_state_to_info: bool = True,
         laser_noise: float = LASER_NOISE,
+        failure_reward: float = FAILURE_REWARD,
         render_mode: str | None = None,
     ) -> None:
         del ip, lower_bound_port, upper_bound_port, rs_address  # no robot server to reach
@@ -72,6 +73,7 @@ class Mir100Navigation(RenderedEnv):
         super().__init__(render_mode, gui=gui)
         self.simulation = Mir100Simulation(self.WORLD, laser_noise=laser_noise)
         self._elements = self.describe()["action"]
+        self._failure_reward = failure_reward
 
         high = np.array(
             [
@@ -144,7 +146,7 @@ class Mir100Navigation(RenderedEnv):
 
         status = self._failure()
         if status is not None:
-            reward = FAILURE_REWARD
+            reward = self._failure_reward
         if distance < SUCCESS_DISTANCE:  # in robo-gym's order: arriving outweighs a failure in the same step
             reward, status = self.SUCCESS_REWARD, "success"
         terminated = status is not None

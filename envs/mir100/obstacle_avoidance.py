@@ -79,7 +79,8 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
 
     ## Constructor
 
-    That of `NoObstacleNavigationMir100Sim`; `laser_noise` is the standard deviation of the readings in m.
+    That of `NoObstacleNavigationMir100Sim`; `laser_noise` is the standard deviation of the readings in m, and
+    `failure_reward` what a collision gives instead of -200: a training may weigh it more.
 
     ## Differences from robo-gym on Gazebo
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import resource
 import sys
 from collections.abc import Mapping, Sequence
@@ -189,7 +190,9 @@ def _shown(size: int) -> list[int | None]:
 
 
 def _filter(contract: Contract) -> BakedStep | None:
-    return next((step for step in contract.baked_in if step.step == "mean_std_filter"), None)
+    """Return the filter if it has seen the observation itself, and not what another step makes of it."""
+    before = itertools.takewhile(lambda step: step.step not in ("logarithm", "user_connector"), contract.baked_in)
+    return next((step for step in before if step.step == "mean_std_filter"), None)
 
 
 def _seen(frozen: BakedStep | None, size: int) -> tuple[Sequence[Any], Sequence[Any]]:

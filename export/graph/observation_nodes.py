@@ -16,7 +16,16 @@ from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from torch import Tensor, nn
 
 from rlservo.export.contract.contract import REWARD
-from rlservo.export.recipe.recipe import Flatten, FrameStack, ObservationFilter, Preprocess, Previous, Recipe, UserStep
+from rlservo.export.recipe.recipe import (
+    Flatten,
+    FrameStack,
+    Logarithm,
+    ObservationFilter,
+    Preprocess,
+    Previous,
+    Recipe,
+    UserStep,
+)
 from rlservo.export.recipe.trees import Tree, space_leaves, tree_leaves
 
 # What may be left out of the filter's mean, in units of the filtered observation: below float32's step near 1.
@@ -48,6 +57,8 @@ def observation_nodes(recipe: Recipe) -> nn.ModuleList:
             dtype = torch.float32
         elif isinstance(step, FrameStack):
             nodes.append(FrameStackNode(step))
+        elif isinstance(step, Logarithm):
+            nodes.append(LogarithmNode(step))
         elif isinstance(step, Previous):
             nodes.append(PreviousNode(step))
         else:
@@ -174,6 +185,20 @@ class FrameStackNode(ObservationNode):
             return stacked
         frames = stacked.reshape(*stacked.shape[:-1], -1, self.depth)
         return frames[..., :: self.every, :].flatten(-2)
+
+
+class LogarithmNode(ObservationNode):
+    """The logarithm of some elements."""
+
+    def __init__(self, step: Logarithm) -> None:
+        super().__init__()
+        self.elements = list(step.elements)
+        self.lowest = step.lowest
+
+    def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it has no state
+        taken = torch.zeros(obs.shape[-1], dtype=torch.bool)
+        taken[self.elements] = True
+        return torch.where(taken, obs.clamp(min=self.lowest).log(), obs)
 
 
 class PreviousNode(ObservationNode):

@@ -11,6 +11,7 @@ from rlservo.export.contract.contract import BakedStep
 from rlservo.export.recipe.recipe import (
     Flatten,
     FrameStack,
+    Logarithm,
     ObservationFilter,
     ObservationStep,
     Preprocess,
@@ -76,6 +77,12 @@ def observation_step(step: ObservationStep) -> BakedStep:
             step="frame_stack",
             detail=f"the last {step.frames} observations{apart} side by side, zeros before the episode's start",
             values={"frames": step.frames, **({"every": step.every} if step.every > 1 else {})},
+        )
+    if isinstance(step, Logarithm):
+        return BakedStep(
+            step="logarithm",
+            detail=f"log(max(obs, {step.lowest:g})) of {len(step.elements)} elements",
+            values={"elements": list(step.elements), "lowest": step.lowest},
         )
     if isinstance(step, Previous):
         parts = [f"the last {step.actions} actions, one-hot"] if step.actions else []

@@ -70,6 +70,14 @@ class FrameStack:
 
 
 @dataclass(frozen=True)
+class Logarithm:
+    """The batched connectors' Logarithm: `log(max(x, lowest))` of some elements of a vector."""
+
+    elements: tuple[int, ...]
+    lowest: float
+
+
+@dataclass(frozen=True)
 class Previous:
     """RLlib's PrevActionsPrevRewards: a dict of the observation, the last actions' one-hot codes and last rewards."""
 
@@ -99,7 +107,7 @@ class Preprocess:
     space: Any
 
 
-ObservationStep: TypeAlias = ObservationFilter | Flatten | FrameStack | Previous | UserStep | Preprocess
+ObservationStep: TypeAlias = ObservationFilter | Flatten | FrameStack | Logarithm | Previous | UserStep | Preprocess
 
 Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax", "given"]
 """How the deterministic action comes out of the distribution's parameters (or Q-values), or that it is given."""

@@ -14,6 +14,7 @@ module and its classes: under other names they could not be read.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -33,19 +34,28 @@ from rlservo.export.contract.errors import UsageError
 SUMS = ("mean_array", "sum_sq_diff_array")  # of a running filter
 
 
-def use_batched_connectors(config: Any, *, observation_filter: bool, num_frames: int = 1, every: int = 1) -> None:
+def use_batched_connectors(
+    config: Any,
+    *,
+    observation_filter: bool,
+    logarithm_of: Sequence[int] = (),
+    num_frames: int = 1,
+    every: int = 1,
+) -> None:
     """Put these pieces in the place of RLlib's in an `AlgorithmConfig`.
 
-    `observation_filter` is whether observations go through a MeanStdFilter; the network sees the last `num_frames` of
-    them, `every` steps apart. Connectors of the configuration's own are replaced. How actions are scaled it must say
-    before, with `environment(normalize_actions=..., clip_actions=...)`.
+    Of the observation's elements `logarithm_of` (their indices) the logarithm is taken; `observation_filter` is whether
+    observations then go through a MeanStdFilter; the network sees the last `num_frames` of them, `every` steps apart.
+    Connectors of the configuration's own are replaced. How actions are scaled it must say before, with
+    `environment(normalize_actions=..., clip_actions=...)`.
     """
     scaling = {"normalize_actions": config.normalize_actions, "clip_actions": config.clip_actions}
 
     def before(_env: Any, _spaces: Any, device: Any) -> list[ConnectorV2]:
-        first = MeanStdFilter if observation_filter else BatchedObservations
+        logarithm = [Logarithm(elements=tuple(logarithm_of))] if logarithm_of else []
+        batched = MeanStdFilter if observation_filter else BatchedObservations
         stacking = [FrameStacking(num_frames=num_frames, every=every, device=device)] if num_frames > 1 else []
-        return [first(device=device), *stacking]
+        return [*logarithm, batched(device=device), *stacking]
 
     def after(_env: Any, _spaces: Any) -> ConnectorV2:
         return NormalizeAndClipActions(**scaling)
@@ -130,6 +140,47 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
     def reset_state(self) -> None:
         super().reset_state()
         self._before = None
+
+
+class Logarithm(ConnectorV2):
+    """The natural logarithm of some elements of a vector, of those below LOWEST its own.
+
+    For distances: what is 5 cm nearer matters at 20 cm and not at 5 m, but a filter divides both alike.
+    """
+
+    LOWEST = 0.05
+
+    def __init__(
+        self,
+        input_observation_space: Any = None,
+        input_action_space: Any = None,
+        *,
+        elements: tuple[int, ...],
+        **kwargs: Any,
+    ) -> None:
+        self.elements = list(elements)
+        super().__init__(input_observation_space, input_action_space, **kwargs)
+
+    def recompute_output_observation_space(self, input_observation_space: Any, input_action_space: Any) -> Any:
+        del input_action_space
+        space = _check_box(input_observation_space)
+        if len(space.shape) != 1 or space.dtype.kind != "f":
+            raise UsageError(f"observations are {space}: logarithms are taken of a vector of floating-point numbers")
+        if wrong := [index for index in self.elements if not 0 <= index < space.shape[0]]:
+            raise UsageError(f"logarithm of element {wrong[0]}: observations have elements 0 to {space.shape[0] - 1}")
+        return Box(self._logarithm(space.low), self._logarithm(space.high), dtype=space.dtype)
+
+    def __call__(self, *, batch: dict[str, Any], episodes: list[Any], **_: Any) -> dict[str, Any]:
+        for episode in episodes:
+            seen = episode.observations.data
+            seen[-1] = self._logarithm(seen[-1])
+            episode.observation_space = self.observation_space
+        return batch
+
+    def _logarithm(self, row: Any) -> Any:
+        changed = row.copy()
+        changed[self.elements] = np.log(np.maximum(row[self.elements], self.LOWEST))
+        return changed
 
 
 class FrameStacking(ConnectorV2):

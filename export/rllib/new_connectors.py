@@ -18,6 +18,7 @@ from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 from rlservo.export.recipe.recipe import (
     Flatten,
     FrameStack,
+    Logarithm,
     ObservationFilter,
     ObservationStep,
     Previous,
@@ -146,6 +147,8 @@ def _observation_step(piece: Any, files: CheckpointFiles, slot: AgentSlot) -> Ob
     if kind.__name__ == "FrameStacking":
         # The batched connectors' has `every`; RLlib's own takes neighbouring frames.
         return FrameStack(int(piece.num_frames), tuple(space.shape), str(space.dtype), int(getattr(piece, "every", 1)))
+    if kind.__name__ == "Logarithm":
+        return Logarithm(tuple(piece.elements), piece.LOWEST)
     if kind.__name__ == "PrevActionsPrevRewards":
         choices = slot.part(piece.input_action_space)
         if not isinstance(choices, Discrete):

@@ -299,6 +299,13 @@ def test_driving_at_a_wall_ends_in_collision_before_it_touches() -> None:
     assert 0.10 < env.simulation.scan.min() < 0.15
 
 
+def test_a_collision_may_weigh_more_in_a_training() -> None:
+    env = make_lab(failure_reward=-400.0)
+    env.reset(seed=0, options={"start_pose": [1.0, 2.5, 0.0], "target_pose": [-1.0, -2.5, 0.0]})
+    *_, (_, reward, *_) = run(env, AHEAD)
+    assert reward == -400.0
+
+
 def test_touching_without_being_seen_is_a_collision() -> None:
     env = make_lab(laser_noise=0.0)
     env.reset(seed=0)

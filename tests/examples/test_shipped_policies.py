@@ -14,15 +14,17 @@ import pickle
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from bundles import EXPORTED_WITH, PRODUCT
 from cache import cached, versions
+from rlservo import export_checkpoint
 from rlservo.serve_app.runtime.policy import Policy
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -206,6 +208,27 @@ def test_checkpoints_are_judged_as_the_cards_do_where_the_settings_ask_for_it(tr
     run = trained("judged").folder / "runs" / "mir100_obstacle_avoidance"
     assert len((run / "curve.csv").read_text().splitlines()) == 4  # 2,048 steps an iteration
     assert (run / "checkpoint" / "rllib_checkpoint.json").exists()
+
+
+@pytest.mark.slow
+def test_the_logarithm_of_the_distances_is_part_of_the_checkpoint(trained: Any, tmp_path: Path) -> None:
+    checkpoint = trained("judged").folder / "runs" / "mir100_obstacle_avoidance" / "checkpoint"
+    contract = export_checkpoint(checkpoint, tmp_path, name="mir", notify=lambda line: None).contract
+    assert [step.step for step in contract.baked_in][:2] == ["logarithm", "mean_std_filter"]
+    assert contract.baked_in[0].values["elements"] == list(range(4, 20))
+
+
+def test_means_outside_the_actions_bounds_cost_what_they_are_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    train_shipped = load("train_shipped")
+    monkeypatch.setattr(train_shipped.PPOTorchLearner, "compute_loss_for_module", lambda *_, **__: torch.tensor(1.0))
+    inputs = torch.tensor([[0.5, -3.0, 9.0, 9.0], [1.5, 1.0, 9.0, 9.0]])  # two means, two log deviations
+    config = SimpleNamespace(learner_config_dict={"bounds_loss_coeff": 0.1})
+    loss = train_shipped.LearnerWithBounds.compute_loss_for_module(
+        object.__new__(train_shipped.LearnerWithBounds),
+        module_id="default_policy", config=config, batch={}, fwd_out={"action_dist_inputs": inputs},
+    )  # fmt: skip
+    assert loss.item() == pytest.approx(1.0 + 0.1 * (4.0 + 0.25) / 2)
 
 
 def test_training_begins_with_another_network_without_the_elements_it_shall_forget(trained: Any) -> None:

@@ -13,6 +13,7 @@ from ray.rllib.algorithms import DQNConfig, PPOConfig, SACConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.filter import RunningStat
 
 from rlservo.export.contract.errors import UsageError
@@ -120,6 +121,19 @@ def test_frames_are_those_of_the_episode_so_far_also_where_it_is_cut(filtered: b
         compared += len(parts) > 2
     assert compared > 3, "too few episodes were cut"
     assert one.module.observation_space.shape == (12,)
+
+
+def test_logarithms_are_taken_of_the_elements_that_were_asked_for() -> None:
+    space = gymnasium.spaces.Box(np.array([-1, 0, 0], np.float32), np.array([1, 29, np.inf], np.float32))
+    piece = batched_connectors.Logarithm(space, gymnasium.spaces.Discrete(2), elements=(1, 2))
+    low, high = piece.observation_space.low, piece.observation_space.high
+    np.testing.assert_allclose(low, [-1.0, np.log(0.05), np.log(0.05)], rtol=1e-6)
+    np.testing.assert_allclose(high, [1.0, np.log(29.0), np.inf], rtol=1e-6)
+    episode = SingleAgentEpisode(observation_space=space, observations=[np.array([0.5, 2.0, 0.01], np.float32)])
+    piece(batch={}, episodes=[episode])
+    np.testing.assert_allclose(episode.get_observations(-1), [0.5, np.log(2.0), np.log(0.05)], rtol=1e-6)
+    with pytest.raises(UsageError, match="logarithm of element 3: observations have elements 0 to 2"):
+        batched_connectors.Logarithm(space, gymnasium.spaces.Discrete(2), elements=(1, 3))
 
 
 def test_images_are_not_stacked_as_vectors() -> None:
