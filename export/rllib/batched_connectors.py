@@ -6,7 +6,9 @@ action a Box, Discrete or MultiDiscrete, and the network is no LSTM or the like:
 
     use_batched_connectors(config, observation_filter=True)
 
-Two are called as RLlib's own, whose work they do: a checkpoint keeps a piece's state under its class's name, so that
+What RLlib does not have are the logarithm of some elements, and stacked vectors (its own stacks images).
+
+Three are called as RLlib's own, whose work they do: a checkpoint keeps a piece's state under its class's name, so that
 what was trained with either goes on with the other, and `new_connectors.py` exports both alike. Checkpoints name this
 module and its classes: under other names they could not be read.
 """
