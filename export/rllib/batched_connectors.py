@@ -1,4 +1,4 @@
-"""RLlib's default connectors for one agent, as two pieces that take all environments of a runner at once.
+"""RLlib's default connectors for one agent, as pieces that take all environments of a runner at once.
 
 RLlib (2.60) passes each environment's observation and action through ten pieces, one by one and each timed, which takes
 as long as the simulator or longer. These give the same numbers, bit by bit. They do where an observation is a Box, an
@@ -8,7 +8,7 @@ action a Box, Discrete or MultiDiscrete, and the network is no LSTM or the like:
 
 What RLlib does not have are the logarithm of some elements, and stacked vectors (its own stacks images).
 
-Three are called as RLlib's own, whose work they do: a checkpoint keeps a piece's state under its class's name, so that
+Two are called as RLlib's own, whose work they do: a checkpoint keeps a piece's state under its class's name, so that
 what was trained with either goes on with the other, and `new_connectors.py` exports both alike. Checkpoints name this
 module and its classes: under other names they could not be read.
 """
