@@ -41,7 +41,7 @@ from ray.rllib.utils.filter import RunningStat
 from ray.tune.registry import get_trainable_cls
 from shared.training_run import main_with_sentences, ray_session
 
-from rlservo import Policy, export_checkpoint
+from rlservo import Policy, errors, export_checkpoint
 from rlservo.export.rllib.batched_connectors import use_batched_connectors
 
 assert ray_settings
@@ -232,7 +232,7 @@ class Beginning:
 
         An element that never moved in the first training (a fixed joint's velocity) was divided by next to nothing:
         the network's weights on it mean nothing, and shake it as soon as the element moves. A forgotten one begins
-        with weights of 0 and a spread of 1. Raises ValueError for an element that the environment does not have.
+        with weights of 0 and a spread of 1. Raises UsageError for an element that the environment does not have.
         """
         learners, runners = algorithm.learner_group, algorithm.env_runner_group
         assert learners is not None and runners is not None
@@ -265,7 +265,7 @@ def _columns(settings: dict[str, Any], names: tuple[str, ...]) -> tuple[list[int
     env.close()
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise ValueError(f"observed element {unknown[0]}: expected some of {', '.join(known)}")
+        raise errors.UsageError(f"observed element {unknown[0]}: expected some of {', '.join(known)}")
     return [known.index(name) for name in names], len(known)
 
 

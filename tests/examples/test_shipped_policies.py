@@ -251,6 +251,11 @@ def test_training_begins_with_another_network_without_the_elements_it_shall_forg
         ("train_shipped.py", ("nobody",), "invalid choice: 'nobody'"),
         ("train_shipped.py", ("cartpole_dqn", "--set", "stop.env_step=1"), "expected KEY=VALUE with a key that"),
         ("train_shipped.py", ("cartpole_dqn", "--set", "stop"), "expected KEY=VALUE with a key that"),
+        (
+            "train_shipped.py",
+            ("mir100_obstacle_avoidance", "--set", "logarithm_of=[laser_99]"),
+            "observed element laser_99: expected some of target_r, target_theta, ",
+        ),
         ("evaluate_shipped.py", ("nobody",), "no policy 'nobody' ships: expected some of cartpole_dqn"),
         ("evaluate_shipped.py", ("--episodes", "1"), "--episodes is 1 and --seed 20000: expected at least 2 and 0"),
         ("evaluate_shipped.py", ("--checkpoint", "x"), "--checkpoint goes with one NAME and without --write"),
