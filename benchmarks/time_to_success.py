@@ -3,8 +3,7 @@
     python benchmarks/time_to_success.py                          # both, UR5, ten to twenty minutes on two cores
     python benchmarks/time_to_success.py --seeds 0 1 2 --only rllib
     python benchmarks/time_to_success.py --set training.lr=0.0005 --only rllib
-    python benchmarks/time_to_success.py --variants quick         # with settings of ur5_variants.yaml
-    python benchmarks/time_to_success.py --variants all --only rllib --seeds 2 --set stop.env_steps=310000  # the sweep
+    python benchmarks/time_to_success.py --variants quick         # with settings of variants/ur5_positioning.yaml
 
 Task and settings are those of a policy that ships (`examples/checkpoints/NAME/training.yaml`), or variants of them;
 RLlib samples with one process a core. Stable-Baselines3 (`pip install stable-baselines3`) gets the same environment,
@@ -39,9 +38,8 @@ import gymnasium
 import numpy as np
 import torch
 import train_shipped
-import yaml
+from sweep import variants_of
 
-VARIANTS = Path(__file__).resolve().parent / "ur5_variants.yaml"
 WINDOW = 100  # episodes
 SUCCESS = 0.95
 
@@ -152,43 +150,21 @@ def comparable() -> list[str]:
     ]
 
 
-def variants_of(name: str, variants: list[str]) -> dict[str, dict[str, Any]]:
-    """Return a policy's settings by the variants' names, changed as `ur5_variants.yaml` says; "" unchanged for none.
-
-    Raises ValueError for a name that is not there.
-    """
-    every: dict[str, dict[str, Any]] = yaml.safe_load(VARIANTS.read_text(encoding="utf-8"))
-    unknown = [variant for variant in variants if variant not in (*every, "all")]
-    if unknown:
-        raise ValueError(f"--variants {unknown[0]}: expected all, or some of {', '.join(map(repr, every))}")
-    chosen = {variant: changes for variant, changes in every.items() if variant in variants or "all" in variants}
-    found = {}
-    for variant, changes in (chosen or {"": {}}).items():
-        settings = found[variant] = evaluate_shipped.load_settings(name)
-        for part, new in changes.items():
-            settings[part] = settings[part] | new if isinstance(new, dict) else new
-    return found
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", nargs="?", default="ur5_positioning", choices=comparable())
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--only", choices=TRAINERS, nargs="+", default=list(TRAINERS))
-    parser.add_argument("--variants", nargs="+", default=[], metavar="NAME", help=f"of {VARIANTS.name}, or all")
+    parser.add_argument("--variants", nargs="+", default=[], metavar="NAME", help="of variants/NAME.yaml, or all")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as train_shipped.py's")
     parser.add_argument("--out", type=Path, default=Path("bench"))
     args = parser.parse_args()
     try:
         variants = variants_of(args.name, args.variants)
+        for settings in variants.values():
+            train_shipped.change_settings(settings, args.set)
     except ValueError as error:
         parser.error(str(error))
-    for settings in variants.values():
-        for change in args.set:
-            try:
-                train_shipped.change_setting(settings, change)
-            except ValueError as error:
-                parser.error(f"--set {change}: {error}")
     trainers = list(args.only)
     if importlib.util.find_spec("stable_baselines3") is None:
         print("Stable-Baselines3 is not installed (pip install stable-baselines3): RLlib alone")

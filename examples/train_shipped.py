@@ -2,18 +2,19 @@
 
     python examples/train_shipped.py mir100_obstacle_avoidance
 
-`examples/checkpoints/NAME/training.yaml` says what is trained and when to stop; `--seed` and `--set` change that
-for one run. The run goes to `runs/NAME`: the best checkpoint so far (by the mean of the last episodes or, where the
-settings have `validation`, by episodes of the exported policy, without exploration), `curve.csv` and `curve.png`.
-`--install` then puts the pruned checkpoint and the curve beside the settings. One process, one thread: RLlib samples in
-the driver, so that a run gives the same numbers again. How good a policy is afterwards `evaluate_shipped.py` tells, on
-other seeds.
+`examples/checkpoints/NAME/training.yaml` says what is trained and when to stop; `--seed`, `--set` and `--settings`
+change that for one run. The run goes to `runs/NAME`: the best checkpoint so far (by the mean of the last episodes or,
+where the settings have `validation`, by episodes of the exported policy, without exploration), `curve.csv` and
+`curve.png`. `--install` then puts the pruned checkpoint and the curve beside the settings. One process, one thread:
+RLlib samples in the driver, so that a run gives the same numbers again. How good a policy is afterwards
+`evaluate_shipped.py` tells, on other seeds.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import math
 import resource
 import shutil
 import sys
@@ -36,8 +37,11 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.connectors.env_to_module import MeanStdFilter
+from ray.rllib.connectors.learner import AddNextObservationsFromEpisodesToTrainBatch
 from ray.rllib.core.columns import Columns
 from ray.rllib.utils.filter import RunningStat
+from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
+from ray.rllib.utils.schedules.scheduler import Scheduler
 from ray.tune.registry import get_trainable_cls
 from shared.training_run import main_with_sentences, ray_session
 
@@ -50,6 +54,8 @@ FILTER = "env_to_module_connector"
 MODULE = "learner_group/learner/rl_module/default_policy"  # where a checkpoint has its network
 MILESTONE = 0.95  # the success rate whose time is printed
 GAINS = {"encoder": 2**0.5, "pi": 0.01, "vf": 1.0}  # of orthogonal weights, by the network's parts
+NEEDED = ("env", "algorithm", "seed", "envs", "filter", "stop")  # of training.yaml
+PENALTIES = ("bounds_loss_coeff", "smoothness_loss_coeff", "largest_std")  # what ActionPenaltyLearner knows
 SUMS = ("episodes", "judged", "return", "length", "success")
 
 
@@ -76,12 +82,15 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
         rollout_fragment_length=settings.get("rollout_fragment_length", "auto"),
     )
     if not settings.get("model", {}).get("use_lstm"):  # the same numbers, sooner
-        names = tuple(settings.get("logarithm_of", ()))
-        logarithm_of = _columns(settings, names)[0] if names else []
+        of_elements: dict[str, Any] = {
+            what: _columns(settings, tuple(settings[what]))[0]
+            for what in ("logarithm_of", "sine_and_cosine_of")
+            if settings.get(what)
+        }
         use_batched_connectors(
             config,
             observation_filter=settings["filter"],
-            logarithm_of=logarithm_of,
+            **of_elements,
             **settings.get("frame_stacking", {}),  # num_frames and every
         )
     elif settings["filter"]:
@@ -89,9 +98,12 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     config.learners(num_learners=0, num_gpus_per_learner=0)
     config.rl_module(model_config=settings.get("model", {}))
     config.training(**settings.get("training", {}))
-    if coefficient := settings.get("bounds_loss_coeff"):
-        config.training(learner_class=LearnerWithBounds)
-        config.learners(learner_config_dict={"bounds_loss_coeff": coefficient})
+    penalties = {name: settings[name] for name in PENALTIES if settings.get(name)}
+    if penalties:
+        config.training(learner_class=ActionPenaltyLearner)
+        config.learners(learner_config_dict=penalties)
+    if "smoothness_loss_coeff" in penalties:
+        config.training(learner_connector=lambda *_: AddNextObservationsFromEpisodesToTrainBatch())
     config.reporting(
         # Off-policy algorithms report by default once a second, however much that is.
         min_time_s_per_iteration=0,
@@ -104,18 +116,51 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     return config
 
 
-class LearnerWithBounds(PPOTorchLearner):
-    """PPO whose Gaussian's mean is drawn back into the action's bounds, by the square of how far it is outside.
+class ActionPenaltyLearner(PPOTorchLearner):
+    """PPO that also shapes the Gaussian it draws actions from. `learner_config_dict` says how:
 
-    Actions are clipped there: with a mean of -2 whatever is drawn is -1, so that nothing is learned of driving slower.
+    `bounds_loss_coeff`: what a mean outside the action's bounds costs, by the square of how far it is outside. Actions
+    are clipped there: with a mean of -2 whatever is drawn is -1, so that nothing is learned of driving slower.
     rl_games, with which Isaac Gym's robots were trained, has it as `bounds_loss_coef`.
+
+    `smoothness_loss_coeff`: what the mean's step from one observation to the next costs, by its square. Source: Mysore
+    et al., Regularizing action policies for smooth control with reinforcement learning, 2021 (their temporal term).
+
+    `largest_std`: the standard deviations' upper bound over environment steps, `[[0, 1.0], [1000000, 0.2]]`, of a
+    network with `free_log_std`. What is learned in the end is then learned near the actions that are taken later.
     """
+
+    def build(self) -> None:
+        super().build()
+        schedule = self.config.learner_config_dict.get("largest_std")
+        self._largest_std = None if schedule is None else Scheduler(schedule, framework="torch")
 
     def compute_loss_for_module(self, *, module_id: str, config: Any, batch: dict[str, Any], fwd_out: Any) -> Any:
         loss = super().compute_loss_for_module(module_id=module_id, config=config, batch=batch, fwd_out=fwd_out)
-        mean, _ = fwd_out[Columns.ACTION_DIST_INPUTS].chunk(2, dim=-1)
-        outside = torch.relu(mean.abs() - 1.0)
-        return loss + config.learner_config_dict["bounds_loss_coeff"] * outside.square().sum(dim=-1).mean()
+        mean = _means(fwd_out)
+        if coefficient := config.learner_config_dict.get("bounds_loss_coeff"):
+            outside = torch.relu(mean.abs() - 1.0)
+            loss = loss + coefficient * outside.square().sum(dim=-1).mean()
+        if coefficient := config.learner_config_dict.get("smoothness_loss_coeff"):
+            after = self.module[module_id].forward_train({Columns.OBS: batch[Columns.NEXT_OBS]})
+            step = (_means(after).clamp(-1.0, 1.0) - mean.clamp(-1.0, 1.0))[batch[Columns.LOSS_MASK]]
+            loss = loss + coefficient * step.square().sum(dim=-1).mean()
+        return loss
+
+    def after_gradient_based_update(self, *, timesteps: dict[str, Any]) -> None:
+        super().after_gradient_based_update(timesteps=timesteps)
+        if self._largest_std is not None:
+            largest = self._largest_std.update(timestep=timesteps[NUM_ENV_STEPS_SAMPLED_LIFETIME])
+            network: Any = self.module["default_policy"]
+            for name, parameter in network.named_parameters():
+                if name.endswith("log_std"):
+                    with torch.no_grad():
+                        parameter.clamp_(max=math.log(largest))
+
+
+def _means(outputs: Any) -> torch.Tensor:
+    means: torch.Tensor = outputs[Columns.ACTION_DIST_INPUTS].chunk(2, dim=-1)[0]
+    return means
 
 
 def _mean_std_filter(*_: Any) -> MeanStdFilter:
@@ -175,19 +220,38 @@ class Validation:
             bundle = export_checkpoint(checkpoint, Path(folder), name="candidate", notify=lambda line: None)
             with Policy.load(bundle.path) as policy:
                 evaluations = evaluate_shipped.evaluate(policy, settings, self.episodes, self.seed)
+        for one in evaluations:
+            print(f"exported, {one.start}: {one.successes} of {one.episodes} episodes succeeded", flush=True)
         return sum(one.successes or 0 for one in evaluations) / sum(one.episodes for one in evaluations)
 
 
-def change_setting(settings: dict[str, Any], change: str) -> None:
-    """Apply `a.b=value` (YAML) to the settings. Raises ValueError for a setting that is not there."""
-    key, equals, value = change.partition("=")
-    *parents, last = key.split(".")
-    where: Any = settings
-    for parent in parents:
-        where = where.get(parent) if isinstance(where, dict) else None
-    if not equals or not isinstance(where, dict) or last not in where:
-        raise ValueError("expected KEY=VALUE with a key that training.yaml has, say stop.env_steps=20000")
-    where[last] = yaml.safe_load(value)
+def read_settings(path: Path) -> dict[str, Any]:
+    """Return the settings in a YAML file. Raises UsageError for a file that has none."""
+    try:
+        settings = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise errors.UsageError(f"{path}: cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise errors.UsageError(f"{path}: no YAML: {error}") from error
+    missing = [name for name in NEEDED if not isinstance(settings, dict) or name not in settings]
+    if missing:
+        raise errors.UsageError(f"{path}: has no {missing[0]}; {SHIPPED}/*/training.yaml show what there is")
+    return cast("dict[str, Any]", settings)
+
+
+def change_settings(settings: dict[str, Any], changes: list[str]) -> None:
+    """Apply each `a.b=value` (YAML) to the settings. Raises ValueError for a setting that is not there."""
+    for change in changes:
+        key, equals, value = change.partition("=")
+        *parents, last = key.split(".")
+        where: Any = settings
+        for parent in parents:
+            where = where.get(parent) if isinstance(where, dict) else None
+        if not equals or not isinstance(where, dict) or last not in where:
+            raise ValueError(
+                f"--set {change}: expected KEY=VALUE with a key that training.yaml has, say stop.env_steps=20000"
+            )
+        where[last] = yaml.safe_load(value)
 
 
 def cpu_seconds() -> float:
@@ -318,7 +382,6 @@ def train(settings: dict[str, Any], seed: int, folder: Path, beginning: Beginnin
                         value = float("-inf")
                     else:
                         value = validation.success(algorithm, settings)
-                        print(f"{value:.1%} success of the exported policy over {validation.episodes} episodes")
                 if is_full and value > best:
                     best = value
                     algorithm.save_to_path(str(checkpoint.resolve()))
@@ -376,15 +439,15 @@ def main() -> None:
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
         help="change a setting of training.yaml for this run, say stop.env_steps=20000 or model.use_lstm=false",
     )  # fmt: skip
+    parser.add_argument("--settings", type=Path, help="a file of your own instead of the policy's training.yaml")
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for checkpoint and curve")
     parser.add_argument("--install", action="store_true", help="replace the shipped checkpoint and curve by this run's")
     args = parser.parse_args()
-    settings = yaml.safe_load((SHIPPED / args.name / "training.yaml").read_text(encoding="utf-8"))
-    for change in args.changes:
-        try:
-            change_setting(settings, change)
-        except ValueError as error:
-            parser.error(f"--set {change}: {error}")
+    settings = read_settings(args.settings or SHIPPED / args.name / "training.yaml")
+    try:
+        change_settings(settings, args.changes)
+    except ValueError as error:
+        parser.error(str(error))
     begin = settings.get("begin")  # {with: the name of a policy that ships, forget: [observed elements]}
     beginning = None if begin is None else Beginning(SHIPPED / begin["with"], tuple(begin.get("forget", ())))
     seed = settings["seed"] if args.seed is None else args.seed

@@ -18,7 +18,8 @@ from cache import cached, versions
 
 ZOO = Path(__file__).resolve().with_name("zoo")
 APP = ZOO / "app"  # the user's own code that some of the checkpoints need
-TRAINED_WITH = [ZOO, versions("ray", "torch", "gymnasium", "numpy")]
+CONNECTORS = ZOO.parents[1] / "export/rllib/batched_connectors.py"  # our own, which one of them has
+TRAINED_WITH = [ZOO, CONNECTORS, versions("ray", "torch", "gymnasium", "numpy")]
 
 
 def training_code() -> Path:

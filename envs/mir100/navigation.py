@@ -66,6 +66,7 @@ class Mir100Navigation(RenderedEnv):
         rs_state_to_info: bool = True,
         laser_noise: float = LASER_NOISE,
         failure_reward: float = FAILURE_REWARD,
+        step_reward: float = 0.0,
         render_mode: str | None = None,
     ) -> None:
         del ip, lower_bound_port, upper_bound_port, rs_address  # no robot server to reach
@@ -73,7 +74,10 @@ class Mir100Navigation(RenderedEnv):
         super().__init__(render_mode, gui=gui)
         self.simulation = Mir100Simulation(self.WORLD, laser_noise=laser_noise)
         self._elements = self.describe()["action"]
-        self._failure_reward = failure_reward
+        for name, value in (("failure_reward", failure_reward), ("step_reward", step_reward)):
+            if not math.isfinite(value):
+                raise ValueError(f"{name} is {value}: expected a finite number")
+        self._failure_reward, self._step_reward = failure_reward, step_reward
 
         high = np.array(
             [
@@ -139,7 +143,7 @@ class Mir100Navigation(RenderedEnv):
         self.simulation.advance()
 
         distance, bearing = self._target_polar()
-        reward = -LINEAR_COST * abs(linear) - ANGULAR_COST * abs(angular)
+        reward = self._step_reward - LINEAR_COST * abs(linear) - ANGULAR_COST * abs(angular)
         if self._previous_distance is not None:  # robo-gym scores no progress in an episode's first step
             reward += PROGRESS_REWARD * (self._previous_distance - distance)
         self._previous_distance = distance

@@ -80,7 +80,7 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
     ## Constructor
 
     That of `NoObstacleNavigationMir100Sim`; `laser_noise` is the standard deviation of the readings in m, and
-    `failure_reward` what a collision gives instead of -200: a training may weigh it more.
+    `failure_reward` what a collision gives instead of -200.
 
     ## Differences from robo-gym on Gazebo
 

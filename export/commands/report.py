@@ -20,6 +20,7 @@ from rlservo.export.contract.spaces import DiscreteSpec, LeafSpec, SpaceSpec, le
 
 MANY = 64  # elements shown one by one; of more, the first and the last few
 ENDS = 8
+CHANGING = ("logarithm", "sine_and_cosine", "user_connector")  # steps after which elements are others
 
 
 def contract_report(contract: Contract) -> RenderableType:
@@ -191,7 +192,7 @@ def _shown(size: int) -> list[int | None]:
 
 def _filter(contract: Contract) -> BakedStep | None:
     """Return the filter if it has seen the observation itself, and not what another step makes of it."""
-    before = itertools.takewhile(lambda step: step.step not in ("logarithm", "user_connector"), contract.baked_in)
+    before = itertools.takewhile(lambda step: step.step not in CHANGING, contract.baked_in)
     return next((step for step in before if step.step == "mean_std_filter"), None)
 
 

@@ -24,6 +24,7 @@ from rlservo.export.recipe.recipe import (
     Preprocess,
     Previous,
     Recipe,
+    SineAndCosine,
     UserStep,
 )
 from rlservo.export.recipe.trees import Tree, space_leaves, tree_leaves
@@ -59,6 +60,8 @@ def observation_nodes(recipe: Recipe) -> nn.ModuleList:
             nodes.append(FrameStackNode(step))
         elif isinstance(step, Logarithm):
             nodes.append(LogarithmNode(step))
+        elif isinstance(step, SineAndCosine):
+            nodes.append(SineAndCosineNode(step))
         elif isinstance(step, Previous):
             nodes.append(PreviousNode(step))
         else:
@@ -199,6 +202,19 @@ class LogarithmNode(ObservationNode):
         taken = torch.zeros(obs.shape[-1], dtype=torch.bool)
         taken[self.elements] = True
         return torch.where(taken, obs.clamp(min=self.lowest).log(), obs)
+
+
+class SineAndCosineNode(ObservationNode):
+    """Some elements' sines in their place, their cosines after all others."""
+
+    def __init__(self, step: SineAndCosine) -> None:
+        super().__init__()
+        self.elements = list(step.elements)
+
+    def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it has no state
+        taken = torch.zeros(obs.shape[-1], dtype=torch.bool)
+        taken[self.elements] = True
+        return torch.cat((torch.where(taken, obs.sin(), obs), obs[..., self.elements].cos()), dim=-1)
 
 
 class PreviousNode(ObservationNode):

@@ -17,6 +17,7 @@ from rlservo.export.recipe.recipe import (
     Preprocess,
     Previous,
     Recipe,
+    SineAndCosine,
     leaf_transform,
 )
 from rlservo.export.recipe.trees import space_leaves
@@ -83,6 +84,12 @@ def observation_step(step: ObservationStep) -> BakedStep:
             step="logarithm",
             detail=f"log(max(obs, {step.lowest:g})) of {len(step.elements)} elements",
             values={"elements": list(step.elements), "lowest": step.lowest},
+        )
+    if isinstance(step, SineAndCosine):
+        return BakedStep(
+            step="sine_and_cosine",
+            detail=f"sines of {len(step.elements)} elements in their place, their cosines at the end",
+            values={"elements": list(step.elements)},
         )
     if isinstance(step, Previous):
         parts = [f"the last {step.actions} actions, one-hot"] if step.actions else []

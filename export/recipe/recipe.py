@@ -78,6 +78,13 @@ class Logarithm:
 
 
 @dataclass(frozen=True)
+class SineAndCosine:
+    """The batched connectors' SineAndCosine: some elements' sines in their place, their cosines after all others."""
+
+    elements: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class Previous:
     """RLlib's PrevActionsPrevRewards: a dict of the observation, the last actions' one-hot codes and last rewards."""
 
@@ -107,7 +114,9 @@ class Preprocess:
     space: Any
 
 
-ObservationStep: TypeAlias = ObservationFilter | Flatten | FrameStack | Logarithm | Previous | UserStep | Preprocess
+ObservationStep: TypeAlias = (
+    ObservationFilter | Flatten | FrameStack | Logarithm | SineAndCosine | Previous | UserStep | Preprocess
+)
 
 Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax", "given"]
 """How the deterministic action comes out of the distribution's parameters (or Q-values), or that it is given."""

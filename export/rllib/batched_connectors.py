@@ -6,7 +6,8 @@ action a Box, Discrete or MultiDiscrete, and the network is no LSTM or the like:
 
     use_batched_connectors(config, observation_filter=True)
 
-What RLlib does not have are the logarithm of some elements, and stacked vectors (its own stacks images).
+What RLlib does not have are the logarithm of some elements, the sine and cosine of angles, and stacked vectors (its own
+stacks images).
 
 Two are called as RLlib's own, whose work they do: a checkpoint keeps a piece's state under its class's name, so that
 what was trained with either goes on with the other, and `new_connectors.py` exports both alike. Checkpoints name this
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import ray
@@ -41,13 +42,15 @@ def use_batched_connectors(
     *,
     observation_filter: bool,
     logarithm_of: Sequence[int] = (),
+    sine_and_cosine_of: Sequence[int] = (),
     num_frames: int = 1,
     every: int = 1,
 ) -> None:
     """Put these pieces in the place of RLlib's in an `AlgorithmConfig`.
 
-    Of the observation's elements `logarithm_of` (their indices) the logarithm is taken; `observation_filter` is whether
-    observations then go through a MeanStdFilter; the network sees the last `num_frames` of them, `every` steps apart.
+    Of the observation's elements `logarithm_of` (their indices) the logarithm is taken, of `sine_and_cosine_of` both;
+    `observation_filter` is whether observations then go through a MeanStdFilter; the network sees the last `num_frames`
+    of them, `every` steps apart.
     Connectors of the configuration's own are replaced. How actions are scaled it must say before, with
     `environment(normalize_actions=..., clip_actions=...)`.
     """
@@ -55,9 +58,10 @@ def use_batched_connectors(
 
     def before(_env: Any, _spaces: Any, device: Any) -> list[ConnectorV2]:
         logarithm = [Logarithm(elements=tuple(logarithm_of))] if logarithm_of else []
+        angles = [SineAndCosine(elements=tuple(sine_and_cosine_of))] if sine_and_cosine_of else []
         batched = MeanStdFilter if observation_filter else BatchedObservations
         stacking = [FrameStacking(num_frames=num_frames, every=every, device=device)] if num_frames > 1 else []
-        return [*logarithm, batched(device=device), *stacking]
+        return [*logarithm, *angles, batched(device=device), *stacking]
 
     def after(_env: Any, _spaces: Any) -> ConnectorV2:
         return NormalizeAndClipActions(**scaling)
@@ -144,13 +148,10 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
         self._before = None
 
 
-class Logarithm(ConnectorV2):
-    """The natural logarithm of some elements of a vector, of those below LOWEST its own.
+class _OfElements(ConnectorV2):
+    """A function of some elements of a vector, which comes in the observation's place."""
 
-    For distances: what is 5 cm nearer matters at 20 cm and not at 5 m, but a filter divides both alike.
-    """
-
-    LOWEST = 0.05
+    WHAT: ClassVar[str]
 
     def __init__(
         self,
@@ -163,26 +164,75 @@ class Logarithm(ConnectorV2):
         self.elements = list(elements)
         super().__init__(input_observation_space, input_action_space, **kwargs)
 
+    def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """Return what a checkpoint keeps; RLlib itself looks for the arguments in the class alone (ray 2.60)."""
+        arguments, named = super().get_ctor_args_and_kwargs()
+        return arguments, {**named, "elements": tuple(self.elements)}
+
     def recompute_output_observation_space(self, input_observation_space: Any, input_action_space: Any) -> Any:
         del input_action_space
         space = _check_box(input_observation_space)
         if len(space.shape) != 1 or space.dtype.kind != "f":
-            raise UsageError(f"observations are {space}: logarithms are taken of a vector of floating-point numbers")
+            raise UsageError(f"observations are {space}: {self.WHAT}s are taken of a vector of floating-point numbers")
         if wrong := [index for index in self.elements if not 0 <= index < space.shape[0]]:
-            raise UsageError(f"logarithm of element {wrong[0]}: observations have elements 0 to {space.shape[0] - 1}")
-        return Box(self._logarithm(space.low), self._logarithm(space.high), dtype=space.dtype)
+            raise UsageError(f"{self.WHAT} of element {wrong[0]}: observations have elements 0 to {space.shape[0] - 1}")
+        return Box(*self.bounds(space.low, space.high), dtype=space.dtype)
 
     def __call__(self, *, batch: dict[str, Any], episodes: list[Any], **_: Any) -> dict[str, Any]:
         for episode in episodes:
             seen = episode.observations.data
-            seen[-1] = self._logarithm(seen[-1])
+            seen[-1] = self.changed(seen[-1])
             episode.observation_space = self.observation_space
         return batch
 
-    def _logarithm(self, row: Any) -> Any:
+    def changed(self, row: Any) -> Any:
+        """Return what comes in the place of one observation."""
+        raise NotImplementedError
+
+    def bounds(self, low: Any, high: Any) -> tuple[Any, Any]:
+        """Return the bounds of that."""
+        raise NotImplementedError
+
+
+class Logarithm(_OfElements):
+    """The natural logarithm of some elements of a vector, of those below LOWEST its own.
+
+    For distances: what is 5 cm nearer matters at 20 cm and not at 5 m, but a filter divides both alike.
+    """
+
+    LOWEST = 0.05
+    WHAT = "logarithm"
+
+    def changed(self, row: Any) -> Any:
         changed = row.copy()
         changed[self.elements] = np.log(np.maximum(row[self.elements], self.LOWEST))
         return changed
+
+    def bounds(self, low: Any, high: Any) -> tuple[Any, Any]:
+        return self.changed(low), self.changed(high)
+
+
+class SineAndCosine(_OfElements):
+    """The sines of some elements of a vector in their place, and their cosines after all others.
+
+    For directions: behind a robot -pi and pi are the same, but as far apart as two angles can be.
+    """
+
+    WHAT = "sine"
+
+    def changed(self, row: Any) -> Any:
+        angles = row[self.elements]
+        changed = np.concatenate([row, np.cos(angles)])
+        changed[self.elements] = np.sin(angles)
+        return changed
+
+    def bounds(self, low: Any, high: Any) -> tuple[Any, Any]:
+        edges = []
+        for bound, edge in ((low, -1.0), (high, 1.0)):
+            changed = np.concatenate([bound, np.full(len(self.elements), edge, bound.dtype)])
+            changed[self.elements] = edge
+            edges.append(changed)
+        return edges[0], edges[1]
 
 
 class FrameStacking(ConnectorV2):

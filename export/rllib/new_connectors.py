@@ -22,6 +22,7 @@ from rlservo.export.recipe.recipe import (
     ObservationFilter,
     ObservationStep,
     Previous,
+    SineAndCosine,
     Transform,
     UserStep,
 )
@@ -149,6 +150,8 @@ def _observation_step(piece: Any, files: CheckpointFiles, slot: AgentSlot) -> Ob
         return FrameStack(int(piece.num_frames), tuple(space.shape), str(space.dtype), int(getattr(piece, "every", 1)))
     if kind.__name__ == "Logarithm":
         return Logarithm(tuple(piece.elements), piece.LOWEST)
+    if kind.__name__ == "SineAndCosine":
+        return SineAndCosine(tuple(piece.elements))
     if kind.__name__ == "PrevActionsPrevRewards":
         choices = slot.part(piece.input_action_space)
         if not isinstance(choices, Discrete):

@@ -306,6 +306,18 @@ def test_a_collision_may_weigh_more_in_a_training() -> None:
     assert reward == -400.0
 
 
+def test_time_may_cost_in_a_training_but_in_the_last_step() -> None:
+    options = {"start_pose": [1.0, 2.5, 0.0], "target_pose": [-1.0, -2.5, 0.0]}
+    usual, dear = make_lab(), make_lab(step_reward=-1.0)
+    for env in (usual, dear):
+        env.reset(seed=0, options=options)
+    rewards, less = ([reward for _, reward, *_ in run(env, AHEAD)] for env in (usual, dear))
+    assert len(rewards) > 1 and rewards[-1] == less[-1] == -200.0
+    assert np.subtract(rewards[:-1], less[:-1]) == pytest.approx(1.0)
+    with pytest.raises(ValueError, match="step_reward is nan: expected a finite number"):
+        make_lab(step_reward=float("nan"))
+
+
 def test_touching_without_being_seen_is_a_collision() -> None:
     env = make_lab(laser_noise=0.0)
     env.reset(seed=0)

@@ -218,17 +218,57 @@ def test_the_logarithm_of_the_distances_is_part_of_the_checkpoint(trained: Any, 
     assert contract.baked_in[0].values["elements"] == list(range(4, 20))
 
 
-def test_means_outside_the_actions_bounds_cost_what_they_are_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def penalties(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Makes a learner with such settings, whose loss without them is 1, and whose network answers as told."""
     monkeypatch.syspath_prepend(EXAMPLES)
     train_shipped = load("train_shipped")
-    monkeypatch.setattr(train_shipped.PPOTorchLearner, "compute_loss_for_module", lambda *_, **__: torch.tensor(1.0))
-    inputs = torch.tensor([[0.5, -3.0, 9.0, 9.0], [1.5, 1.0, 9.0, 9.0]])  # two means, two log deviations
-    config = SimpleNamespace(learner_config_dict={"bounds_loss_coeff": 0.1})
-    loss = train_shipped.LearnerWithBounds.compute_loss_for_module(
-        object.__new__(train_shipped.LearnerWithBounds),
-        module_id="default_policy", config=config, batch={}, fwd_out={"action_dist_inputs": inputs},
-    )  # fmt: skip
-    assert loss.item() == pytest.approx(1.0 + 0.1 * (4.0 + 0.25) / 2)
+    base = train_shipped.PPOTorchLearner
+    monkeypatch.setattr(base, "compute_loss_for_module", lambda *_, **__: torch.tensor(1.0))
+    monkeypatch.setattr(base, "build", lambda self: None)
+    monkeypatch.setattr(base, "after_gradient_based_update", lambda self, *, timesteps: None)
+
+    def make(module: Any = None, **settings: Any) -> Any:
+        learner = object.__new__(train_shipped.ActionPenaltyLearner)
+        learner.config, learner._module = SimpleNamespace(learner_config_dict=settings), {"default_policy": module}
+        learner.build()
+        return learner
+
+    return make
+
+
+def loss_of(learner: Any, inputs: list[list[float]], batch: dict[str, Any]) -> float:
+    outputs = {"action_dist_inputs": torch.tensor(inputs)}
+    loss = learner.compute_loss_for_module(
+        module_id="default_policy", config=learner.config, batch=batch, fwd_out=outputs
+    )
+    return float(loss)
+
+
+def test_means_outside_the_actions_bounds_cost_what_they_are_outside(penalties: Callable[..., Any]) -> None:
+    inputs = [[0.5, -3.0, 9.0, 9.0], [1.5, 1.0, 9.0, 9.0]]  # two means, two log deviations
+    learner = penalties(bounds_loss_coeff=0.1)
+    assert loss_of(learner, inputs, {}) == pytest.approx(1.0 + 0.1 * (4.0 + 0.25) / 2)
+
+
+def test_a_step_to_the_next_observations_mean_costs_its_square_within_the_bounds(
+    penalties: Callable[..., Any],
+) -> None:
+    after = torch.tensor([[0.3, -5.0, 9.0, 9.0], [1.0, 1.0, 9.0, 9.0], [-1.0, -1.0, 9.0, 9.0]])
+    network = SimpleNamespace(forward_train=lambda batch: {"action_dist_inputs": after + 0.0 * batch["obs"]})
+    inputs = [[0.5, -3.0, 9.0, 9.0], [0.0, 1.0, 9.0, 9.0], [1.0, 1.0, 9.0, 9.0]]
+    batch = {"new_obs": torch.zeros(3, 1), "loss_mask": torch.tensor([True, True, False])}
+    learner = penalties(network, smoothness_loss_coeff=2.0)
+    assert loss_of(learner, inputs, batch) == pytest.approx(1.0 + 2.0 * (0.04 + 1.0) / 2)
+
+
+def test_standard_deviations_stay_below_their_bound_over_the_steps(penalties: Callable[..., Any]) -> None:
+    network = torch.nn.Module()
+    network.log_std = torch.nn.Parameter(torch.log(torch.tensor([0.9, 0.1])))
+    learner = penalties(network, largest_std=[[0, 1.0], [1000, 1.0], [2000, 0.2]])
+    for steps, largest in ((500, 0.9), (1500, 0.6), (3000, 0.2)):
+        learner.after_gradient_based_update(timesteps={"num_env_steps_sampled_lifetime": steps})
+        assert torch.allclose(network.log_std.exp(), torch.tensor([largest, 0.1]))
 
 
 def test_training_begins_with_another_network_without_the_elements_it_shall_forget(trained: Any) -> None:

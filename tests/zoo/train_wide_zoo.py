@@ -90,7 +90,9 @@ def ppo(obs: str, action: str, *before: Any, model: Any = SMALL, spec: Any = Non
 
 def stacked_vectors() -> Any:
     config = ppo("vector", "box")
-    use_batched_connectors(config, observation_filter=True, logarithm_of=(0, 2), num_frames=3, every=2)
+    use_batched_connectors(
+        config, observation_filter=True, logarithm_of=(0, 2), sine_and_cosine_of=(1,), num_frames=3, every=2
+    )
     return config
 
 

@@ -136,6 +136,23 @@ def test_logarithms_are_taken_of_the_elements_that_were_asked_for() -> None:
         batched_connectors.Logarithm(space, gymnasium.spaces.Discrete(2), elements=(1, 3))
 
 
+def test_angles_become_sines_in_their_place_and_cosines_at_the_end() -> None:
+    space = gymnasium.spaces.Box(np.array([-np.pi, 0, -np.pi], np.float32), np.array([np.pi, 29, np.pi], np.float32))
+    piece = batched_connectors.SineAndCosine(space, gymnasium.spaces.Discrete(2), elements=(0, 2))
+    np.testing.assert_array_equal(piece.observation_space.low, np.float32([-1, 0, -1, -1, -1]))
+    np.testing.assert_array_equal(piece.observation_space.high, np.float32([1, 29, 1, 1, 1]))
+    seen = np.array([3.0, 7.0, -0.5], np.float32)
+    episode = SingleAgentEpisode(observation_space=space, observations=[seen.copy()])
+    piece(batch={}, episodes=[episode])
+    expected = [np.sin(3.0), 7.0, np.sin(-0.5), np.cos(3.0), np.cos(-0.5)]
+    np.testing.assert_allclose(episode.get_observations(-1), expected, rtol=1e-6)
+    assert episode.get_observations(-1).dtype == np.float32
+    behind = [piece.changed(np.array([angle, 7.0, 0.0], np.float32)) for angle in (np.pi, -np.pi)]
+    np.testing.assert_allclose(*behind, atol=1e-6)
+    with pytest.raises(UsageError, match="sine of element 3: observations have elements 0 to 2"):
+        batched_connectors.SineAndCosine(space, gymnasium.spaces.Discrete(2), elements=(3,))
+
+
 def test_images_are_not_stacked_as_vectors() -> None:
     image = gymnasium.spaces.Box(0.0, 1.0, (8, 8, 1))
     with pytest.raises(UsageError, match=r"frames are stacked of vectors; RLlib's FrameStacking has images"):
