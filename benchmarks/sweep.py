@@ -18,7 +18,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from rlservo.serve_app.rollout.report import wilson_interval
 
 VARIANTS = Path(__file__).resolve().parent / "variants"
 FIRST_SEED = 60_000
+TOLD_EVERY_S = 10.0
 HEAD = "| variant | seed | steps | CPU s | {starts} | over all | 95% interval |"
 
 
@@ -59,6 +60,13 @@ class Trial:
                 stdout=log, stderr=subprocess.STDOUT, check=True,
             )  # fmt: skip
         return (self.folder / name / "curve.csv").read_text(encoding="utf-8").splitlines()[-1]
+
+    def how_far(self) -> str:
+        """Return what its training said last."""
+        log = self.folder / "log"
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
+        last = next((line.partition("  return")[0] for line in reversed(lines) if line.startswith("steps ")), "begins")
+        return f"{self.variant}, seed {self.seed}: {' '.join(last.split())}"
 
     def judge(self, name: str, episodes: int, first_seed: int) -> list[evaluate_shipped.Evaluation]:
         """Export what was trained, and let it act."""
@@ -132,9 +140,13 @@ def main() -> None:
     print(f"{len(trials)} trainings, {args.jobs} at a time; logs in {folder}", flush=True)
     failed = []
     with ThreadPoolExecutor(args.jobs) as pool:
-        running = {pool.submit(trial.train, args.name): trial for trial in trials}
-        for ended in as_completed(running):
-            trial = running[ended]
+        waiting: dict[Future[str], Trial] = {pool.submit(trial.train, args.name): trial for trial in trials}
+        while waiting:
+            ended = next(iter(wait(waiting, timeout=TOLD_EVERY_S, return_when=FIRST_COMPLETED).done), None)
+            if ended is None:
+                print("; ".join(trial.how_far() for future, trial in waiting.items() if future.running()), flush=True)
+                continue
+            trial = waiting.pop(ended)
             try:
                 curve = ended.result()
             except subprocess.CalledProcessError:

@@ -85,6 +85,14 @@ def test_a_training_that_fails_does_not_end_the_others(
     assert "| quick | 0 |" in (tmp_path / "sweep-ur5_positioning.md").read_text()
 
 
+def test_it_says_how_far_the_trainings_are(tmp_path: Path) -> None:
+    trial = sweep.Trial("wide", 3, {}, tmp_path)
+    assert trial.how_far() == "wide, seed 3: begins"
+    said = ("WARNING", "steps      8,192 of 20,000  return 1.0", "steps     16,384 of 20,000  return 2.0", "exported")
+    (tmp_path / "log").write_text("\n".join(said))
+    assert trial.how_far() == "wide, seed 3: steps 16,384 of 20,000"
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
