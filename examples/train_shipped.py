@@ -340,14 +340,15 @@ def _forget(learner: Any, columns: list[int], count: int) -> None:
                 weight[:, columns] = 0.0
 
 
-def train(settings: dict[str, Any], seed: int, folder: Path, beginning: Beginning | None = None) -> list[Row]:
+def train(
+    config: AlgorithmConfig, settings: dict[str, Any], folder: Path, beginning: Beginning | None = None
+) -> list[Row]:
     """Train until the stop metric or the steps are reached; leave `folder/checkpoint` (the best) and `curve.csv`."""
     stop = settings["stop"]
     validation = Validation(**settings["validation"]) if "validation" in settings else None
     rows: list[Row] = []
     best, reached_milestone = float("-inf"), False
     checkpoint = folder / "checkpoint"
-    config = algorithm_config(settings, seed)
     resources.check_room(resources.request_of(config), resources.ray_room("the one process that trains"), config=config)
     algorithm = config.build_algo()
     if beginning is not None:
@@ -457,8 +458,9 @@ def main() -> None:
     # Checkpoints hold functions of this file. Pickled by value, they load where it does not exist.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
     torch.set_num_threads(1)
+    config = algorithm_config(settings, seed)  # what is wrong in the settings is said before Ray starts
     with ray_session(num_cpus=1):
-        rows = train(settings, seed, folder, beginning)
+        rows = train(config, settings, folder, beginning)
     draw(rows, f"{args.name}, {settings['algorithm']}, seed {seed}", folder / "curve.png")
     print(f"best checkpoint: {folder / 'checkpoint'}")
     if args.install:
