@@ -5,7 +5,8 @@
 
 One machine, one run, one policy (the shipped UR5's), one load generator (`wrk`, and for what it does not speak a line
 client in Python). The peers come from PyPI and npm, each in an environment of its own, with one worker each. All
-servers run at the same time and take turns in short rounds, so that a slow moment of the machine falls on all of them.
+servers run at the same time and take turns in short rounds, so that a slow moment of the machine falls on all of them;
+after them one replica and two, alone on the machine.
 What is compared are ratios within rounds; absolute times belong to the machine. CPU time per request, of all of a
 server's processes, depends on it less. Robots at their pace come from `speed/paced.py`, whose own share of a tail falls
 on all servers alike. Results go to bench/serving.md, .json and .svg; with --publish the table and the chart also to
@@ -34,10 +35,10 @@ from rich.console import Console
 from rich.table import Table
 
 from speed import report
-from speed.catalogue import BARE_ASGI, DIRECT, MAKERS, RLLIB, RLSERVO, Case, case_of, direct, servers
+from speed.catalogue import BARE_ASGI, DIRECT, MAKERS, RLLIB, RLSERVO, TWO, Case, case_of, direct, rlservo, servers
 from speed.machine import REPLICA, pss_mb
 from speed.report import Result, verdicts
-from speed.rounds import PLANNED_HZ, Rounds, carried, check_answers
+from speed.rounds import PLANNED_HZ, Rounds, Samples, carried, check_answers, scaling
 from speed.servers import Server, StartError, running
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -144,6 +145,8 @@ def measure(
         }
         replica_mb, server_mb = memory(started)
         console.print("stopping the servers ...")
+    for key, taken in two_replicas(case, folder, mark, arguments, console).items():
+        samples[key] = taken
     return Result(samples, cold, replica_mb, server_mb, missing, robots)
 
 
@@ -156,6 +159,19 @@ def cold_starts(pair: list[Server], folder: Path, mark: str, times: int, console
                 taken[server.name].append(server.cold_start_s)
                 console.print(f"cold start {number + 1} of {times}, {server.name}: {server.cold_start_s:.1f} s")
     return {name: statistics.median(each) for name, each in taken.items() if each}
+
+
+def two_replicas(case: Case, folder: Path, mark: str, arguments: argparse.Namespace, console: Console) -> Samples:
+    """Measure one replica and two in turns, each with the machine to itself: two take all of two cores."""
+    samples: Samples = {}
+    pair = [rlservo(case, folder), rlservo(case, folder, TWO, 2)]
+    for number in range(arguments.rounds):
+        for server in pair:
+            console.print(f"round {number + 1} of {arguments.rounds}, alone on the machine: {server.name}")
+            with running(server, folder, mark):
+                for key, one in scaling([server, direct(server)], folder, arguments.seconds).items():
+                    samples.setdefault(key, []).append(one)
+    return samples
 
 
 def memory(compared: list[Server]) -> tuple[dict[str, float], dict[str, float]]:

@@ -21,7 +21,8 @@ from speed.servers import Exchange, Server
 
 PEERS = Path(__file__).resolve().parent.parent / "peers"
 BARE, RLSERVO, TWO = "uvicorn + FastAPI", "rlservo serve", "rlservo serve, 2 replicas"
-DIRECT = "rlservo serve, direct port"
+DIRECTLY = ", direct port"
+DIRECT = RLSERVO + DIRECTLY
 BARE_ASGI, GRANIAN = "uvicorn, bare ASGI", "granian, bare ASGI"
 MOSEC, FASTIFY = "mosec", "fastify + onnxruntime-node"
 MLSERVER, LITSERVE, BENTOML = "MLServer", "LitServe", "BentoML"
@@ -116,7 +117,7 @@ def rlservo(case: Case, _folder: Path, name: str = RLSERVO, replicas: int = 1) -
 def direct(server: Server) -> Server:
     """Return a started server of ours as who goes without its proxy sees it."""
     assert server.direct_port is not None
-    return replace(server, name=DIRECT, port=server.direct_port, grpc_port=None)
+    return replace(server, name=server.name + DIRECTLY, port=server.direct_port, grpc_port=None)
 
 
 def asked(case: Case, name: str, command: list[str], port: int, grpc_port: int | None = None) -> Server:
@@ -133,10 +134,6 @@ def asked(case: Case, name: str, command: list[str], port: int, grpc_port: int |
         greets=True,
         grpc_port=grpc_port,
     )
-
-
-def two_replicas(case: Case, folder: Path) -> Server:
-    return rlservo(case, folder, TWO, 2)
 
 
 def bare(case: Case, _folder: Path) -> Server:
@@ -218,7 +215,6 @@ def rllib_example(case: Case, folder: Path) -> Server:
 
 MAKERS: dict[str, Callable[[Case, Path], Server]] = {
     RLSERVO: rlservo,
-    TWO: two_replicas,
     BARE: bare,
     BARE_ASGI: bare_asgi,
     GRANIAN: granian,

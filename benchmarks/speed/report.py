@@ -16,6 +16,7 @@ from speed.catalogue import (
     BENTOML,
     DEFAULTS,
     DIRECT,
+    DIRECTLY,
     FASTIFY,
     GRANIAN,
     LITSERVE,
@@ -37,6 +38,7 @@ from speed.rounds import (
     LARGE,
     LINE,
     ONE,
+    ONES,
     PLANNED_HZ,
     STREAM,
     Sample,
@@ -159,20 +161,17 @@ def verdicts(result: Result) -> list[Verdict]:
         ),
         Verdict("memory of a replica, over the RLlib example's", memory, 0.6),
         Verdict("cold start to the first answer, over the RLlib example's", start, 0.8),
-        Verdict(
-            "requests/s of two replicas, over one's, single observations",
-            ratio((JSON16, TWO), ours16, rate),
-            None,
-            1.5,
-            limits(result, JSON16),
-        ),
-        Verdict(
-            "requests/s of two replicas, over one's, batches of 64",
-            ratio((HEAVY, TWO), (HEAVY, RLSERVO), rate),
-            None,
-            1.5,
-            limits(result, HEAVY),
-        ),
+        *[
+            Verdict(
+                f"requests/s of two replicas, over one's, {what}{way}",
+                ratio((measure, TWO + way), (measure, RLSERVO + way), rate),
+                None,
+                least,
+                limits(result, measure, way),
+            )
+            for measure, what, least in ((ONES, "single observations", 1.5), (HEAVY, "batches of 64", 1.6))
+            for way in ("", DIRECTLY)
+        ],
         *_beside_the_least(result),
     ]
 
@@ -227,10 +226,10 @@ def _beside_the_least(result: Result) -> list[Verdict]:
     return found
 
 
-def limits(result: Result, measure: str) -> str:
+def limits(result: Result, measure: str, way: str) -> str:
     """Say what each part used while one and two replicas were loaded [cores]."""
     parts = []
-    for name, said in ((RLSERVO, "one"), (TWO, "two")):
+    for name, said in ((RLSERVO + way, "one"), (TWO + way, "two")):
         shares = {role: result.median(measure, name, _cores_of(role)) for role in ("generator", PROXY, REPLICA, OTHER)}
         parts.append(f"{said}: " + ", ".join(f"{role} {used or 0:.2f}" for role, used in shares.items()))
     return f"cores busy with {'; with '.join(parts)}"

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from speed import loads
-from speed.catalogue import BARE, BARE_ASGI, BATCH, DIRECT, RLLIB, RLSERVO, TWO, Case
+from speed.catalogue import BARE, BARE_ASGI, BATCH, DIRECT, RLLIB, RLSERVO, Case
 from speed.loads import GrpcLine, HttpLine, Load, RefusedError, WebSocketLine
 from speed.machine import OTHER, PROXY, REPLICA, cpu_by_role
 from speed.paced import SETTLE_S, http_robot, paced, paced_calls, stream_robot
@@ -25,7 +25,8 @@ from speed.servers import Server, ask
 
 IN_PROCESS = "onnxruntime in process"
 JSON1, JSON16, LINE, STREAM, GRPC = "json, 1 connection", "json, 16 connections", "json line", "websocket", "grpc"
-LARGE, HEAVY = f"binary, batch of {BATCH}", "binary, batch of 64, 16 connections"
+LARGE = f"binary, batch of {BATCH}"
+ONES, HEAVY = "alone: json, 16 connections", "alone: binary, batch of 64, 16 connections"
 ONE = "one observation"
 JSON64 = "json, 64 connections"
 CONNECTIONS, MANY_CONNECTIONS = 16, 64
@@ -75,8 +76,7 @@ class Rounds:
         session = session_of(case)
         single, many = {"obs": case.obs[None]}, {"obs": case.batch(BATCH)}
 
-        def over_wrk(server: Server, exchange: Any, connections: int) -> Turn:
-            return lambda: loads.wrk(server.port, exchange, folder, connections=connections, seconds=seconds)
+        over_wrk = partial(wrk_turn, folder=folder, seconds=seconds)
 
         def over(open_line: Callable[[], Any]) -> Turn:
             def turn() -> Load:
@@ -90,13 +90,10 @@ class Rounds:
             return lambda: loads.timed(lambda: session.run(["action"], feed), seconds)
 
         ours = [server for server in self._servers.values() if server.name in (RLSERVO, DIRECT, BARE, BARE_ASGI)]
-        compared = [server for server in self._servers.values() if server.name != TWO]
-        two = [server for server in self._servers.values() if server.name in (RLSERVO, TWO)]
+        compared = list(self._servers.values())
         self._add(ONE, [(IN_PROCESS, in_process(single))])
         self._add(JSON1, [(server.name, over_wrk(server, server.act, 1)) for server in compared])
-        self._add(
-            JSON16, [(server.name, over_wrk(server, server.act, CONNECTIONS)) for server in self._servers.values()]
-        )
+        self._add(JSON16, [(server.name, over_wrk(server, server.act, CONNECTIONS)) for server in compared])
         self._add(JSON64, [(one.name, over_wrk(one, one.act, MANY_CONNECTIONS)) for one in compared])
         self._add(LINE, [(one.name, over(partial(HttpLine, one.port, one.act))) for one in ours])
         streams = [
@@ -113,8 +110,6 @@ class Rounds:
         self._add(GRPC, calls)
         large = [(one.name, over(partial(HttpLine, one.port, one.batch))) for one in ours if one.batch is not None]
         self._add(LARGE, [(IN_PROCESS, in_process(many)), *large])
-        heavy = [(one.name, over_wrk(one, one.heavy, CONNECTIONS)) for one in two if one.heavy is not None]
-        self._add(HEAVY, heavy)
         for robots, rate_hz in fleets:
             fleet: dict[str, Any] = {"robots": robots, "rate_hz": rate_hz, "seconds": seconds}
             self._add(
@@ -160,17 +155,36 @@ class Rounds:
         return samples
 
     def _sample(self, name: str, turn: Turn) -> Sample:
-        server = self._servers.get(name)
-        members = {} if server is None else server.members()
-        before = cpu_by_role(members)
-        load = turn()
-        after = cpu_by_role(members)
-        return Sample(load, {role: after[role] - before[role] for role in (REPLICA, PROXY, OTHER)})
+        return sample(self._servers.get(name), turn)
 
     def _warm(self) -> None:
         for measure, _, turn in self._turns:
             if not is_paced(measure):  # which settles first
                 turn()
+
+
+def wrk_turn(server: Server, exchange: Any, connections: int, *, folder: Path, seconds: int) -> Turn:
+    return lambda: loads.wrk(server.port, exchange, folder, connections=connections, seconds=seconds)
+
+
+def sample(server: Server | None, turn: Turn) -> Sample:
+    """Take a turn, and what the server's processes use meanwhile."""
+    members = {} if server is None else server.members()
+    before = cpu_by_role(members)
+    load = turn()
+    after = cpu_by_role(members)
+    return Sample(load, {role: after[role] - before[role] for role in (REPLICA, PROXY, OTHER)})
+
+
+def scaling(ways: Iterable[Server], folder: Path, seconds: int) -> dict[tuple[str, str], Sample]:
+    """Return one sample of each measure that tells what a second replica is worth, of one server's `ways` in."""
+    found = {}
+    for measure, name_of in ((ONES, "act"), (HEAVY, "heavy")):
+        for way in ways:
+            turn = wrk_turn(way, getattr(way, name_of), CONNECTIONS, folder=folder, seconds=seconds)
+            turn()  # what it has to do once is not what is measured
+            found[measure, way.name] = sample(way, turn)
+    return found
 
 
 def paced_measure(protocol: str, robots: int, rate_hz: float) -> str:

@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +27,11 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 from soak import Track, mix, soak
 from speed import report
-from speed.catalogue import BARE, RLLIB, RLSERVO, TWO, Case, binary, case_of, plain
+from speed.catalogue import BARE, DIRECTLY, RLLIB, RLSERVO, TWO, Case, binary, case_of, plain
 from speed.loads import HttpLine, Load, LoadError, WebSocketLine, infer_request, wrk
 from speed.machine import OTHER, PROXY, REPLICA, processes
 from speed.report import Result, Verdict, verdicts
-from speed.rounds import JSON1, JSON16, JSON64, Rounds, Sample, check_answers
+from speed.rounds import HEAVY, JSON1, JSON16, JSON64, ONES, Rounds, Sample, check_answers, scaling
 from speed.servers import Exchange, Server, listening, running
 from stores import load_store
 
@@ -121,6 +122,13 @@ def test_a_round_samples_every_measure_it_can(server: Server, case: Case, tmp_pa
         assert load.count <= 4 * 20 * (1 + waited_s) + 10  # no more than robots ask, however quick the server is
 
 
+@needs_wrk
+def test_one_replica_and_two_are_measured_by_every_way_in(server: Server, tmp_path: Path) -> None:
+    samples = scaling([server, replace(server, name=RLSERVO + DIRECTLY)], tmp_path, 1)
+    assert samples.keys() == {(measure, RLSERVO + way) for measure in (ONES, HEAVY) for way in ("", DIRECTLY)}
+    assert all(taken.load.count > 0 for taken in samples.values())
+
+
 def test_grpc_request_is_what_the_protocols_message_reads(case: Case) -> None:
     """The hand-written bytes against protobuf's own parser, with the fields of the protocol's specification."""
     kinds = descriptor_pb2.FieldDescriptorProto
@@ -162,7 +170,10 @@ def test_ratios_are_taken_within_rounds_and_their_median_counts(tmp_path: Path) 
         (JSON16, RLSERVO): [sample(1.0, 4000.0)],
         (JSON16, BARE): [sample(1.0, 5000.0)],
         (JSON16, RLLIB): [sample(1.0, 100.0)],
-        (JSON16, TWO): [sample(1.0, 5000.0)],
+        (ONES, RLSERVO): [sample(1.0, 4000.0)],
+        (ONES, TWO): [sample(1.0, 5000.0)],
+        (HEAVY, RLSERVO + DIRECTLY): [sample(1.0, 2000.0)],
+        (HEAVY, TWO + DIRECTLY): [sample(1.0, 3300.0)],
     }
     result = Result(samples, {RLSERVO: 8.0, RLLIB: 16.0}, {RLSERVO: 100.0}, {RLSERVO: 800.0}, {"bentoml": "no network"})
     by_name = {verdict.what: verdict for verdict in verdicts(result)}
@@ -172,6 +183,7 @@ def test_ratios_are_taken_within_rounds_and_their_median_counts(tmp_path: Path) 
     assert by_name["cold start to the first answer, over the RLlib example's"].measured == pytest.approx(0.5)
     two = by_name["requests/s of two replicas, over one's, single observations"]
     assert two.holds is False and "replica 0.50" in two.note
+    assert by_name["requests/s of two replicas, over one's, batches of 64, direct port"].holds
     assert by_name["memory of a replica, over the RLlib example's"].holds is None  # the peer's was not measured
     facts = {"cores": 2, "rounds": 3, "seconds": 1, "load_average": (0.5, 0.5, 0.5)}
     text = report.markdown(result, facts)
