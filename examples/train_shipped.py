@@ -261,7 +261,8 @@ class Validation:
                 evaluations = evaluate_shipped.evaluate(policy, settings, self.episodes, self.seed)
         for one in evaluations:
             endings = ", ".join(f"{count} {status}" for status, count in sorted(one.endings.items()))
-            print(f"exported, {one.start}: {one.successes} of {one.episodes} succeeded ({endings})", flush=True)
+            succeeded = f"{one.successes} of {one.episodes} episodes succeeded"
+            print(f"exported, {one.start}: {succeeded} ({endings})", flush=True)
         return sum(one.successes or 0 for one in evaluations) / sum(one.episodes for one in evaluations)
 
 

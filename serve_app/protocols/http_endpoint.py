@@ -56,7 +56,9 @@ TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been
 STAMP_HEADER = STAMP.encode()
 ROOT = "/"  # a page for browsers (`status_page.py`), nothing for programs
 
-REPLY = "rlservo.reply"  # in a connection's scope: writes (status, headers, body) at once, False where that has to wait
+# In a connection's scope, where its server has them:
+REPLY = "rlservo.reply"  # writes (status, headers, body) at once, False where that has to wait
+AT_ONCE = "rlservo.at_once"  # takes what answers a WebSocket's message, for one that comes while it is waited for
 
 Body = bytes | bytearray
 

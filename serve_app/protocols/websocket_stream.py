@@ -32,6 +32,7 @@ from rlservo.export.contract.errors import (
 from rlservo.serve_app.episodes.request import Request, new_episode_id
 from rlservo.serve_app.episodes.sessions import Session
 from rlservo.serve_app.protocols.direct_routes import StreamRoute
+from rlservo.serve_app.protocols.http_endpoint import AT_ONCE
 from rlservo.serve_app.protocols.http_errors import encode_bug, error_answer, fail_stream, refuse_upgrade
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
@@ -105,7 +106,11 @@ class StreamEndpoint:
         opening.stream = Session(policy) if policy.is_stateful else None
         try:
             await send(_binary(encode_metadata(policy.contract)))
-            await self._answer_all(opening, scope, receive, send, idle)
+            conversation = _Conversation(core, self._codec, opening, scope, idle)
+            if (answer_at_once := scope.get(AT_ONCE)) is not None:
+                answer_at_once(conversation.answer)
+            while (message := await receive())["type"] != "websocket.disconnect":
+                await send(await conversation.answer(message))
         except asyncio.CancelledError:
             if not idle.expired:
                 raise
@@ -126,49 +131,6 @@ class StreamEndpoint:
                 core.episodes.sessions.release(opening.stream)
             core.close_stream(opening)
 
-    async def _answer_all(self, opening: Request, scope: Scope, receive: Receive, send: Send, idle: IdleTimer) -> None:
-        """Answer request by request. Raises RlservoError, which has been recorded, where it ends the stream."""
-        core, codec = self._core, self._codec
-        keeps = KEEP in scope.get("query_string", b"").split(b"&")
-        key = StreamKey(core.keys, presented_key(scope[HEADERS]))
-        timings: dict[str, float] | None = None
-        waited: float | None = None
-        while True:
-            message = await receive()
-            request = Request(
-                PROTOCOL,
-                opening.policy,
-                opening.version,
-                time.perf_counter(),
-                label=opening.label,
-                request_id=opening.request_id,
-                waited=waited,
-                stream=opening.stream,
-                stream_id=opening.stream_id,
-                reply_options=timings,
-            )
-            idle.touch()
-            if message["type"] == "websocket.disconnect":
-                return
-            waited = None
-            try:
-                try:
-                    key.check()
-                except RlservoError as error:
-                    core.record_failure(request, error.code, error.message)
-                    raise
-                reply = await core.answer(codec, request, message)
-            except RlservoError as error:
-                if not keeps or isinstance(error, REVOKED):  # which ends every stream
-                    raise
-                await send({"type": "websocket.send", "text": _with_seq(error_answer(error)[1], request.seq)})
-                continue
-            await send(_binary(reply))
-            taken_s = time.perf_counter() - request.received
-            timings = {"prev_total_ms": taken_s * 1e3}
-            if taken_s > core.admission.max_wait_s:
-                waited = 0.0  # the loop stood still for this answer, and the next request comes after it
-
     def _address(self, params: Mapping[str, str]) -> tuple[str, str | None]:
         """Return (policy, version) that a path's parameters name; without any it is the default policy."""
         if "name" in params:
@@ -182,6 +144,51 @@ class StreamEndpoint:
                 {"policies": list(names)},
             )
         return default, None
+
+
+class _Conversation:
+    """Answers the messages of one connection, one after the other."""
+
+    def __init__(self, core: Core, codec: MsgpackCodec, opening: Request, scope: Scope, idle: IdleTimer) -> None:
+        self._core, self._codec, self._opening, self._idle = core, codec, opening, idle
+        self._keeps = KEEP in scope.get("query_string", b"").split(b"&")
+        self._key = StreamKey(core.keys, presented_key(scope[HEADERS]))
+        self._timings: dict[str, float] | None = None
+        self._waited: float | None = None
+
+    async def answer(self, message: Message) -> Message:
+        """Return the reply. Raises RlservoError, which has been recorded, where it ends the stream."""
+        core, opening = self._core, self._opening
+        request = Request(
+            PROTOCOL,
+            opening.policy,
+            opening.version,
+            time.perf_counter(),
+            label=opening.label,
+            request_id=opening.request_id,
+            waited=self._waited,
+            stream=opening.stream,
+            stream_id=opening.stream_id,
+            reply_options=self._timings,
+        )
+        self._idle.touch()
+        self._waited = None
+        try:
+            try:
+                self._key.check()
+            except RlservoError as error:
+                core.record_failure(request, error.code, error.message)
+                raise
+            reply = await core.answer(self._codec, request, message)
+        except RlservoError as error:
+            if not self._keeps or isinstance(error, REVOKED):  # which ends every stream
+                raise
+            return {"type": "websocket.send", "text": _with_seq(error_answer(error)[1], request.seq)}
+        taken_s = time.perf_counter() - request.received
+        self._timings = {"prev_total_ms": taken_s * 1e3}
+        if taken_s > core.admission.max_wait_s:
+            self._waited = 0.0  # the loop stood still for this answer, and the next request comes after it
+        return _binary(reply)
 
 
 class IdleTimer:

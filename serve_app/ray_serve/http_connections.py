@@ -10,10 +10,12 @@ uvicorn (0.54) bounds one phase of a connection, the idle time after a reply. Fo
 And it takes a head of any size. Of WebSockets see `websocket_connections.py`.
 
 A request for an action that came whole is answered at once where nothing has to wait, in the turn of the event loop
-that reads it, and its reply is written in one piece. A head that comes again is not parsed again.
+that reads it, and its reply is written in one piece. A head that comes again is not parsed again, and the object that
+uvicorn makes for each request serves it again.
 
 `install` puts subclasses in place of the classes that uvicorn chooses, in each of Serve's processes that serves HTTP
-(`ingress.py`). One timer a connection checks its phase; a request costs two assignments. In front of the replicas
+(`ingress.py`). One timer a connection checks its phase, the idle time too, for which uvicorn has a timer a reply; a
+request costs three assignments. In front of the replicas
 HAProxy has time-outs of its own (`haproxy/configuration.py`).
 """
 
@@ -23,13 +25,12 @@ import asyncio
 import functools
 import re
 import socket
-import sys
-import types
-from collections.abc import Callable, Coroutine, Generator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from rlservo.serve_app.protocols.http_endpoint import REPLY, WholeBody
 from rlservo.serve_app.ray_serve import uvicorn_parts
+from rlservo.serve_app.ray_serve.eager_tasks import start_at_once
 from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
 from rlservo.serve_app.ray_serve.uvicorn_parts import (
     STATUS_LINE,
@@ -148,6 +149,13 @@ class EarlyEnd(RequestResponseCycle):
 
     ends_early = False
 
+    def begin_again(self, scope: Any, default_headers: Any, on_response: Callable[[], None]) -> None:
+        """Serve another request: this one's is answered, and nothing uses it any more."""
+        self.scope, self.default_headers, self.on_response = scope, default_headers, on_response
+        self.response_started = self.response_complete = False
+        self.chunked_encoding, self.expected_content_length = None, 0
+        self.message_event.clear()
+
     async def send(self, message: Any) -> None:
         """Write a part of the reply."""
         if self.response_started or not self.more_body:
@@ -164,6 +172,7 @@ class TimedProtocol(HttpToolsProtocol):
     body_s = BODY_S
     is_request_immediate: Callable[[Scope], bool] = staticmethod(lambda _: False)
     _head_since: float | None = None  # since when a head is awaited; None while something else is
+    _idle_since: float | None = None  # since when nothing has come after a reply
     _body_since = 0.0  # since when the request's body is awaited
     _timer: asyncio.TimerHandle | None = None
     _replies: JoinedWrites
@@ -175,6 +184,7 @@ class TimedProtocol(HttpToolsProtocol):
     _known: RepeatedHead | None = None  # the head that is expected to come again
     _lessons = MOST_LESSONS
     _answered: Any = None  # the scope of the request that was answered at once in this read
+    _spare: EarlyEnd | None = None  # of a known request that was answered at once, for the next one
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first head."""
@@ -224,9 +234,14 @@ class TimedProtocol(HttpToolsProtocol):
         """Answer a request whose head need not be parsed; return False where it is to take the ordinary way."""
         if not self.is_immediate(scope):
             return False
-        self._unset_keepalive_if_required()
+        self._idle_since = None
         self._replies.head = None
         self.scope, self.headers = scope, scope["headers"]
+        cycle = self._spare
+        if cycle is not None and cycle is self.cycle and cycle.keep_alive:
+            cycle.begin_again(scope, self.server_state.default_headers, self.on_response_complete)
+            self._answer(cycle, body)
+            return True
         self.cycle = cycle = EarlyEnd(
             scope=scope,
             transport=cast("asyncio.Transport", self._replies),
@@ -241,7 +256,7 @@ class TimedProtocol(HttpToolsProtocol):
             on_response=self.on_response_complete,
         )
         cycle.more_body = False
-        self._answer(cycle, body)
+        self._spare = cycle if self._answer(cycle, body) else None
         return True
 
     def handle_websocket_upgrade(self) -> None:
@@ -276,12 +291,21 @@ class TimedProtocol(HttpToolsProtocol):
                 self._answered = {**cycle.scope}
             self._answer(cycle, bytes(cycle.body))
 
+    def _unset_keepalive_if_required(self) -> None:
+        self._idle_since = None
+
     def on_response_complete(self) -> None:
-        """Give a client that is still sending a moment to take its reply, and close."""
-        super().on_response_complete()
+        """Begin to wait for the next request; give a client that is still sending a moment to take its reply."""
+        self.server_state.total_requests += 1
+        if self.transport.is_closing():
+            return
+        self.flow.resume_reading()
+        if self.pipeline:
+            self._start_asgi_task(*self.pipeline.pop())
+        else:
+            self._idle_since = self.loop.time()
         cycle: Any = self.cycle
         if cycle.response_complete and cycle.ends_early and not self.transport.is_closing():
-            self._unset_keepalive_if_required()
             self._stop()
             self.loop.call_soon(self._linger)  # the reply may be held until the end of this turn (`joined_writes.py`)
 
@@ -321,7 +345,8 @@ class TimedProtocol(HttpToolsProtocol):
         """Whether the application answers a request, once it is whole, without waiting for anything."""
         return self.is_request_immediate(scope)
 
-    def _answer(self, cycle: Any, body: bytes) -> None:
+    def _answer(self, cycle: Any, body: bytes) -> bool:
+        """Answer a request that is whole; return whether that is over, and nothing uses `cycle` any more."""
         app: Any = self.app
 
         def answer(scope: Scope, receive: Receive, send: Send) -> Any:
@@ -332,9 +357,10 @@ class TimedProtocol(HttpToolsProtocol):
         task = start_at_once(cycle.run_asgi(answer), self.loop)
         if task is None:
             cycle.scope.pop(REPLY, None)
-        else:
-            self.tasks.add(task)
-            task.add_done_callback(self.tasks.discard)
+            return True
+        self.tasks.add(task)
+        task.add_done_callback(self.tasks.discard)
+        return False
 
     def _reply(self, cycle: Any, status: int, headers: Any, body: bytes) -> bool:
         """Write a whole reply; return False where that has to wait, since the client does not read."""
@@ -361,8 +387,11 @@ class TimedProtocol(HttpToolsProtocol):
             late = now - self._head_since > HEAD_S
         elif cycle.response_complete:
             late = False
-            if self.timeout_keep_alive_task is None:  # something came, but no head began: blank lines
+            if self._idle_since is None:  # something came, but no head began: blank lines
                 self._head_since = now
+            elif now - self._idle_since > self.timeout_keep_alive:
+                self.transport.close()
+                return
         else:
             late = cycle.more_body and now - self._body_since > self.body_s
         if not late:
@@ -376,38 +405,6 @@ class TimedProtocol(HttpToolsProtocol):
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-
-
-def start_at_once(coroutine: Coroutine[Any, Any, None], loop: asyncio.AbstractEventLoop) -> asyncio.Task[None] | None:
-    """Run a coroutine until it waits for the first time; return the task that goes on with it, None where it is over.
-
-    Most answers never wait, and then cost no task, no turn of the loop and no callback. Python 3.12 has tasks that
-    begin so; before, up to there it is in no task (`asyncio.current_task`).
-    """
-    if sys.version_info >= (3, 12):
-        task = asyncio.Task(coroutine, loop=loop, eager_start=True)
-        return None if task.done() else task
-    try:
-        waits_for = coroutine.send(None)
-    except StopIteration:
-        return None
-    rest: Any = _go_on(coroutine, waits_for)  # a coroutine for asyncio, and a generator by its type
-    return loop.create_task(rest)
-
-
-@types.coroutine
-def _go_on(coroutine: Coroutine[Any, Any, None], waits_for: Any) -> Generator[Any, Any, None]:
-    """Wait for what a coroutine waits for, and pass on to it what comes of that."""
-    resume: Callable[[], Any]
-    while True:
-        try:
-            resume = functools.partial(coroutine.send, (yield waits_for))
-        except BaseException as error:
-            resume = functools.partial(coroutine.throw, error)
-        try:
-            waits_for = resume()
-        except StopIteration:
-            return
 
 
 def _has_body(scope: Any) -> bool:

@@ -24,6 +24,7 @@ from typing import Any, Protocol
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from rlservo.serve_app.protocols.http_endpoint import AT_ONCE
 from rlservo.serve_app.ray_serve import closed_endpoints, http_connections, loopback_binding
 from rlservo.serve_app.server.access_checks import mend_headers
 
@@ -104,6 +105,7 @@ class Ingress:
                 await app.answer_ahead(match, scope, receive, send)
                 return
         headers = mend_headers(scope["headers"])
+        scope.pop(AT_ONCE, None)  # Serve reads a stream itself
         if http:
             if closed_endpoints.is_closed(scope):
                 await send({"type": "http.response.start", "status": 404, "headers": list(NOT_FOUND)})

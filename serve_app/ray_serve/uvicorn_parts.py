@@ -51,7 +51,15 @@ METHODS: dict[type, tuple[str, ...]] = {
         *("on_message_begin", "on_headers_complete", "on_message_complete", "on_response_complete", "shutdown"),
     ),
     RequestResponseCycle: ("run_asgi", "send"),
-    WebSocketsSansIOProtocol: ("handle_cont", "handle_ping", "handle_pong", "receive", "send", "stop_keepalive"),
+    WebSocketsSansIOProtocol: (
+        "handle_cont",
+        "handle_ping",
+        "handle_pong",
+        "receive",
+        "run_asgi",
+        "send",
+        "stop_keepalive",
+    ),
     ServerProtocol: ("data_to_send", "fail", "state"),
 }
 """What is overridden or called."""
@@ -59,12 +67,13 @@ METHODS: dict[type, tuple[str, ...]] = {
 FIELDS: dict[type, tuple[str, ...]] = {
     HttpToolsProtocol: (
         *("access_log", "access_logger", "app", "config", "cycle", "flow", "headers", "logger", "loop", "parser"),
-        *("scope", "server_state", "tasks", "timeout_keep_alive_task", "transport"),
+        *("pipeline", "scope", "server_state", "tasks", "timeout_keep_alive", "transport"),
         "ws_protocol_class",
     ),
     RequestResponseCycle: (
-        *("body", "default_headers", "disconnected", "flow", "keep_alive", "message_event", "more_body"),
-        *("on_response", "response_complete", "response_started", "scope", "transport"),
+        *("body", "chunked_encoding", "default_headers", "disconnected", "expected_content_length", "flow"),
+        *("keep_alive", "message_event", "more_body", "on_response", "response_complete", "response_started"),
+        *("scope", "transport"),
     ),
     WebSocketsSansIOProtocol: (
         *("close_sent", "conn", "disconnected", "handshake_initiated", "loop", "queue", "read_paused"),

@@ -3,14 +3,20 @@
 uvicorn (0.54) takes whatever comes: 16 KB that unpack to 16 MB, again and again (`http_connections.py` turns
 compression off); as many frames at once as fit a read, which the application then answers one after the other while
 the event loop stands still; pings whose answers nobody reads.
+
+A message that comes while the application waits for one is answered in the turn of the event loop that reads it, as
+requests are (`http_connections.py`): no queue, and no task to wake up.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import functools
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
+from rlservo.serve_app.protocols.http_endpoint import AT_ONCE
+from rlservo.serve_app.ray_serve.eager_tasks import start_at_once
 from rlservo.serve_app.ray_serve.uvicorn_parts import (
     OPEN,
     WebSocketsSansIOProtocol,
@@ -32,6 +38,7 @@ MOST_EMPTY, SMALL_BYTES = 1000, 512
 """Frames of a WebSocket in a second that complete no message: pings, pongs, small fragments."""
 
 TOO_MUCH = 1008  # the close code "policy violation"
+FAILED = "failed"  # what is queued for the application where a message could not be answered at once
 
 
 class BoundedStream(WebSocketsSansIOProtocol):
@@ -40,6 +47,9 @@ class BoundedStream(WebSocketsSansIOProtocol):
     _since = float("-inf")  # when the second began in which `_empty` counts
     _empty = 0
     _is_at_frame = False  # whether what is read next begins a frame
+    _answer: Callable[[Message], Awaitable[Message]] | None = None  # the application's, for a message at once
+    _is_awaited = False  # whether the application waits for a message
+    _turn: asyncio.Task[None] | None = None  # of a message whose answer has to wait
 
     def __init__(self, *arguments: Any, on_lost: Callable[[], None] | None = None, **more: Any) -> None:
         """Call `on_lost` when the connection has ended."""
@@ -57,8 +67,12 @@ class BoundedStream(WebSocketsSansIOProtocol):
         if self.conn.state is not OPEN:  # the handshake, and what comes before it is answered
             self._is_at_frame = not self.handshake_initiated
         elif self._is_at_frame and (message := self._find_message(data)) is not None:
+            event: Any = {"type": "websocket.receive", "bytes": message}
             waits = not self.queue.empty()
-            self.queue.put_nowait({"type": "websocket.receive", "bytes": message})
+            if self._is_awaited and self._answer is not None and not waits and (not self._turn or self._turn.done()):
+                self._turn = start_at_once(self._take_turn(self._answer, event), self.loop)
+                return
+            self.queue.put_nowait(event)
             if waits and not self.read_paused:  # it costs two system calls, which one message is not worth
                 self.read_paused = True
                 self.transport.pause_reading()
@@ -110,13 +124,27 @@ class BoundedStream(WebSocketsSansIOProtocol):
             return None
         return apply_mask(data[content:], data[content - 4 : content])
 
+    async def run_asgi(self) -> None:
+        """Run the application, which may give `_answer`."""
+        scope: Any = self.scope
+        scope[AT_ONCE] = functools.partial(setattr, self, "_answer")
+        await super().run_asgi()
+
+    async def _take_turn(self, answer: Callable[[Message], Awaitable[Message]], event: Message) -> None:
+        try:
+            await self.send(await answer(event))
+        except Exception as error:  # for the application to say, as if it had answered itself
+            failed: Any = {"type": FAILED, "error": error}
+            self.queue.put_nowait(failed)
+
     async def send(self, message: Any) -> None:
         """Send a message; a binary one as a frame of its own."""
         content = message.get("bytes")
         if content is None or self.close_sent or self.disconnected or self.conn.state is not OPEN:
             await super().send(message)
             return
-        await self.writable.wait()
+        if not self.writable.is_set():
+            await self.writable.wait()
         size = len(content)
         if size < LENGTH_FOLLOWS:
             head = b"\x82%c" % size
@@ -130,7 +158,17 @@ class BoundedStream(WebSocketsSansIOProtocol):
         """Return the next message; others have their turn before one that has come already."""
         if not self.queue.empty():
             await asyncio.sleep(0)
-        return await super().receive()  # type: ignore[return-value]
+        self._is_awaited = True
+        try:
+            message: Any = await super().receive()
+        finally:
+            self._is_awaited = False
+        if self._turn is not None:  # what came first is answered first
+            await asyncio.wait((self._turn,))
+            self._turn = None
+        if message["type"] == FAILED:
+            raise message["error"]
+        return message  # type: ignore[no-any-return]
 
     def _count(self) -> None:
         now = self.loop.time()

@@ -192,6 +192,7 @@ class PolicyStore:
             served = self._find(name)
             if served.canary is not None and _draw(name, label, served.canary) < served.canary_share:
                 return served.canary
+            return served.default
         return self.get(name, version)
 
     def is_drawn(self, name: str, label: str | None) -> bool:
@@ -310,7 +311,8 @@ def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision,
         blame(error, policy.contract.version)
         raise
     infer_ms = (time.perf_counter() - started) * 1e3
-    name, version = policy.contract.name, policy.contract.version
+    contract = policy.contract
+    name, version = contract.name, contract.version
     decision = Decision(step.action, policy, step.inputs, name, version, infer_ms, step.batch, step.notices)
     decision.last_action = step.last_action
     return decision, step

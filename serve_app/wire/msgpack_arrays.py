@@ -63,6 +63,13 @@ def _unpack_array(document: dict[Any, Any]) -> Any:
     return document
 
 
+def _are_sizes(shape: list[Any]) -> bool:
+    for size in shape:  # noqa: SIM110 - a generator is a call for each
+        if type(size) is not int or not 0 <= size < 2**31:
+            return False
+    return True
+
+
 def _array(document: Mapping[Any, Any]) -> NDArray[Any]:
     data: Any = document.get(b"data")
     name: Any = document.get(b"dtype")
@@ -72,7 +79,7 @@ def _array(document: Mapping[Any, Any]) -> NDArray[Any]:
     )
     if dtype is None:
         raise ObservationError(f"an array in the message is of dtype {name!r:.32}: send numbers, such as '<f4'")
-    if type(shape) is not list or len(shape) > MAX_AXES or not all(type(n) is int and 0 <= n < 2**31 for n in shape):
+    if type(shape) is not list or len(shape) > MAX_AXES or not _are_sizes(shape):
         raise ObservationError(f"an array in the message has the shape {shape!r:.64}: expected a list of sizes")
     if type(data) is not bytes or len(data) != math.prod(shape) * dtype.itemsize:
         got = f"{len(data)} bytes" if type(data) is bytes else f"a {type(data).__name__}"

@@ -32,8 +32,9 @@ from stores import store_of
 
 HOME = Path(ingress_module.__file__).parents[2]  # as this Python imports them, which may be by a link
 OURS = (str(HOME / "serve_app"), str(HOME / "export"), str(HOME / "deploy"))
-NINE = [
+TEN = [
     "serve_app/ray_serve/http_connections.py",
+    "serve_app/ray_serve/eager_tasks.py",
     "serve_app/ray_serve/ingress.py",
     "serve_app/protocols/http_endpoint.py",
     "serve_app/server/access_checks.py",
@@ -103,7 +104,7 @@ async def pass_through(
 
 
 @pytest.mark.parametrize("key", [False, True], ids=["open", "keyed"])
-def test_a_json_request_passes_nine_files_between_socket_and_network(ur5: Path, bypass: ServeBypass, key: bool) -> None:
+def test_a_json_request_passes_ten_files_between_socket_and_network(ur5: Path, bypass: ServeBypass, key: bool) -> None:
     """Of nothing but an observation, as HAProxy passes it on."""
     body = json.dumps({"obs": OBS}).encode()
 
@@ -128,9 +129,9 @@ def test_a_json_request_passes_nine_files_between_socket_and_network(ur5: Path, 
     ):
         requests = asyncio.run(pass_through(ur5, bypass, listener, ask, LINE if key else ""))
     for files in requests:
-        assert sorted(files) == sorted(NINE)
-        assert files[0] == NINE[0]
-        assert files[-1] == NINE[-1]  # what is nearest to the network
+        assert sorted(files) == sorted(TEN)
+        assert files[0] == TEN[0]
+        assert files[-1] == TEN[-1]  # what is nearest to the network
 
 
 def test_so_does_one_of_our_client(ur5: Path, bypass: ServeBypass, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,5 +156,5 @@ def test_so_does_one_of_our_client(ur5: Path, bypass: ServeBypass, monkeypatch: 
 
         requests = asyncio.run(pass_through(ur5, bypass, listener, ask, LINE))
     for files in requests:
-        assert sorted(files) == sorted(NINE)
+        assert sorted(files) == sorted(TEN)
     assert repeated >= 2

@@ -170,23 +170,50 @@ def test_a_reply_that_ends_the_connection_ends_it(repeated: list[bytes]) -> None
     assert b"connection: close" in written
 
 
-def test_an_idle_connection_has_one_timer_and_a_lost_one_none(repeated: list[bytes]) -> None:
+def test_an_idle_connection_ends_without_a_word_when_its_time_is_over(repeated: list[bytes]) -> None:
+    def wait(protocol: TimedProtocol) -> None:
+        assert protocol._idle_since is not None
+        protocol._check_phase()
+        assert not protocol.transport.is_closing()
+        protocol._idle_since -= IDLE_S + 1
+        protocol._check_phase()
+
+    written = replies([request(b"1")] * 6, [1] * 6, then=wait)
+    assert len(repeated) == 4 and written.count(b"HTTP/1.1") == 6 and written.endswith(b"<closed>")
+
+
+def test_a_connection_has_one_timer_and_a_lost_one_none(repeated: list[bytes]) -> None:
     timers: list[Any] = []
-
-    def look(protocol: TimedProtocol) -> None:
-        timers.append(protocol.timeout_keep_alive_task)
-        left = protocol.timeout_keep_alive_task.when() - protocol.loop.time()  # type: ignore[union-attr]
-        assert IDLE_S - 5 < left <= IDLE_S
-
-    replies([request(b"1")] * 6, [1] * 6, then=look)
+    replies([request(b"1")] * 6, [1] * 6, then=lambda protocol: timers.append(protocol._timer))
     assert len(repeated) == 4 and timers[0].cancelled()
+
+
+def test_one_object_serves_the_requests_that_come_again(repeated: list[bytes]) -> None:
+    cycles: list[Any] = []
+    repeat = TimedProtocol._repeat
+
+    def kept(self: TimedProtocol, scope: Any, body: bytes) -> bool:
+        done = repeat(self, scope, body)
+        cycles.append(self.cycle)
+        return done
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TimedProtocol, "_repeat", kept)
+        pieces = [request(b"%d" % number) for number in range(4)]
+        pieces += [request(b"4", "/wait"), request(b"5", "/wait"), request(b"6", "/wait"), request(b"7", "/wait")]
+        written = replies(pieces, [1] * 4 + [5] * 4)
+    assert written.count(b"200 OK") == 8
+    assert cycles[0] is cycles[1]  # answered at once
+    assert len({id(cycle) for cycle in cycles[2:]}) == len(cycles) - 2  # the others had to wait
 
 
 def test_it_is_not_idle_while_a_request_is_answered(repeated: list[bytes]) -> None:
     def ask(protocol: TimedProtocol) -> None:
-        assert protocol.timeout_keep_alive_task is not None
+        assert protocol._idle_since is not None
         protocol.data_received(request(b"1", "/wait"))
-        assert protocol.timeout_keep_alive_task is None
+        assert protocol._idle_since is None
+        protocol._check_phase()
+        assert not protocol.transport.is_closing()
 
     replies([request(b"1", "/wait")] * 3, [5] * 3, then=ask)
     assert len(repeated) == 2

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rlservo.serve_app.ray_serve.http_connections import start_at_once
+from rlservo.serve_app.ray_serve.eager_tasks import start_at_once
 
 
 def run(scenario: Callable[[asyncio.AbstractEventLoop], Coroutine[Any, Any, None]]) -> None:
