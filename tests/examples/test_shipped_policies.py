@@ -17,6 +17,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -270,6 +271,47 @@ def test_standard_deviations_stay_below_their_bound_over_the_steps(penalties: Ca
     for steps, largest in ((500, 0.9), (1500, 0.6), (3000, 0.2)):
         learner.after_gradient_based_update(timesteps={"num_env_steps_sampled_lifetime": steps})
         assert torch.allclose(network.log_std.exp(), torch.tensor([largest, 0.1]))
+
+
+class OfOneStep(gymnasium.Env[Any, Any]):
+    """Ends after a step, in a success but where an even seed began the episode."""
+
+    observation_space, action_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Discrete(2)
+    seeds: list[int]
+
+    def __init__(self) -> None:
+        self.seeds = []
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
+        assert seed is not None
+        self.seeds.append(seed)
+        return 0, {}
+
+    def step(self, _action: Any) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        return 0, 0.0, True, False, {"is_success": self.seeds[-1] % 2 == 1}
+
+
+def test_a_share_of_the_episodes_begins_as_one_that_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    train_shipped = load("train_shipped")
+
+    def episodes(share: float, seed: int) -> tuple[list[int], list[bool]]:
+        env = train_shipped.FailedAgain(OfOneStep(), share)
+        env.reset(seed=seed)
+        again = []
+        for _ in range(1000):
+            again.append(env.step(0)[-1]["again"])
+            env.reset()
+        return env.unwrapped.seeds[:-1], again
+
+    seeds, again = episodes(0.3, 7)
+    failed: set[int] = set()
+    for number, (episode, is_again) in enumerate(zip(seeds, again, strict=True)):
+        assert is_again == (episode in failed), number
+        failed |= {episode} if episode % 2 == 0 else set()
+    assert 250 <= sum(again) <= 350
+    assert episodes(0.3, 7) == (seeds, again) and episodes(0.3, 8)[0] != seeds
+    assert not any(episodes(0.0, 7)[1])
 
 
 def test_training_begins_with_another_network_without_the_elements_it_shall_forget(trained: Any) -> None:
