@@ -48,7 +48,8 @@ __all__ = [
 METHODS: dict[type, tuple[str, ...]] = {
     HttpToolsProtocol: (
         *("_should_upgrade", "_start_asgi_task", "_unset_keepalive_if_required", "handle_websocket_upgrade"),
-        *("on_message_begin", "on_headers_complete", "on_message_complete", "on_response_complete", "shutdown"),
+        *("on_message_begin", "on_headers_complete", "on_message_complete", "on_response_complete"),
+        *("send_400_response", "shutdown"),
     ),
     RequestResponseCycle: ("run_asgi", "send"),
     WebSocketsSansIOProtocol: (

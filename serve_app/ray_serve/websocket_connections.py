@@ -5,13 +5,13 @@ compression off); as many frames at once as fit a read, which the application th
 the event loop stands still; pings whose answers nobody reads.
 
 A message that comes while the application waits for one is answered in the turn of the event loop that reads it, as
-requests are (`http_connections.py`): no queue, and no task to wake up.
+requests are (`http_connections.py`): no queue, and no task to wake up. Where the answer has to wait or fails, the
+application wakes up after all: it waits for it, and fails as it does, before it is given any other message.
 """
 
 from __future__ import annotations
 
 import asyncio
-import functools
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +38,7 @@ MOST_EMPTY, SMALL_BYTES = 1000, 512
 """Frames of a WebSocket in a second that complete no message: pings, pongs, small fragments."""
 
 TOO_MUCH = 1008  # the close code "policy violation"
-FAILED = "failed"  # what is queued for the application where a message could not be answered at once
+WAKE = "wake"  # queued for the application where an answer that was begun is not over, or has failed
 
 
 class BoundedStream(WebSocketsSansIOProtocol):
@@ -49,7 +49,8 @@ class BoundedStream(WebSocketsSansIOProtocol):
     _is_at_frame = False  # whether what is read next begins a frame
     _answer: Callable[[Message], Awaitable[Message]] | None = None  # the application's, for a message at once
     _is_awaited = False  # whether the application waits for a message
-    _turn: asyncio.Task[None] | None = None  # of a message whose answer has to wait
+    _turn: asyncio.Task[None] | None = None  # the rest of an answer that has to wait
+    _failure: BaseException | None = None  # of an answer that was begun
 
     def __init__(self, *arguments: Any, on_lost: Callable[[], None] | None = None, **more: Any) -> None:
         """Call `on_lost` when the connection has ended."""
@@ -69,8 +70,8 @@ class BoundedStream(WebSocketsSansIOProtocol):
         elif self._is_at_frame and (message := self._find_message(data)) is not None:
             event: Any = {"type": "websocket.receive", "bytes": message}
             waits = not self.queue.empty()
-            if self._is_awaited and self._answer is not None and not waits and (not self._turn or self._turn.done()):
-                self._turn = start_at_once(self._take_turn(self._answer, event), self.loop)
+            if self._is_awaited and self._answer is not None and not waits:
+                self._begin(self._answer, event)
                 return
             self.queue.put_nowait(event)
             if waits and not self.read_paused:  # it costs two system calls, which one message is not worth
@@ -125,26 +126,40 @@ class BoundedStream(WebSocketsSansIOProtocol):
         return apply_mask(data[content:], data[content - 4 : content])
 
     async def run_asgi(self) -> None:
-        """Run the application, which may give `_answer`."""
+        """Run the application, which may say how messages are answered at once."""
         scope: Any = self.scope
-        scope[AT_ONCE] = functools.partial(setattr, self, "_answer")
-        await super().run_asgi()
+        scope[AT_ONCE] = self._set_answer
+        try:
+            await super().run_asgi()
+        finally:  # what it began ends with it, and no cycle of references is left
+            if self._turn is not None:
+                self._turn.cancel()
+            scope.pop(AT_ONCE, None)
+            self._answer = None
+
+    def _set_answer(self, answer: Callable[[Message], Awaitable[Message]]) -> None:
+        self._answer = answer
+
+    def _begin(self, answer: Callable[[Message], Awaitable[Message]], event: Message) -> None:
+        self._turn = start_at_once(self._take_turn(answer, event), self.loop)
+        if self._turn is not None or self._failure is not None:
+            wake: Any = {"type": WAKE}
+            self.queue.put_nowait(wake)
 
     async def _take_turn(self, answer: Callable[[Message], Awaitable[Message]], event: Message) -> None:
         try:
             await self.send(await answer(event))
-        except Exception as error:  # for the application to say, as if it had answered itself
-            failed: Any = {"type": FAILED, "error": error}
-            self.queue.put_nowait(failed)
+        except (Exception, asyncio.CancelledError) as failure:  # for the application, as if it had answered itself
+            self._failure = failure
 
     async def send(self, message: Any) -> None:
         """Send a message; a binary one as a frame of its own."""
+        if not self.writable.is_set():  # until the client reads, or has gone
+            await self.writable.wait()
         content = message.get("bytes")
         if content is None or self.close_sent or self.disconnected or self.conn.state is not OPEN:
             await super().send(message)
             return
-        if not self.writable.is_set():
-            await self.writable.wait()
         size = len(content)
         if size < LENGTH_FOLLOWS:
             head = b"\x82%c" % size
@@ -158,17 +173,20 @@ class BoundedStream(WebSocketsSansIOProtocol):
         """Return the next message; others have their turn before one that has come already."""
         if not self.queue.empty():
             await asyncio.sleep(0)
-        self._is_awaited = True
-        try:
-            message: Any = await super().receive()
-        finally:
-            self._is_awaited = False
-        if self._turn is not None:  # what came first is answered first
-            await asyncio.wait((self._turn,))
-            self._turn = None
-        if message["type"] == FAILED:
-            raise message["error"]
-        return message  # type: ignore[no-any-return]
+        while True:
+            self._is_awaited = True
+            try:
+                message: Any = await super().receive()
+            finally:
+                self._is_awaited = False
+            if self._turn is not None:
+                await self._turn
+                self._turn = None
+            if self._failure is not None:
+                failure, self._failure = self._failure, None
+                raise failure
+            if message["type"] != WAKE:
+                return message  # type: ignore[no-any-return]
 
     def _count(self) -> None:
         now = self.loop.time()

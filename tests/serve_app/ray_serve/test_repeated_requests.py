@@ -207,6 +207,46 @@ def test_one_object_serves_the_requests_that_come_again(repeated: list[bytes]) -
     assert len({id(cycle) for cycle in cycles[2:]}) == len(cycles) - 2  # the others had to wait
 
 
+def test_an_answer_that_goes_on_after_its_reply_keeps_its_object(repeated: list[bytes]) -> None:
+    async def act(scope: Any, receive: Any, send: Any) -> None:
+        body = (await receive())["body"]
+        if body == b"slow":
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+        assert scope[REPLY](200, [(b"content-length", b"4")], body)
+        if body == b"long":
+            await asyncio.sleep(0)
+
+    pieces = [request(body) for body in (b"fast", b"fast", b"fast", b"fast", b"long", b"slow", b"fast")]
+    written = replies(pieces, [1, 1, 1, 1, 0, 5, 1], app=act)
+    assert [part[-4:] for part in written.split(b"HTTP/1.1 200 OK")[1:]] == [piece[-4:] for piece in pieces]
+    assert len(repeated) == 5 and b"500" not in written
+
+
+def test_a_reply_that_is_held_comes_before_the_error_that_ends_its_connection(repeated: list[bytes]) -> None:
+    async def run() -> list[bytes]:
+        config = uvicorn.Config(answer, lifespan="off", log_level="critical")
+        config.load()
+        both = []
+        for _ in range(2):
+            transport = Transport()
+            protocol = TimedProtocol(config, ServerState(), {}, asyncio.get_running_loop())
+            protocol.connection_made(transport)
+            both.append((protocol, transport))
+        for last in (b"", b"no HTTP at all\r\n\r\n"):  # in the first turn both are answered: the second holds replies
+            for number, (protocol, _) in enumerate(both):
+                protocol.data_received(request(b"1") + last * number)
+            await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        for protocol, _ in both:
+            protocol.connection_lost(None)
+        return [transport.written for _, transport in both]
+
+    first, second = asyncio.run(run())
+    assert first.count(b"200 OK") == second.count(b"200 OK") == 2
+    assert second.index(b"400 Bad Request") > second.rindex(b"200 OK")
+
+
 def test_it_is_not_idle_while_a_request_is_answered(repeated: list[bytes]) -> None:
     def ask(protocol: TimedProtocol) -> None:
         assert protocol._idle_since is not None

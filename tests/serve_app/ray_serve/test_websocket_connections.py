@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import weakref
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -66,8 +68,10 @@ class Stream:
             while (message := await receive())["type"] != "websocket.disconnect":
                 self.received.append(message)
                 await send(await (self.answer or echo)(message))
-        except ValueError as error:
+        except (ValueError, asyncio.CancelledError) as error:
             self.ended = error
+        except OSError:
+            self.ended = "before its reply was sent"
         else:
             self.ended = "by the client"
 
@@ -77,7 +81,8 @@ class Stream:
         )
         config.load()
         self.transport = Transport()
-        protocol = TimedProtocol(config, ServerState(), {}, asyncio.get_running_loop())
+        self.state = ServerState()
+        protocol = TimedProtocol(config, self.state, {}, asyncio.get_running_loop())
         protocol.connection_made(self.transport)
         protocol.data_received(HANDSHAKE)
         await turns()
@@ -174,21 +179,89 @@ def test_a_message_in_pieces_and_those_behind_it_keep_their_order() -> None:
 
 
 @pytest.mark.parametrize("waits", [False, True])
-def test_an_answer_that_fails_fails_in_the_application(waits: bool) -> None:
+@pytest.mark.parametrize("failure", [ValueError("no"), asyncio.CancelledError("no")], ids=["failed", "cancelled"])
+def test_an_answer_that_fails_fails_in_the_application_before_another_is_given(
+    waits: bool, failure: BaseException
+) -> None:
     async def run() -> None:
-        async def fail(_message: Any) -> Any:
+        async def fail(message: Any) -> Any:
+            if message["bytes"] != b"1":
+                return await echo(message)
             if waits:
-                await asyncio.sleep(0)
-            raise ValueError("no")
+                await asyncio.sleep(0.001)
+            raise failure
 
         stream = Stream(fail)
         await stream.open()
-        stream.send(frame(b"1"))
+        for content in (b"1", b"2", b"3"):
+            stream.send(frame(content))
         assert stream.replies == []
-        await turns()
-        assert str(stream.ended) == "no" and stream.received == []
+        await asyncio.sleep(0.1)
+        assert stream.ended is failure and stream.received == []
+        assert all(reply[:1] not in b"23" for reply in stream.replies)  # nothing but the close
 
     asyncio.run(run())
+
+
+def test_what_the_application_began_ends_with_it() -> None:
+    async def run() -> None:
+        ended = False
+
+        async def answer(_message: Any) -> Any:
+            nonlocal ended
+            try:
+                await asyncio.sleep(60)
+            finally:
+                ended = True
+
+        stream = Stream(answer)
+        await stream.open()
+        stream.send(frame(b"1"))
+        await turns()
+        (task,) = stream.state.tasks
+        task.cancel()
+        await turns()
+        assert ended and isinstance(stream.ended, asyncio.CancelledError)
+
+    asyncio.run(run())
+
+
+def test_a_client_that_goes_while_its_reply_cannot_be_written_is_no_error_of_ours() -> None:
+    async def run() -> None:
+        stream = Stream(None)
+        await stream.open()
+        protocol = stream.transport.protocol
+        protocol.pause_writing()
+        stream.send(frame(b"1"))
+        await turns()
+        assert stream.replies == []
+        stream.transport.is_closed = True
+        protocol.connection_lost(None)
+        await turns()
+        assert stream.ended == "before its reply was sent" and stream.replies == []
+
+    asyncio.run(run())
+
+
+def test_nothing_is_left_for_the_garbage_collector() -> None:
+    async def run() -> Any:
+        stream = Stream(echo)
+        await stream.open()
+        stream.send(frame(b"1"))
+        protocol = stream.transport.protocol
+        stream.transport.is_closed = True
+        protocol.connection_lost(None)
+        stream.transport.protocol = None
+        await turns()
+        return weakref.ref(protocol)
+
+    gc.collect()
+    gc.disable()
+    try:
+        left = asyncio.run(run())
+        assert left() is None
+    finally:
+        gc.enable()
 
 
 def test_the_client_may_go_while_its_answer_waits() -> None:
@@ -208,6 +281,6 @@ def test_the_client_may_go_while_its_answer_waits() -> None:
         assert stream.ended is None  # not before the answer is over
         go_on.set()
         await turns()
-        assert stream.ended == "by the client" and stream.replies == []
+        assert stream.ended == "before its reply was sent" and stream.replies == []
 
     asyncio.run(run())
