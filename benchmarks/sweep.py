@@ -2,7 +2,7 @@
 
     python benchmarks/sweep.py mir100_obstacle_avoidance               # all its variants, hours on two cores
     python benchmarks/sweep.py ur5_positioning --set stop.env_steps=310000 --seeds 2
-    python benchmarks/sweep.py mir100_obstacle_avoidance --variants "no memory" "eight frames"
+    python benchmarks/sweep.py mir100_obstacle_avoidance --variants "as it ships" "three frames"
 
 `benchmarks/variants/NAME.yaml` has the variants: what each changes of `examples/checkpoints/NAME/training.yaml`. Each
 is trained by `train_shipped.py`, a process for each core, and what it comes to is exported and judged as the cards are,

@@ -213,11 +213,12 @@ def test_checkpoints_are_judged_as_the_cards_do_where_the_settings_ask_for_it(tr
 
 
 @pytest.mark.slow
-def test_the_logarithm_of_the_distances_is_part_of_the_checkpoint(trained: Any, tmp_path: Path) -> None:
+def test_what_becomes_of_distances_and_direction_is_part_of_the_checkpoint(trained: Any, tmp_path: Path) -> None:
     checkpoint = trained("judged").folder / "runs" / "mir100_obstacle_avoidance" / "checkpoint"
     contract = export_checkpoint(checkpoint, tmp_path, name="mir", notify=lambda line: None).contract
-    assert [step.step for step in contract.baked_in][:2] == ["logarithm", "mean_std_filter"]
+    assert [step.step for step in contract.baked_in][:3] == ["logarithm", "sine_and_cosine", "mean_std_filter"]
     assert contract.baked_in[0].values["elements"] == list(range(4, 20))
+    assert contract.baked_in[1].values["elements"] == [1]
 
 
 @pytest.fixture
