@@ -44,7 +44,7 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.utils.filter import RunningStat
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from ray.rllib.utils.schedules.scheduler import Scheduler
-from ray.tune.registry import get_trainable_cls, register_env
+from ray.tune.registry import ENV_CREATOR, _global_registry, get_trainable_cls, register_env
 from shared.training_run import main_with_sentences, ray_session
 
 from rlservo import Policy, errors, export_checkpoint
@@ -57,7 +57,7 @@ MODULE = "learner_group/learner/rl_module/default_policy"  # where a checkpoint 
 MILESTONE = 0.95  # the success rate whose time is printed
 GAINS = {"encoder": 2**0.5, "pi": 0.01, "vf": 1.0}  # of orthogonal weights, by the network's parts
 NEEDED = ("env", "algorithm", "seed", "envs", "filter", "stop")  # of training.yaml
-PENALTIES = ("bounds_loss_coeff", "smoothness_loss_coeff", "largest_std")  # what ActionPenaltyLearner knows
+SHAPING = ("bounds_loss_coeff", "smoothness_loss_coeff", "largest_std")  # what ActionPenaltyLearner knows
 FAILED_KEPT = 16  # episodes, by each environment
 SUMS = ("episodes", "judged", "return", "length", "success")
 
@@ -76,11 +76,14 @@ class Row:
 
 
 def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
-    """Return the RLlib configuration that `training.yaml` describes."""
+    """Return the RLlib configuration that `training.yaml` describes. Raises UsageError."""
     config: AlgorithmConfig = get_trainable_cls(settings["algorithm"]).get_default_config()
     config.environment(settings["env"], env_config=settings.get("env_config", {}), clip_rewards=False)
+    # Under the environment's own name, which checkpoints keep: one that is restored elsewhere has no wrapper.
     if share := settings.get("failed_again"):
         register_env(settings["env"], functools.partial(_make_failed_again, settings["env"], share))
+    else:  # what a training before this one, in the same process, has registered
+        _global_registry.unregister(ENV_CREATOR, settings["env"])
     config.env_runners(
         num_env_runners=0,
         num_envs_per_env_runner=settings["envs"],
@@ -103,11 +106,15 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     config.learners(num_learners=0, num_gpus_per_learner=0)
     config.rl_module(model_config=settings.get("model", {}))
     config.training(**settings.get("training", {}))
-    penalties = {name: settings[name] for name in PENALTIES if settings.get(name)}
-    if penalties:
+    shaping = {name: settings[name] for name in SHAPING if settings.get(name)}
+    if "largest_std" in shaping and not settings.get("model", {}).get("free_log_std"):
+        raise errors.UsageError(
+            "largest_std bounds a standard deviation that is no output: set model.free_log_std=true"
+        )
+    if shaping:
         config.training(learner_class=ActionPenaltyLearner)
-        config.learners(learner_config_dict=penalties)
-    if "smoothness_loss_coeff" in penalties:
+        config.learners(learner_config_dict=shaping)
+    if "smoothness_loss_coeff" in shaping:
         config.training(learner_connector=lambda *_: AddNextObservationsFromEpisodesToTrainBatch())
     config.reporting(
         # Off-policy algorithms report by default once a second, however much that is.
@@ -122,9 +129,9 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
 
 
 class FailedAgain(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Begin a share of the episodes as one that failed began, until it succeeds.
+    """Begin a share of the episodes as one that failed began, until it succeeds or 16 others have failed since.
 
-    Where 19 of 20 episodes succeed, one in twenty teaches what is missing. Episodes are the same again by their seed;
+    Where 19 of 20 episodes succeed, one in twenty shows what is missing. Episodes are the same again by their seed;
     `info["again"]` says which are. After Jiang et al., Prioritized level replay, 2021, whose score is a failure here.
     """
 
@@ -138,6 +145,7 @@ class FailedAgain(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         if seed is not None:
             self._rng = np.random.default_rng([seed, 1])
+            self._failed.clear()
         self._is_again = bool(self._failed) and self._rng.random() < self._share
         self._episode = self._failed.popleft() if self._is_again else int(self._rng.integers(2**31))
         return super().reset(seed=self._episode, options=options)

@@ -152,7 +152,7 @@ def verdicts(result: Result) -> list[Verdict]:
             1.5,
         ),
         Verdict("WebSocket p50, over our JSON's", ratio((STREAM, RLSERVO), (LINE, RLSERVO), p50), 0.8),
-        Verdict("WebSocket p50, over a bare uvicorn WebSocket's", ratio((STREAM, RLSERVO), (STREAM, BARE), p50), 2.0),
+        Verdict("WebSocket p50, over uvicorn + FastAPI's", ratio((STREAM, RLSERVO), (STREAM, BARE), p50), 2.0),
         Verdict(
             f"observations/s in batches of {BATCH} over the binary protocol, over onnxruntime in process",
             ratio((LARGE, RLSERVO), in_process, rate),
