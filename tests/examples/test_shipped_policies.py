@@ -341,6 +341,7 @@ def test_the_curve_is_of_the_episodes_that_the_environment_draws(monkeypatch: py
     assert logged == ([] if again else wanted)
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of spaces in float64
 def test_failed_episodes_come_again_in_that_training_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     train_shipped = load("train_shipped")
@@ -378,7 +379,7 @@ def test_training_begins_with_another_network_without_the_elements_it_shall_forg
         (
             "train_shipped.py",
             ("mir100_obstacle_avoidance", "--set", "model.free_log_std=false"),
-            "largest_std bounds a standard deviation of no output: set model.free_log_std=true",
+            "largest_std bounds a standard deviation that is no output: set model.free_log_std=true",
         ),
         ("evaluate_shipped.py", ("nobody",), "no policy 'nobody' ships: expected some of cartpole_dqn"),
         ("evaluate_shipped.py", ("--episodes", "1"), "--episodes is 1 and --seed 20000: expected at least 2 and 0"),
