@@ -454,18 +454,22 @@ def test_a_client_finds_the_port_and_goes_back_to_the_proxy_when_it_is_gone(
     start: Callable[[], Replica], port: int, proxied: int, kind: type[PolicyClient] | type[StreamClient], app: Any
 ) -> None:
     replica = start()
-    with kind(f"http://127.0.0.1:{proxied}", "ur5", api_key=KEY, deadline_ms=1e3 * SOON_S) as policy:
+    with (
+        kind(f"http://127.0.0.1:{proxied}", "ur5", api_key=KEY, deadline_ms=1e3 * SOON_S) as policy,
+        socket.socket() as nobody,  # has a port, which no other process can take, and does not listen
+    ):
+        nobody.bind(("127.0.0.1", 0))
         expected = policy.act(OBS)
+        # From now on: on a busy machine a 503 sends the client to the proxy, which would offer the replica's port
+        # again, and on that the launcher listens, too, when the replica is gone.
+        app.offer = offer_of(nobody.getsockname()[1])
         for _ in range(5):
             assert np.array_equal(policy.act(OBS), expected)
             assert policy.is_direct
         assert policy.reconnects == 0
-        with socket.socket() as nobody:  # has a port, which no other process can take, and does not listen
-            nobody.bind(("127.0.0.1", 0))
-            app.offer = offer_of(nobody.getsockname()[1])
-            replica.drain()
-            for _ in range(5):
-                assert np.array_equal(policy.act(OBS), expected)
+        replica.drain()
+        for _ in range(5):
+            assert np.array_equal(policy.act(OBS), expected)
         app.offer = ()
         assert np.array_equal(policy.act(OBS), expected)
         assert not policy.is_direct
