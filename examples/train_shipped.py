@@ -79,8 +79,11 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     """Return the RLlib configuration that `training.yaml` describes. Raises UsageError."""
     config: AlgorithmConfig = get_trainable_cls(settings["algorithm"]).get_default_config()
     config.environment(settings["env"], env_config=settings.get("env_config", {}), clip_rewards=False)
+    share = settings.get("failed_again", 0)
+    if not isinstance(share, int | float) or not 0 <= share <= 1:
+        raise errors.UsageError(f"failed_again is {share!r}: expected a share of the episodes, 0 to 1")
     # Under the environment's own name, which checkpoints keep: one that is restored elsewhere has no wrapper.
-    if share := settings.get("failed_again"):
+    if share:
         register_env(settings["env"], functools.partial(_make_failed_again, settings["env"], share))
     else:  # what a training before this one, in the same process, has registered
         _global_registry.unregister(ENV_CREATOR, settings["env"])

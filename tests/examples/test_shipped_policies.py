@@ -378,6 +378,11 @@ def test_training_begins_with_another_network_without_the_elements_it_shall_forg
         ),
         (
             "train_shipped.py",
+            ("mir100_obstacle_avoidance", "--set", "failed_again=1.5"),
+            "failed_again is 1.5: expected a share of the episodes, 0 to 1",
+        ),
+        (
+            "train_shipped.py",
             ("mir100_obstacle_avoidance", "--set", "model.free_log_std=false"),
             "largest_std bounds a standard deviation that is no output: set model.free_log_std=true",
         ),
