@@ -35,6 +35,7 @@ from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
 from rlservo.serve_app.ray_serve.uvicorn_parts import (
     STATUS_LINE,
     HttpToolsProtocol,
+    ProxyHeadersMiddleware,
     RequestResponseCycle,
     auto,
 )
@@ -188,11 +189,14 @@ class TimedProtocol(HttpToolsProtocol):
     _known: RepeatedHead | None = None  # the head that is expected to come again
     _lessons = MOST_LESSONS
     _answered: Any = None  # the scope of the request that was answered at once in this read
+    _behind_proxy: ASGIApp  # the application, without what looks for the client that a proxy names
     _spare: EarlyEnd | None = None  # of a known request that was answered at once, for the next one
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first head."""
         super().connection_made(transport)
+        app: Any = self.app
+        self._behind_proxy = cast("Any", app.app) if isinstance(app, ProxyHeadersMiddleware) else app
         self._replies = JoinedWrites(transport)
         self._head_since = self.loop.time()
         self._timer = self.loop.call_later(CHECK_PERIOD_S, self._check_phase)
@@ -258,7 +262,7 @@ class TimedProtocol(HttpToolsProtocol):
                 on_response=self.on_response_complete,
             )
             cycle.more_body = False
-        self._spare = cycle if self._answer(cycle, body) else None
+        self._spare = cycle if self._answer(cycle, body, self._behind_proxy) else None
         return True
 
     def handle_websocket_upgrade(self) -> None:
@@ -289,9 +293,10 @@ class TimedProtocol(HttpToolsProtocol):
         super().on_message_complete()
         if self._awaited is not None:
             cycle, self._awaited, self._is_first = self._awaited, None, False
-            if self._lessons:
-                self._answered = {**cycle.scope}
-            self._answer(cycle, bytes(cycle.body))
+            scope = self._answered = {**cycle.scope} if self._lessons else None
+            self._answer(cycle, bytes(cycle.body), cast("Any", self.app))
+            if scope is not None:  # whom a proxy named
+                scope["client"], scope["scheme"] = cycle.scope["client"], cycle.scope["scheme"]
 
     def send_400_response(self, msg: str) -> None:
         """End the connection, whose bytes are no HTTP."""
@@ -360,9 +365,8 @@ class TimedProtocol(HttpToolsProtocol):
         """Whether the application answers a request, once it is whole, without waiting for anything."""
         return self.is_request_immediate(scope)
 
-    def _answer(self, cycle: Any, body: bytes) -> bool:
+    def _answer(self, cycle: Any, body: bytes, app: ASGIApp) -> bool:
         """Answer a request that is whole; return whether that is over, and nothing uses `cycle` any more."""
-        app: Any = self.app
 
         def answer(scope: Scope, receive: Receive, send: Send) -> Any:
             return app(scope, WholeBody(body, receive), send)

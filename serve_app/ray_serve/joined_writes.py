@@ -14,6 +14,8 @@ import asyncio
 import threading
 from typing import Any
 
+from rlservo.serve_app.ray_serve.busy_polling import BusyPolling
+
 MOST_HELD = 16  # replies: the first of them waits for the last
 INFORMATIONAL = b"HTTP/1.1 1"  # 100 Continue: the client waits for it before it sends the body
 
@@ -26,15 +28,22 @@ class Turn(threading.local):
         self._replies = 0
         self._several = False  # in the turn before
         self._held: list[tuple[Any, bytes]] = []
+        self._polling: BusyPolling
 
-    def write(self, transport: Any, reply: bytes) -> None:
-        """Write a reply, now or at the end of the turn."""
+    def count(self) -> None:
+        """Count a reply, which somebody else writes."""
         loop = asyncio.get_running_loop()
         if self._loop is not loop:  # the first, or the one before has ended and taken its connections with it
             self._loop, self._replies, self._several, self._held = loop, 0, False, []
+            self._polling = BusyPolling(loop)
         if self._replies == 0:
             loop.call_soon(self._end)
+            self._polling.note_answer()
         self._replies += 1
+
+    def write(self, transport: Any, reply: bytes) -> None:
+        """Write a reply, now or at the end of the turn."""
+        self.count()
         if not self._several:
             transport.write(reply)
             return
@@ -52,6 +61,8 @@ class Turn(threading.local):
     def _end(self) -> None:
         self.flush()
         self._several = self._replies > 1
+        if not self._several:
+            self._polling.begin()
         self._replies = 0
 
 

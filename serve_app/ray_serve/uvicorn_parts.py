@@ -23,6 +23,7 @@ def refusal(name: str) -> RuntimeError:
 
 
 try:
+    from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
     from uvicorn.protocols.http import auto
     from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
     from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
@@ -38,6 +39,7 @@ __all__ = [
     "OPEN",
     "STATUS_LINE",
     "HttpToolsProtocol",
+    "ProxyHeadersMiddleware",
     "RequestResponseCycle",
     "WebSocketsSansIOProtocol",
     "apply_mask",
@@ -71,6 +73,7 @@ FIELDS: dict[type, tuple[str, ...]] = {
         *("pipeline", "scope", "server_state", "tasks", "timeout_keep_alive", "transport"),
         "ws_protocol_class",
     ),
+    ProxyHeadersMiddleware: ("app",),
     RequestResponseCycle: (
         *("body", "chunked_encoding", "default_headers", "disconnected", "expected_content_length", "flow"),
         *("keep_alive", "message_event", "more_body", "on_response", "response_complete", "response_started"),

@@ -20,6 +20,7 @@ from onnxruntime import InferenceSession
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve import ingress as ingress_module
+from rlservo.serve_app.ray_serve.busy_polling import AWAKE_S
 from rlservo.serve_app.ray_serve.http_connections import RepeatedHead, TimedProtocol
 from rlservo.serve_app.ray_serve.ingress import Ingress, ServeBypass
 from rlservo.serve_app.runtime.policy import Policy
@@ -90,6 +91,7 @@ async def pass_through(
     await ask()  # by way of Serve: it tells the prefix
     each = [PassedFiles() for _ in range(4)]
     for passed in each:
+        await asyncio.sleep(10 * AWAKE_S)  # in which the loop looks for a request
         sys.setprofile(passed)  # of this thread, and so not of a client in another
         try:
             await ask()

@@ -24,7 +24,7 @@ class Transport(asyncio.Transport):
     """A connection's bytes, in memory."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__({"peername": ("127.0.0.1", 50000)})
         self.written = b""
         self.is_closed = False
 
@@ -52,7 +52,8 @@ async def tell(scope: Any, receive: Any, send: Any) -> None:
     if scope["path"] != "/unread":
         body = (await receive())["body"]
     headers = [[name.decode("latin-1"), value.decode("latin-1")] for name, value in scope["headers"]]
-    told = json.dumps([scope["path"], scope["query_string"].decode(), headers, body.decode("latin-1")]).encode()
+    asked = [scope["path"], scope["query_string"].decode(), headers, scope["client"], scope["scheme"]]
+    told = json.dumps([*asked, body.decode("latin-1")]).encode()
     lines = [(b"content-length", b"%d" % len(told))]
     if REPLY in scope and scope[REPLY](200, lines, told):
         return
@@ -132,6 +133,22 @@ def parsed(monkeypatch: pytest.MonkeyPatch, pieces: list[bytes], turns: list[int
 def test_the_third_request_is_not_parsed_again(repeated: list[bytes]) -> None:
     written = replies([request(b"%d" % number) for number in range(5)], [1] * 5)
     assert written.count(b"200 OK") == 5 and repeated == [b"2", b"3", b"4"]
+
+
+def test_the_client_that_a_proxy_names_is_that_of_every_request(
+    repeated: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forwarded(body: bytes, client: str, *lines: str) -> bytes:
+        return request(body, "/act", f"x-forwarded-for: {client}", *lines)
+
+    first, other = "192.0.2.7", "192.0.2.8"
+    pieces = [*(forwarded(b"%d" % number, first) for number in range(4)), forwarded(b"4", other)]
+    pieces += [forwarded(b"5", other), forwarded(b"6", other, "x-forwarded-proto: https"), forwarded(b"7", first)]
+    written = replies(pieces, [1] * 8)
+    assert repeated[:2] == [b"2", b"3"]
+    assert [written.count(f'["{client}", 0]'.encode()) for client in (first, other)] == [5, 3]
+    assert written.count(b'"https", "6"') == 1
+    assert written == parsed(monkeypatch, pieces, [1] * 8)
 
 
 def test_requests_sent_ahead_are_all_answered(repeated: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
