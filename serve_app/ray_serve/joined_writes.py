@@ -29,9 +29,11 @@ class Turn(threading.local):
         self._several = False  # in the turn before
         self._held: list[tuple[Any, bytes]] = []
         self._polling: BusyPolling
+        self._last: Any = None  # the connection that the last turn's first reply went to
+        self._is_same = False  # as the turn's before it
 
-    def count(self) -> None:
-        """Count a reply, which somebody else writes."""
+    def count(self, transport: Any) -> None:
+        """Count a reply on a connection, which somebody else writes."""
         loop = asyncio.get_running_loop()
         if self._loop is not loop:  # the first, or the one before has ended and taken its connections with it
             self._loop, self._replies, self._several, self._held = loop, 0, False, []
@@ -39,11 +41,12 @@ class Turn(threading.local):
         if self._replies == 0:
             loop.call_soon(self._end)
             self._polling.note_answer()
+            self._is_same, self._last = transport is self._last, transport
         self._replies += 1
 
     def write(self, transport: Any, reply: bytes) -> None:
         """Write a reply, now or at the end of the turn."""
-        self.count()
+        self.count(transport)
         if not self._several:
             transport.write(reply)
             return
@@ -61,7 +64,7 @@ class Turn(threading.local):
     def _end(self) -> None:
         self.flush()
         self._several = self._replies > 1
-        if not self._several:
+        if self._is_same and not self._several:  # of several clients, each would pay for the others' moments
             self._polling.begin()
         self._replies = 0
 

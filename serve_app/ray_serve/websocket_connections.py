@@ -168,7 +168,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
             head = b"\x82\x7e" + size.to_bytes(2, "big")
         else:
             head = b"\x82\x7f" + size.to_bytes(8, "big")
-        turn.count()
+        turn.count(self.transport)
         self.transport.write(head + content)
 
     async def receive(self) -> Message:  # type: ignore[override]

@@ -90,19 +90,19 @@ def test_one_that_paid_is_followed_by_the_next(
         assert loop.take_turn() and not loop.take_turn()
 
 
-def test_a_turn_with_one_reply_stays_awake_and_one_with_several_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(busy_polling, "AWAKE_S", 0.0)
-    begun: list[int] = []
-    begin = BusyPolling.begin
-    monkeypatch.setattr(BusyPolling, "begin", lambda self: (begun.append(1), begin(self)))
+def test_only_a_client_that_asked_before_keeps_the_loop_awake(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[str] = []
+    monkeypatch.setattr(BusyPolling, "begin", lambda _: begun.append("begun"))
 
-    async def reply(count: int) -> int:
-        for _ in range(count):
-            turn.count()
+    async def after(*connections: str) -> int:
+        """How often it was begun by the end of a turn with replies on these connections."""
+        begun.clear()
+        for connection in connections:
+            turn.count(connection)
         await asyncio.sleep(0)
         return len(begun)
 
-    async def replies() -> list[int]:
-        return [await reply(count) for count in (1, 2, 1)]
+    async def turns() -> list[int]:
+        return [await after(*each) for each in ("a", "a", "a", "b", "a", "a", "ab", "aa", "a")]
 
-    assert asyncio.run(replies()) == [1, 1, 2]
+    assert asyncio.run(turns()) == [0, 1, 1, 0, 0, 1, 0, 0, 1]
