@@ -85,12 +85,12 @@ LARGE_REPLY = (
 
 
 class RepeatedHead(NamedTuple):
-    """What the parser made of a head, and where its varying values are.
+    """What was made of a head by the parser, and by uvicorn's look for the client that a proxy names.
 
     A robot asks a hundred times a second, and only the body's length varies; reading a head costs more than all else
-    that a connection does: a dozen calls from the parser into Python. What it made of one holds for every other that
-    is the same byte by byte, but for two values that are looked at here: how long the body is, and a proxy's stamp.
-    All other requests are for the parser.
+    that a connection does: a dozen calls from the parser into Python. It holds for every other that is the same byte by
+    byte, but for two values whose places are kept: how long the body is, and a proxy's stamp. All other requests are
+    for the parser.
     """
 
     begin: bytes
@@ -98,7 +98,7 @@ class RepeatedHead(NamedTuple):
     values: tuple[tuple[int, bytes, bytes], ...]
     """Of each: its header's place and name, and the bytes from its end to the next one, or to the body."""
     scope: dict[str, Any]
-    """Of the request that had it."""
+    """Of the request that had it, as the application was given it."""
 
     @classmethod
     def learn(cls, data: bytes, scope: Any) -> RepeatedHead | None:
@@ -189,14 +189,14 @@ class TimedProtocol(HttpToolsProtocol):
     _known: RepeatedHead | None = None  # the head that is expected to come again
     _lessons = MOST_LESSONS
     _answered: Any = None  # the scope of the request that was answered at once in this read
-    _behind_proxy: ASGIApp  # the application, without what looks for the client that a proxy names
+    _inner_app: ASGIApp  # the application, without what looks for the client that a proxy names
     _spare: EarlyEnd | None = None  # of a known request that was answered at once, for the next one
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first head."""
         super().connection_made(transport)
         app: Any = self.app
-        self._behind_proxy = cast("Any", app.app) if isinstance(app, ProxyHeadersMiddleware) else app
+        self._inner_app = cast("Any", app.app) if isinstance(app, ProxyHeadersMiddleware) else app
         self._replies = JoinedWrites(transport)
         self._head_since = self.loop.time()
         self._timer = self.loop.call_later(CHECK_PERIOD_S, self._check_phase)
@@ -262,7 +262,7 @@ class TimedProtocol(HttpToolsProtocol):
                 on_response=self.on_response_complete,
             )
             cycle.more_body = False
-        self._spare = cycle if self._answer(cycle, body, self._behind_proxy) else None
+        self._spare = cycle if self._answer(cycle, body, self._inner_app) else None
         return True
 
     def handle_websocket_upgrade(self) -> None:

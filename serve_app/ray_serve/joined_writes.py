@@ -14,7 +14,7 @@ import asyncio
 import threading
 from typing import Any
 
-from rlservo.serve_app.ray_serve.busy_polling import BusyPolling
+from rlservo.serve_app.ray_serve.busy_polling import polling
 
 MOST_HELD = 16  # replies: the first of them waits for the last
 INFORMATIONAL = b"HTTP/1.1 1"  # 100 Continue: the client waits for it before it sends the body
@@ -28,25 +28,16 @@ class Turn(threading.local):
         self._replies = 0
         self._several = False  # in the turn before
         self._held: list[tuple[Any, bytes]] = []
-        self._polling: BusyPolling
-        self._last: Any = None  # the connection that the last turn's first reply went to
-        self._is_same = False  # as the turn's before it
-
-    def count(self, transport: Any) -> None:
-        """Count a reply on a connection, which somebody else writes."""
-        loop = asyncio.get_running_loop()
-        if self._loop is not loop:  # the first, or the one before has ended and taken its connections with it
-            self._loop, self._replies, self._several, self._held = loop, 0, False, []
-            self._polling = BusyPolling(loop)
-        if self._replies == 0:
-            loop.call_soon(self._end)
-            self._polling.note_answer()
-            self._is_same, self._last = transport is self._last, transport
-        self._replies += 1
 
     def write(self, transport: Any, reply: bytes) -> None:
         """Write a reply, now or at the end of the turn."""
-        self.count(transport)
+        loop = asyncio.get_running_loop()
+        if self._loop is not loop:  # the first, or the one before has ended and taken its connections with it
+            self._loop, self._replies, self._several, self._held = loop, 0, False, []
+        if self._replies == 0:
+            loop.call_soon(self._end)
+        self._replies += 1
+        polling.note_reply(transport)
         if not self._several:
             transport.write(reply)
             return
@@ -62,11 +53,8 @@ class Turn(threading.local):
                 transport.write(reply)
 
     def _end(self) -> None:
+        self._several, self._replies = self._replies > 1, 0
         self.flush()
-        self._several = self._replies > 1
-        if self._is_same and not self._several:  # of several clients, each would pay for the others' moments
-            self._polling.begin()
-        self._replies = 0
 
 
 turn = Turn()

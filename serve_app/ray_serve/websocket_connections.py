@@ -16,8 +16,8 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from rlservo.serve_app.protocols.http_endpoint import AT_ONCE
+from rlservo.serve_app.ray_serve.busy_polling import polling
 from rlservo.serve_app.ray_serve.eager_tasks import start_at_once
-from rlservo.serve_app.ray_serve.joined_writes import turn
 from rlservo.serve_app.ray_serve.uvicorn_parts import (
     OPEN,
     WebSocketsSansIOProtocol,
@@ -168,7 +168,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
             head = b"\x82\x7e" + size.to_bytes(2, "big")
         else:
             head = b"\x82\x7f" + size.to_bytes(8, "big")
-        turn.count(self.transport)
+        polling.note_reply(self.transport)
         self.transport.write(head + content)
 
     async def receive(self) -> Message:  # type: ignore[override]

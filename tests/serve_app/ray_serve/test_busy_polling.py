@@ -4,105 +4,136 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
+import uvloop
 
 from rlservo.serve_app.ray_serve import busy_polling
 from rlservo.serve_app.ray_serve.busy_polling import MOST_SKIPPED, BusyPolling
-from rlservo.serve_app.ray_serve.joined_writes import turn
+
+FOR_EVER = 3600.0
+TURNS = 4  # of the event loop, in which a moment of no length is over
 
 
-class Loop:
-    """Calls back when it is told to, as an event loop does in its next turn."""
+@pytest.fixture(params=["asyncio", "uvloop"])
+def run(request: pytest.FixtureRequest) -> Callable[[Coroutine[Any, Any, Any]], Any]:
+    """Run a coroutine in an event loop of its own."""
+    return asyncio.run if request.param == "asyncio" else uvloop.run
+
+
+class Counted(BusyPolling):
+    """Counts how often the loop was kept awake."""
 
     def __init__(self) -> None:
-        self.next: list[Any] = []
+        super().__init__()
+        self.polls = 0
 
-    def call_soon(self, callback: Any) -> None:
-        self.next.append(callback)
+    def _poll(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.polls += 1
+        super()._poll(loop)
 
-    def take_turn(self) -> bool:
-        """Return whether something was to be called: otherwise the loop sleeps."""
-        now, self.next = self.next, []
-        for callback in now:
-            callback()
-        return bool(now)
+    async def has_begun(self, *connections: object) -> bool:
+        """Whether the loop was kept awake after a turn with replies on these connections, in moments of no length."""
+        before = self.polls
+        for connection in connections:
+            self.note_reply(connection)
+        for _ in range(TURNS):
+            await asyncio.sleep(0)
+        return self.polls > before
 
 
 @pytest.fixture
-def loop() -> Loop:
-    return Loop()
+def polling() -> Counted:
+    return Counted()
 
 
 @pytest.fixture
-def polling(loop: Loop) -> BusyPolling:
-    return BusyPolling(loop)  # type: ignore[arg-type]
+def awake_s(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    return lambda seconds: monkeypatch.setattr(busy_polling, "AWAKE_S", seconds)
 
 
-def begins(loop: Loop, polling: BusyPolling) -> bool:
-    """Whether the loop is awake after this reply, to which no request comes."""
-    polling.begin()
-    was_awake = False
-    while loop.take_turn():
-        was_awake = True
-    return was_awake
-
-
-def test_the_loop_is_awake_until_a_request_comes(
-    loop: Loop, polling: BusyPolling, monkeypatch: pytest.MonkeyPatch
+def test_the_loop_stays_awake_until_a_request_is_answered(
+    run: Any, polling: Counted, awake_s: Callable[[float], None]
 ) -> None:
-    monkeypatch.setattr(busy_polling, "AWAKE_S", 3600.0)
-    polling.begin()
-    assert all(loop.take_turn() for _ in range(100))
-    polling.note_answer()
-    assert loop.take_turn() and not loop.take_turn()
+    async def turns() -> None:
+        for _ in range(2):
+            polling.note_reply(run)
+            await asyncio.sleep(0.02)
+        assert polling.polls > 20
+        awake_s(0.0)
+        polling.note_reply(run)  # the request has come; after this reply it is looked for once more, in vain
+        await asyncio.sleep(0.02)
+        over = polling.polls
+        await asyncio.sleep(0.02)
+        assert polling.polls == over
+
+    awake_s(FOR_EVER)
+    run(turns())
 
 
-def test_the_loop_sleeps_when_nothing_has_come_in_time(loop: Loop, polling: BusyPolling) -> None:
-    assert begins(loop, polling)
-    assert not loop.take_turn()
+def test_the_loop_sleeps_when_nothing_has_come_in_time(
+    run: Any, polling: Counted, awake_s: Callable[[float], None]
+) -> None:
+    async def turns() -> None:
+        for _ in range(2):
+            polling.note_reply(run)
+            await asyncio.sleep(0)
+        await asyncio.sleep(0.05)
+        over = polling.polls
+        assert over > 0
+        await asyncio.sleep(0.02)
+        assert polling.polls == over
+
+    awake_s(0.01)
+    run(turns())
 
 
 def test_a_moment_for_nothing_is_tried_ever_more_rarely(
-    loop: Loop, polling: BusyPolling, monkeypatch: pytest.MonkeyPatch
+    run: Any, polling: Counted, awake_s: Callable[[float], None]
 ) -> None:
-    monkeypatch.setattr(busy_polling, "AWAKE_S", 0.0)
-    tried = [number for number in range(400) if begins(loop, polling)]
-    assert [after - before - 1 for before, after in itertools.pairwise(tried)] == [
-        *(1, 3, 7, 15, 31, 63),
-        *[MOST_SKIPPED] * 4,
-    ]
+    async def turns() -> list[bool]:
+        await polling.has_begun(run)
+        return [await polling.has_begun(run) for _ in range(400)]
+
+    awake_s(0.0)
+    tried = [number for number, has_begun in enumerate(run(turns())) if has_begun]
+    skipped = [after - before - 1 for before, after in itertools.pairwise(tried)]
+    assert skipped == [1, 3, 7, 15, 31, 63, *[MOST_SKIPPED] * 4]
 
 
-def test_one_that_paid_is_followed_by_the_next(
-    loop: Loop, polling: BusyPolling, monkeypatch: pytest.MonkeyPatch
+def test_each_that_paid_halves_what_is_skipped_after_the_next_failure(
+    run: Any, polling: Counted, awake_s: Callable[[float], None]
 ) -> None:
-    monkeypatch.setattr(busy_polling, "AWAKE_S", 0.0)
-    assert [begins(loop, polling) for _ in range(3)] == [True, False, True]  # and three would be skipped now
-    monkeypatch.setattr(busy_polling, "AWAKE_S", 3600.0)
-    for _ in range(3):
-        polling.begin()
-    for _ in range(5):
-        polling.begin()
-        assert loop.take_turn()
-        polling.note_answer()
-        assert loop.take_turn() and not loop.take_turn()
+    async def turns() -> list[bool]:
+        await polling.has_begun(run)
+        for _ in range(1 + 1 + 1 + 3 + 1):  # three failures with what is skipped between them
+            await polling.has_begun(run)
+        awake_s(FOR_EVER)
+        for _ in range(7):  # which the third has skipped
+            assert not await polling.has_begun(run)
+        for _ in range(3):  # 7, 3, 1 and 0
+            assert await polling.has_begun(run)
+        awake_s(0.0)
+        await polling.has_begun(run)
+        return [await polling.has_begun(run) for _ in range(3)]
+
+    awake_s(0.0)
+    assert run(turns()) == [False, True, False]
 
 
-def test_only_a_client_that_asked_before_keeps_the_loop_awake(monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[str] = []
-    monkeypatch.setattr(BusyPolling, "begin", lambda _: begun.append("begun"))
+def test_only_a_client_that_had_the_reply_before_keeps_the_loop_awake(
+    run: Any, polling: Counted, awake_s: Callable[[float], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a, b = object(), object()
 
-    async def after(*connections: str) -> int:
-        """How often it was begun by the end of a turn with replies on these connections."""
-        begun.clear()
-        for connection in connections:
-            turn.count(connection)
-        await asyncio.sleep(0)
-        return len(begun)
+    async def turns() -> list[bool]:
+        each = ((a,), (a,), (a,), (b,), (a,), (a,), (a, b), (a, a), (a,))
+        return [await polling.has_begun(*connections) for connections in each]
 
-    async def turns() -> list[int]:
-        return [await after(*each) for each in ("a", "a", "a", "b", "a", "a", "ab", "aa", "a")]
-
-    assert asyncio.run(turns()) == [0, 1, 1, 0, 0, 1, 0, 0, 1]
+    awake_s(0.0)
+    monkeypatch.setattr(busy_polling, "MOST_SKIPPED", 0)
+    expected = [False, True, True, False, False, True, False, False, True]
+    assert run(turns()) == expected
+    assert run(turns()) == expected  # in another loop, which knows nothing of the one before

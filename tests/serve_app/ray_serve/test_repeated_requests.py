@@ -10,10 +10,12 @@ from typing import Any
 
 import pytest
 import uvicorn
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 from uvicorn.server import ServerState
 
 from rlservo.serve_app.protocols.http_endpoint import REPLY
 from rlservo.serve_app.ray_serve import ingress
+from rlservo.serve_app.ray_serve.busy_polling import polling
 from rlservo.serve_app.ray_serve.http_connections import RepeatedHead, TimedProtocol
 
 IDLE_S = 60
@@ -52,7 +54,8 @@ async def tell(scope: Any, receive: Any, send: Any) -> None:
     if scope["path"] != "/unread":
         body = (await receive())["body"]
     headers = [[name.decode("latin-1"), value.decode("latin-1")] for name, value in scope["headers"]]
-    asked = [scope["path"], scope["query_string"].decode(), headers, scope["client"], scope["scheme"]]
+    keys = sorted(key for key in scope if not key.startswith("rlservo."))
+    asked = [scope["path"], scope["query_string"].decode(), headers, scope["client"], scope["scheme"], keys]
     told = json.dumps([*asked, body.decode("latin-1")]).encode()
     lines = [(b"content-length", b"%d" % len(told))]
     if REPLY in scope and scope[REPLY](200, lines, told):
@@ -141,14 +144,35 @@ def test_the_client_that_a_proxy_names_is_that_of_every_request(
     def forwarded(body: bytes, client: str, *lines: str) -> bytes:
         return request(body, "/act", f"x-forwarded-for: {client}", *lines)
 
-    first, other = "192.0.2.7", "192.0.2.8"
+    first, other, https = "192.0.2.7", "192.0.2.8", "x-forwarded-proto: https"
     pieces = [*(forwarded(b"%d" % number, first) for number in range(4)), forwarded(b"4", other)]
-    pieces += [forwarded(b"5", other), forwarded(b"6", other, "x-forwarded-proto: https"), forwarded(b"7", first)]
-    written = replies(pieces, [1] * 8)
-    assert repeated[:2] == [b"2", b"3"]
-    assert [written.count(f'["{client}", 0]'.encode()) for client in (first, other)] == [5, 3]
-    assert written.count(b'"https", "6"') == 1
-    assert written == parsed(monkeypatch, pieces, [1] * 8)
+    pieces += [*(forwarded(b"%d" % number, other, https) for number in range(5, 9)), forwarded(b"9", first)]
+    turns = [1] * len(pieces)
+    written = replies(pieces, turns)
+    assert repeated == [b"2", b"3", b"6", b"7", b"8"]
+    assert [written.count(f'["{client}", 0]'.encode()) for client in (first, other)] == [5, 5]
+    assert written.count(b'["192.0.2.8", 0], "https"') == 4
+    assert written == parsed(monkeypatch, pieces, turns)
+
+
+def test_a_head_that_comes_again_is_not_searched_for_a_client_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched: list[str] = []
+    call = ProxyHeadersMiddleware.__call__
+
+    async def counted(self: ProxyHeadersMiddleware, scope: Any, receive: Any, send: Any) -> None:
+        searched.append(scope["path"])
+        await call(self, scope, receive, send)
+
+    monkeypatch.setattr(ProxyHeadersMiddleware, "__call__", counted)
+    written = replies([request(b"%d" % number) for number in range(5)], [1] * 5)
+    assert written.count(b"200 OK") == 5 and len(searched) == 2
+
+
+def test_every_reply_is_one_that_the_loop_may_stay_awake_after(monkeypatch: pytest.MonkeyPatch) -> None:
+    noted: list[Any] = []
+    monkeypatch.setattr(polling, "note_reply", noted.append)
+    written = replies([request(b"%d" % number) for number in range(4)], [1] * 4)
+    assert written.count(b"200 OK") == len(noted) == 4 and len(set(noted)) == 1
 
 
 def test_requests_sent_ahead_are_all_answered(repeated: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:

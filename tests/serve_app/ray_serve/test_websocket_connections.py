@@ -13,6 +13,7 @@ import uvicorn
 from uvicorn.server import ServerState
 
 from rlservo.serve_app.protocols.http_endpoint import AT_ONCE
+from rlservo.serve_app.ray_serve.busy_polling import polling
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 
 HANDSHAKE = (
@@ -104,6 +105,20 @@ async def turns() -> None:
 
 async def echo(message: Any) -> Any:
     return {"type": "websocket.send", "bytes": message["bytes"]}
+
+
+def test_every_reply_is_one_that_the_loop_may_stay_awake_after(monkeypatch: pytest.MonkeyPatch) -> None:
+    noted: list[Any] = []
+    monkeypatch.setattr(polling, "note_reply", noted.append)
+
+    async def run() -> None:
+        stream = Stream(echo)
+        await stream.open()
+        for number in range(3):
+            stream.send(frame(b"%d" % number))
+        assert noted == [stream.transport] * 3
+
+    asyncio.run(run())
 
 
 def test_a_message_is_answered_before_the_read_returns() -> None:
