@@ -4,8 +4,8 @@ A thread that sleeps costs the next request its way back: on a virtual machine t
 wakes it goes by way of the host (28 us of the 143 that one JSON request took). A client that asks again at once finds
 this thread awake. So it is after a turn of the event loop with one reply, on the connection of the turn before: of
 several clients on busy cores each would pay for the others' moments. (HAProxy's connection counts as one client.) Where
-nothing comes in the moment, the next replies do without, twice as many after each failure: a robot's fifty requests a
-second cost one moment in `MOST_SKIPPED` replies.
+that client does not ask in the moment, the next replies do without, twice as many after each failure: a robot's fifty
+requests a second cost one moment in `MOST_SKIPPED` replies.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ class BusyPolling(threading.local):
 
     def _poll(self, loop: asyncio.AbstractEventLoop) -> None:
         """Let the loop look at its sockets once more: it does not sleep while something is to be called."""
-        if self._replies:
+        if self._replies and self._is_same:
             self._to_skip //= 2
-        elif time.perf_counter() < self._until:
+        elif not self._replies and time.perf_counter() < self._until:
             loop.call_soon(self._poll, loop)
         else:
             self._to_skip, self._skipped = min(2 * self._to_skip + 1, MOST_SKIPPED), 0

@@ -137,3 +137,19 @@ def test_only_a_client_that_had_the_reply_before_keeps_the_loop_awake(
     expected = [False, True, True, False, False, True, False, False, True]
     assert run(turns()) == expected
     assert run(turns()) == expected  # in another loop, which knows nothing of the one before
+
+
+def test_a_request_of_another_client_is_none_that_it_was_awake_for(
+    run: Any, polling: Counted, awake_s: Callable[[float], None]
+) -> None:
+    a, b = object(), object()
+
+    async def turns() -> list[bool]:
+        await polling.has_begun(a)
+        begun = [await polling.has_begun(a)]
+        awake_s(0.0)
+        begun += [await polling.has_begun(*connections) for connections in ((b,), (b,), (b,))]
+        return begun
+
+    awake_s(FOR_EVER)
+    assert run(turns()) == [True, True, False, True]  # awake still as b is answered; then one is skipped
