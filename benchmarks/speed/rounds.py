@@ -18,7 +18,7 @@ import numpy as np
 
 from speed import loads
 from speed.catalogue import BARE, BARE_ASGI, BATCH, DIRECT, RLLIB, RLSERVO, Case
-from speed.loads import GrpcLine, HttpLine, Load, RefusedError, WebSocketLine
+from speed.loads import GrpcLine, HttpLine, Load, LoadError, RefusedError, WebSocketLine
 from speed.machine import OTHER, PROXY, REPLICA, cpu_by_role
 from speed.paced import SETTLE_S, http_robot, paced, paced_calls, stream_robot
 from speed.servers import Server, ask
@@ -209,6 +209,8 @@ def carried(server: Server, rate_hz: float, seconds: float) -> tuple[int, float]
             load = paced(make, robots=robots, rate_hz=rate_hz, seconds=seconds)
         except RefusedError:
             load = None
+        except LoadError as error:
+            raise LoadError(f"{server.name}, {robots} robots at {rate_hz:g} Hz: {error}") from None
         after = cpu_by_role(server.members())
         if load is not None and load.p999_ms is not None and load.p999_ms <= 250 / rate_hz:
             most = robots
