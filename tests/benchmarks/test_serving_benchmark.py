@@ -22,6 +22,7 @@ from rich.console import Console
 
 import soak as soak_module
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.ray_serve.http_connections import HEAD_S
 from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
@@ -30,8 +31,21 @@ from speed import report
 from speed.catalogue import BARE, DIRECTLY, RLLIB, RLSERVO, TWO, Case, binary, case_of, plain
 from speed.loads import HttpLine, Load, LoadError, WebSocketLine, infer_request, wrk
 from speed.machine import OTHER, PROXY, REPLICA, processes
+from speed.paced import CONNECT_S
 from speed.report import Result, Verdict, verdicts
-from speed.rounds import HEAVY, JSON1, JSON16, JSON64, ONES, Rounds, Sample, check_answers, scaling
+from speed.rounds import (
+    HEAVY,
+    JSON1,
+    JSON16,
+    JSON64,
+    MOST_ROBOTS,
+    ONES,
+    PLANNED_HZ,
+    Rounds,
+    Sample,
+    check_answers,
+    scaling,
+)
 from speed.servers import Exchange, Server, listening, running
 from stores import load_store
 
@@ -256,3 +270,8 @@ def test_soak_begins_when_every_replica_has_answered(server: Server, monkeypatch
     monkeypatch.setattr(soak_module, "START_S", 0.3)
     with pytest.raises(SystemExit, match="did not start 2 replicas"):
         soak_module.settle(server, 2)  # there is one
+
+
+def test_the_most_robots_have_connected_before_the_first_is_closed_for_its_silence() -> None:
+    slowest = min(PLANNED_HZ)
+    assert MOST_ROBOTS * CONNECT_S + 1 / slowest < HEAD_S
