@@ -8,6 +8,7 @@ they came.
 from __future__ import annotations
 
 import asyncio
+import functools
 import ipaddress
 import logging
 import math
@@ -38,7 +39,7 @@ from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
 from rlservo.serve_app.protocols.http_errors import retry_after_s, status_of
 from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, check_form, check_size, datatype_of, from_bytes
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, NAMES, check_form, check_size, from_bytes
 from rlservo.serve_app.server.access_checks import StreamKey, authorize, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
@@ -170,9 +171,13 @@ class Grpc:
             )
         metadata = context.invocation_metadata()
         headers: dict[bytes, bytes] = {}
+        texts: dict[str, str] = {}
         for name, value in metadata:
-            headers.setdefault(name.encode(), _bytes(value))
-        texts = {name: value for name, value in metadata if type(value) is str}
+            if type(value) is str:
+                texts[name] = value
+                headers.setdefault(name.encode(), value.encode())
+            else:
+                headers.setdefault(name.encode(), value)
         request = Request(
             PROTOCOL,
             "",
@@ -281,7 +286,7 @@ class OipGrpcCodec:
         for name, value in answer.parameters.items():
             _set(reply.parameters[name], value)
         arrays = {name: np.ascontiguousarray(array) for name, array in answer.outputs.items()}
-        datatypes = {name: datatype_of(array.dtype.name) for name, array in arrays.items()}
+        datatypes = {name: NAMES[array.dtype] for name, array in arrays.items()}
         # A reply is bytes altogether or typed fields altogether, and not every type has a field.
         raw = request.reply_options.binary or any(datatype not in FIELDS for datatype in datatypes.values())
         for name, array in arrays.items():
@@ -320,20 +325,19 @@ def _inputs(message: Any) -> dict[str, NDArray[Any]]:
         raise RequestError(
             f"there are {len(message.inputs)} inputs and {len(raw)} raw_input_contents: one for each, or none"
         )
-    seen: set[str] = set()
-    for tensor in message.inputs:
-        if tensor.name in seen:
-            raise RequestError(f"input '{tensor.name[:64]}' is there twice")
-        seen.add(tensor.name)
     inputs: dict[str, NDArray[Any]] = {}
     for index, tensor in enumerate(message.inputs):
-        label, shape = tensor.name[:64], tuple(tensor.shape)
+        name, shape = tensor.name, tuple(tensor.shape)
+        label = name[:64]
+        if name in inputs:
+            raise RequestError(f"input '{label}' is there twice")
         dtype = check_form(label, shape, tensor.datatype, tensor.parameters)
         if raw:
-            check_size(label, shape, dtype, len(raw[index]), "raw_input_contents are")
-            inputs[tensor.name] = from_bytes(memoryview(raw[index]), shape, dtype)
+            content = raw[index]
+            check_size(label, shape, dtype, len(content), "raw_input_contents are")
+            inputs[name] = from_bytes(memoryview(content), shape, dtype)
         else:
-            inputs[tensor.name] = _typed(label, tensor, shape, dtype)
+            inputs[name] = _typed(label, tensor, shape, dtype)
     return inputs
 
 
@@ -417,6 +421,7 @@ def _explain(error: Exception) -> tuple[grpc.StatusCode, str, str]:
     return status, error.message, error.code
 
 
+@functools.lru_cache(maxsize=1024)  # the peers of open connections: to read an address costs as much as to decide
 def is_local(peer: str) -> bool:
     """Whether a gRPC peer ('ipv4:127.0.0.1:4711', 'ipv6:%5B::1%5D:4711', 'unix:...') is on this machine."""
     scheme, _, address = peer.partition(":")
@@ -434,7 +439,3 @@ def _peer(peer: str, metadata: Any) -> str:
     """Return where a call came from: what HAProxy says, which is on this machine and adds its word last."""
     forwarded = [value for name, value in metadata if name == "x-forwarded-for" and type(value) is str]
     return forwarded[-1].rpartition(",")[2].strip() if forwarded and is_local(peer) else peer
-
-
-def _bytes(value: str | bytes) -> bytes:
-    return value if isinstance(value, bytes) else value.encode()
