@@ -135,7 +135,8 @@ class FailedAgain(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Begin a share of the episodes as one that failed began, until it succeeds or 16 others have failed since.
 
     Where 19 of 20 episodes succeed, one in twenty shows what is missing. Episodes are the same again by their seed;
-    `info["again"]` says which are. After Jiang et al., Prioritized level replay, 2021, whose score is a failure here.
+    `info["again"]` says which are. An episode whose target is out of reach has failed where it ends before its time.
+    After Jiang et al., Prioritized level replay, 2021, whose score is a failure here.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], share: float) -> None:
@@ -143,7 +144,7 @@ class FailedAgain(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._share = share
         self._failed: deque[int] = deque(maxlen=FAILED_KEPT)
         self._rng = np.random.default_rng()
-        self._episode, self._is_again = 0, False
+        self._episode, self._is_again, self._is_hopeless = 0, False, False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         if seed is not None:
@@ -151,13 +152,20 @@ class FailedAgain(gymnasium.Wrapper[Any, Any, Any, Any]):
             self._failed.clear()
         self._is_again = bool(self._failed) and self._rng.random() < self._share
         self._episode = self._failed.popleft() if self._is_again else int(self._rng.integers(2**31))
-        return super().reset(seed=self._episode, options=options)
+        observation, info = super().reset(seed=self._episode, options=options)
+        self._is_hopeless = _is_hopeless(info)
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = super().step(action)
-        if (terminated or truncated) and not info.get("is_success", True):
+        if (terminated if self._is_hopeless else terminated or truncated) and not info.get("is_success", True):
             self._failed.append(self._episode)
         return observation, reward, terminated, truncated, {**info, "again": self._is_again}
+
+
+def _is_hopeless(first: dict[str, Any]) -> bool:
+    """Whether an episode whose first info is given has a target out of reach: `extreme_share` of them have."""
+    return first.get("randomization", {}).get("extreme") == "target"
 
 
 def _make_failed_again(env_id: str, share: float, env_config: dict[str, Any]) -> FailedAgain:
@@ -239,8 +247,8 @@ def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any 
     chunks = [*(prev_episode_chunks or ()), episode]  # an episode is cut where a sampling phase ended
     total, length = sum(chunk.get_return() for chunk in chunks), sum(map(len, chunks))
     info = episode.get_infos(-1) or {}
-    if info.get("again"):
-        return  # the curve is of the episodes that the environment draws
+    if info.get("again") or _is_hopeless(chunks[0].get_infos(0) or {}):
+        return  # the curve is of the episodes that the environment draws, and of targets that can be reached
     success, judgements = info.get("is_success", False), "is_success" in info
     for key, value in zip(SUMS, (1, judgements, total, length, success), strict=True):
         metrics_logger.log_value(("shipped", key), float(value), reduce="sum")

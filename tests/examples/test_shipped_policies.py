@@ -319,26 +319,66 @@ def test_a_share_of_the_episodes_begins_as_one_that_failed_until_it_succeeds(mon
     assert not any(episodes(train_shipped.FailedAgain(OfOneStep(), 0.0), 7)[1])
 
 
-@pytest.mark.parametrize("again", [False, True])
-def test_the_curve_is_of_the_episodes_that_the_environment_draws(monkeypatch: pytest.MonkeyPatch, again: bool) -> None:
+def test_an_episode_with_its_target_out_of_reach_fails_where_it_ends_before_its_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+
+    class Hopeless(OfOneStep):
+        """Ends in a collision where the seed is even, and else when its time is over."""
+
+        def reset(self, **given: Any) -> tuple[int, dict[str, Any]]:
+            return super().reset(**given)[0], {"randomization": {"extreme": "target"}}
+
+        def step(self, _action: Any) -> tuple[int, float, bool, bool, dict[str, Any]]:
+            collides = self.seeds[-1] % 2 == 0
+            return 0, 0.0, collides, not collides, {"is_success": False}
+
+    env = load("train_shipped").FailedAgain(Hopeless(), 0.5)
+    env.reset(seed=3)
+    for _ in range(200):
+        env.step(0)
+        env.reset()
+    again = {seed for seed in env.unwrapped.seeds if env.unwrapped.seeds.count(seed) > 1}
+    assert again and all(seed % 2 == 0 for seed in again)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "counts"),
+    [
+        ({}, {"again": False}, True),
+        ({}, {"again": True}, False),
+        ({"randomization": {"extreme": "target"}}, {}, False),
+        ({"randomization": {"extreme": "start"}}, {}, True),
+        ({"randomization": {"action_latency": 3}}, {}, True),
+    ],
+)
+def test_the_curve_is_of_episodes_that_the_environment_draws_and_that_can_succeed(
+    monkeypatch: pytest.MonkeyPatch, first: dict[str, Any], last: dict[str, Any], counts: bool
+) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     logged: list[Any] = []
     logger = SimpleNamespace(log_value=lambda key, value, **_: logged.append((key[1], value)))
-    info = {"is_success": True, "again": again}
 
-    class Episode:
+    class Part:
+        """Of an episode that is cut where a sampling phase ended: three steps."""
+
+        def __init__(self, first: dict[str, Any], last: dict[str, Any]) -> None:
+            self._infos = {0: first, -1: {"is_success": True, **last}}
+
         def get_return(self) -> float:
             return 1.5
 
-        def get_infos(self, _at: int) -> dict[str, bool]:
-            return info
+        def get_infos(self, at: int) -> dict[str, Any]:
+            return self._infos[at]
 
         def __len__(self) -> int:
             return 3
 
-    load("train_shipped")._log_episode(episode=Episode(), metrics_logger=logger)
-    wanted = [("episodes", 1.0), ("judged", 1.0), ("return", 1.5), ("length", 3.0), ("success", 1.0)]
-    assert logged == ([] if again else wanted)
+    log = load("train_shipped")._log_episode
+    log(episode=Part({}, last), metrics_logger=logger, prev_episode_chunks=[Part(first, {})])
+    wanted = [("episodes", 1.0), ("judged", 1.0), ("return", 3.0), ("length", 6.0), ("success", 1.0)]
+    assert logged == (wanted if counts else [])
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of spaces in float64
