@@ -58,7 +58,6 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
     | `base_offset` | how far from its believed place the robot stands, in any direction, in a range | reset | m |
     | `robot_models` | which robot it is, of these models (named twice: twice as often) | reset | |
     | `extreme` | "target": a target out of reach; "start": the robot in a corner | reset | |
-    | `extreme_share` | in how many of the episodes, 0.1 being every tenth; all, if it is not given | reset | 1 |
 
     `observation_noise` and `observation_bias` are one number for all elements, one each, a mapping by element name, or
     "real" for what the environment's `sensor_errors` states of real sensors, each element in its own unit ("2*real"
@@ -95,7 +94,6 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         base_offset: Range = (0.0, 0.0),
         robot_models: Sequence[str] = (),
         extreme: Extreme | None = None,
-        extreme_share: float = 1.0,
     ) -> None:
         super().__init__(env)
         self._action_latency = _cycles("action_latency", action_latency)
@@ -116,11 +114,6 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         if extreme is not None and extreme not in EXTREMES:
             raise ValueError(f"extreme is {extreme!r}: expected {' or '.join(EXTREMES)}")
         self._extreme: Extreme | None = extreme
-        if not 0.0 < extreme_share <= 1.0:
-            raise ValueError(f"extreme_share is {extreme_share:g}: expected a share of the episodes, above 0, up to 1")
-        if extreme_share < 1.0 and extreme is None:
-            raise ValueError(f"extreme_share is {extreme_share:g}, but extreme is not given: expected both")
-        self._extreme_share = extreme_share
         if isinstance(robot_models, str):
             raise ValueError(f"robot_models is {robot_models!r}: expected a list of names")
         self._robot_models = tuple(robot_models)
@@ -162,7 +155,7 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
             self._simulation.set_payload(mass)
         draws |= {"action_latency": self._delay, "observation_latency": age, "payload": mass}
         draws |= self._draw_model()
-        if self._extreme is not None and self._draws_extreme():
+        if self._extreme is not None:
             assert isinstance(self.env.unwrapped, HasExtremes)
             extreme = self.env.unwrapped.extreme_options(self._extreme, self._streams["extreme"])
             options = {**extreme, **(options or {})}
@@ -198,10 +191,6 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
     def _set_robot_model(self, model: str) -> None:
         assert isinstance(self.env.unwrapped, HasRobotModels)
         self.env.unwrapped.set_robot_model(model)
-
-    def _draws_extreme(self) -> bool:
-        # Nothing is drawn where it is all: the episodes stay what they were before there was a share.
-        return self._extreme_share == 1.0 or float(self._streams["extreme"].uniform()) < self._extreme_share
 
     def _draw_model(self) -> dict[str, Any]:
         draws: dict[str, Any] = {}
@@ -362,7 +351,6 @@ def make_randomized(
     base_offset: Range = (0.0, 0.0),
     robot_models: Sequence[str] = (),
     extreme: Extreme | None = None,
-    extreme_share: float = 1.0,
     **arguments: Any,
 ) -> DomainRandomization:
     """Make `env_id` with `arguments` and wrap it: `rlservo/Randomized-v0`, for programs that make environments by id.
@@ -384,7 +372,6 @@ def make_randomized(
         base_offset=base_offset,
         robot_models=robot_models,
         extreme=extreme,
-        extreme_share=extreme_share,
     )
 
 

@@ -34,16 +34,17 @@ class Turn(threading.local):
         loop = asyncio.get_running_loop()
         if self._loop is not loop:  # the first, or the one before has ended and taken its connections with it
             self._loop, self._replies, self._several, self._held = loop, 0, False, []
+        if not self._several:
+            transport.write(reply)
+        else:
+            self._held.append((transport, reply))
+            if len(self._held) == MOST_HELD:
+                self.flush()
+        # After the write: the client waits for it.
         if self._replies == 0:
             loop.call_soon(self._end)
         self._replies += 1
         polling.note_reply(transport)
-        if not self._several:
-            transport.write(reply)
-            return
-        self._held.append((transport, reply))
-        if len(self._held) == MOST_HELD:
-            self.flush()
 
     def flush(self) -> None:
         """Write what is held."""

@@ -168,8 +168,8 @@ class BoundedStream(WebSocketsSansIOProtocol):
             head = b"\x82\x7e" + size.to_bytes(2, "big")
         else:
             head = b"\x82\x7f" + size.to_bytes(8, "big")
-        polling.note_reply(self.transport)
         self.transport.write(head + content)
+        polling.note_reply(self.transport)  # after it: the client waits for the frame
 
     async def receive(self) -> Message:  # type: ignore[override]
         """Return the next message; others have their turn before one that has come already."""

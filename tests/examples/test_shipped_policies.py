@@ -276,109 +276,115 @@ def test_standard_deviations_stay_below_their_bound_over_the_steps(penalties: Ca
 
 
 class OfOneStep(gymnasium.Env[Any, Any]):
-    """Ends after a step: in a success but for the first two episodes of an even seed."""
+    """Ends after a step: in a success but for the first two episodes of an even seed, and out of reach never in one."""
 
     observation_space, action_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Discrete(2)
     seeds: list[int]
 
     def __init__(self) -> None:
         self.seeds = []
+        self.hopeless: list[int] = []
+        self.drawn: list[float] = []
+        self.is_hopeless = False
+
+    def extreme_options(self, what: str, rng: np.random.Generator) -> dict[str, Any]:
+        return {what: rng.random()}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
         assert seed is not None
         self.seeds.append(seed)
+        self.is_hopeless = bool(options)
+        if options:
+            self.hopeless.append(seed)
+            self.drawn.append(options["target"])
         return 0, {}
 
     def step(self, _action: Any) -> tuple[int, float, bool, bool, dict[str, Any]]:
         seed = self.seeds[-1]
+        if self.is_hopeless:  # a collision, or the end of its time
+            return 0, 0.0, seed % 2 == 0, seed % 2 == 1, {"is_success": False}
         return 0, 0.0, True, False, {"is_success": seed % 2 == 1 or self.seeds.count(seed) > 2}
+
+
+def episodes(env: Any, seed: int, count: int = 500) -> tuple[list[int], list[bool]]:
+    """Return the seeds of so many episodes, and which of them were drawn."""
+    begin = len(env.unwrapped.seeds)
+    env.reset(seed=seed)
+    drawn = []
+    for _ in range(count):
+        drawn.append(env.step(0)[-1]["is_drawn"])
+        env.reset()
+    return env.unwrapped.seeds[begin:-1], drawn
 
 
 def test_a_share_of_the_episodes_begins_as_one_that_failed_until_it_succeeds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
-    train_shipped = load("train_shipped")
-
-    def episodes(env: gymnasium.Env[Any, Any], seed: int) -> tuple[list[int], list[bool]]:
-        begin = len(env.unwrapped.seeds)
-        env.reset(seed=seed)
-        again = []
-        for _ in range(500):
-            again.append(env.step(0)[-1]["again"])
-            env.reset()
-        return env.unwrapped.seeds[begin:-1], again
-
-    env = train_shipped.FailedAgain(OfOneStep(), 0.3)
-    seeds, again = episodes(env, 7)
-    for number, (episode, is_again) in enumerate(zip(seeds, again, strict=True)):
+    chosen = load("train_shipped").ChosenEpisodes
+    env = chosen(OfOneStep(), 0.3)
+    seeds, drawn = episodes(env, 7)
+    for number, (episode, is_drawn) in enumerate(zip(seeds, drawn, strict=True)):
         before = seeds[:number].count(episode)
-        assert is_again == (before > 0) and before <= (2 if episode % 2 == 0 else 0), number
-    assert 100 <= sum(again) <= 200 and max(map(seeds.count, seeds)) == 3
+        assert is_drawn == (before == 0) and before <= (2 if episode % 2 == 0 else 0), number
+    assert 300 <= sum(drawn) <= 400 and max(map(seeds.count, seeds)) == 3
     assert episodes(env, 8)[0] != seeds
     env.unwrapped.seeds.clear()
-    assert episodes(env, 7) == (seeds, again)  # whatever was before
-    assert not any(episodes(train_shipped.FailedAgain(OfOneStep(), 0.0), 7)[1])
+    assert episodes(env, 7) == (seeds, drawn)  # whatever was before
+    assert all(episodes(chosen(OfOneStep(), 0.0), 7)[1])
 
 
-def test_an_episode_with_its_target_out_of_reach_fails_where_it_ends_before_its_time(
+def test_a_share_has_its_target_out_of_reach_after_a_while_and_fails_before_its_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
-
-    class Hopeless(OfOneStep):
-        """Ends in a collision where the seed is even, and else when its time is over."""
-
-        def reset(self, **given: Any) -> tuple[int, dict[str, Any]]:
-            return super().reset(**given)[0], {"randomization": {"extreme": "target"}}
-
-        def step(self, _action: Any) -> tuple[int, float, bool, bool, dict[str, Any]]:
-            collides = self.seeds[-1] % 2 == 0
-            return 0, 0.0, collides, not collides, {"is_success": False}
-
-    env = load("train_shipped").FailedAgain(Hopeless(), 0.5)
-    env.reset(seed=3)
-    for _ in range(200):
-        env.step(0)
-        env.reset()
-    again = {seed for seed in env.unwrapped.seeds if env.unwrapped.seeds.count(seed) > 1}
-    assert again and all(seed % 2 == 0 for seed in again)
+    chosen = load("train_shipped").ChosenEpisodes
+    env = chosen(OfOneStep(), 0.0, hopeless=0.2, after=300)
+    seeds, drawn = episodes(env, 7, 1000)
+    hopeless = env.unwrapped.hopeless
+    assert [seed for seed, one in zip(seeds, drawn, strict=True) if not one] == hopeless
+    assert all(drawn[:300]) and 100 <= len(hopeless) <= 180
+    again = chosen(OfOneStep(), 0.5, hopeless=0.2)
+    episodes(again, 7)
+    twice = {seed for seed in again.unwrapped.hopeless if again.unwrapped.hopeless.count(seed) > 1}
+    assert twice and all(seed % 2 == 0 for seed in twice)
+    told = dict(zip(again.unwrapped.hopeless, again.unwrapped.drawn, strict=True))
+    assert list(map(told.get, again.unwrapped.hopeless)) == again.unwrapped.drawn  # the same again by its seed
 
 
-@pytest.mark.parametrize(
-    ("first", "last", "counts"),
-    [
-        ({}, {"again": False}, True),
-        ({}, {"again": True}, False),
-        ({"randomization": {"extreme": "target"}}, {}, False),
-        ({"randomization": {"extreme": "start"}}, {}, True),
-        ({"randomization": {"action_latency": 3}}, {}, True),
-    ],
-)
-def test_the_curve_is_of_episodes_that_the_environment_draws_and_that_can_succeed(
-    monkeypatch: pytest.MonkeyPatch, first: dict[str, Any], last: dict[str, Any], counts: bool
+@pytest.mark.parametrize("is_drawn", [False, True])
+def test_the_curve_is_of_the_episodes_that_the_environment_draws(
+    monkeypatch: pytest.MonkeyPatch, is_drawn: bool
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     logged: list[Any] = []
     logger = SimpleNamespace(log_value=lambda key, value, **_: logged.append((key[1], value)))
+    info = {"is_success": True, "is_drawn": is_drawn}
 
-    class Part:
-        """Of an episode that is cut where a sampling phase ended: three steps."""
-
-        def __init__(self, first: dict[str, Any], last: dict[str, Any]) -> None:
-            self._infos = {0: first, -1: {"is_success": True, **last}}
-
+    class Episode:
         def get_return(self) -> float:
             return 1.5
 
-        def get_infos(self, at: int) -> dict[str, Any]:
-            return self._infos[at]
+        def get_infos(self, _at: int) -> dict[str, bool]:
+            return info
 
         def __len__(self) -> int:
             return 3
 
-    log = load("train_shipped")._log_episode
-    log(episode=Part({}, last), metrics_logger=logger, prev_episode_chunks=[Part(first, {})])
-    wanted = [("episodes", 1.0), ("judged", 1.0), ("return", 3.0), ("length", 6.0), ("success", 1.0)]
-    assert logged == (wanted if counts else [])
+    load("train_shipped")._log_episode(episode=Episode(), metrics_logger=logger)
+    wanted = [("episodes", 1.0), ("judged", 1.0), ("return", 1.5), ("length", 3.0), ("success", 1.0)]
+    assert logged == (wanted if is_drawn else [])
+
+
+def test_what_is_trained_is_judged_when_it_is_worth_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    train_shipped = load("train_shipped")
+    validation = train_shipped.Validation(episodes=2, seed=0, env_steps=100, above=0.9, since=1000)
+    rows = [(500, 0.95), (1000, 0.8), (1050, 0.95), (1100, 0.99), (1150, 0.95), (1300, 0.85)]
+    due = [
+        steps
+        for steps, success in rows
+        if validation.is_due(train_shipped.Row(steps, steps, 0.0, 1.0, success, wall_s=0.0, cpu_s=0.0))
+    ]
+    assert due == [1050, 1150]
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of spaces in float64
@@ -420,6 +426,11 @@ def test_training_begins_with_another_network_without_the_elements_it_shall_forg
             "train_shipped.py",
             ("mir100_obstacle_avoidance", "--set", "failed_again=1.5"),
             "failed_again is 1.5: expected a share of the episodes, 0 to 1",
+        ),
+        (
+            "train_shipped.py",
+            ("mir100_obstacle_avoidance", "--set", "out_of_reach.share=-0.1"),
+            "out_of_reach.share is -0.1: expected a share of the episodes, 0 to 1",
         ),
         (
             "train_shipped.py",
