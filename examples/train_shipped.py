@@ -48,6 +48,7 @@ from ray.tune.registry import ENV_CREATOR, _global_registry, get_trainable_cls, 
 from shared.training_run import main_with_sentences, ray_session
 
 from rlservo import Policy, errors, export_checkpoint
+from rlservo.envs.disturbances import HasExtremes
 from rlservo.export.rllib.batched_connectors import use_batched_connectors
 
 assert ray_settings
@@ -79,15 +80,10 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     """Return the RLlib configuration that `training.yaml` describes. Raises UsageError."""
     config: AlgorithmConfig = get_trainable_cls(settings["algorithm"]).get_default_config()
     config.environment(settings["env"], env_config=settings.get("env_config", {}), clip_rewards=False)
-    failed, hopeless = settings.get("failed_again", 0), settings.get("out_of_reach") or {"share": 0, "after": 0}
-    for name, share in (("failed_again", failed), ("out_of_reach.share", hopeless["share"])):
-        if not isinstance(share, int | float) or not 0 <= share <= 1:
-            raise errors.UsageError(f"{name} is {share!r}: expected a share of the episodes, 0 to 1")
+    chosen = _chosen_episodes(settings)
     # Under the environment's own name, which checkpoints keep: one that is restored elsewhere has no wrapper.
-    if failed or hopeless["share"]:
-        after = hopeless["after"] // settings["envs"]
-        made = functools.partial(_make_chosen, settings["env"], failed, hopeless["share"], after)
-        register_env(settings["env"], made)
+    if chosen["failed_share"] or chosen["out_of_reach_share"]:
+        register_env(settings["env"], functools.partial(_make_chosen, settings["env"], chosen))
     else:  # what a training before this one, in the same process, has registered
         _global_registry.unregister(ENV_CREATOR, settings["env"])
     config.env_runners(
@@ -135,53 +131,63 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
 
 
 class ChosenEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Choose how episodes begin: some as one that failed, some with a target that nobody can reach.
+    """Choose how episodes begin: some as one that failed, some with a target that is out of reach.
 
     Where 19 of 20 episodes succeed, one in twenty shows what is missing: a share begins as one that failed began, until
     it succeeds or 16 others have failed since. (After Jiang et al., Prioritized level replay, 2021, whose score is a
-    failure here.) Another share, after so many steps, has its target out of reach, by the environment's
-    `extreme_options`: what can be done there is to wait, so that it has failed where it ends before its time.
+    failure here.) Of the others a share has its target out of reach, by the environment's `extreme_options`: all that
+    can be done there is to wait until the time is over.
 
-    Episodes are the same again by their seed. `info["is_drawn"]` says which are neither.
+    Episodes are the same again by their seed. `info["is_ordinary"]` says which are neither.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], failed: float, hopeless: float = 0.0, after: int = 0) -> None:
-        """Take the shares of the episodes; `after` are this environment's own steps."""
+    def __init__(
+        self, env: gymnasium.Env[Any, Any], *, failed_share: float = 0.0, out_of_reach_share: float = 0.0
+    ) -> None:
+        """Raise UsageError for an environment that has no targets out of reach, where a share is to have one."""
         super().__init__(env)
-        self._shares = {"failed": failed, "hopeless": hopeless}
-        self._steps_left = after
-        self._failed: deque[tuple[int, bool]] = deque(maxlen=FAILED_KEPT)
+        if out_of_reach_share and not isinstance(env.unwrapped, HasExtremes):
+            raise errors.UsageError(f"out_of_reach is {out_of_reach_share}: {env.unwrapped} has no extreme_options")
+        self._failed_share, self._out_of_reach_share = failed_share, out_of_reach_share
+        self._failed: deque[int] = deque(maxlen=FAILED_KEPT)
         self._rng = np.random.default_rng()
-        self._episode, self._is_hopeless, self._is_drawn = 0, False, True
+        self._episode, self._is_out_of_reach, self._is_ordinary = 0, False, True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         if seed is not None:
             self._rng = np.random.default_rng([seed, 1])
             self._failed.clear()
-        is_again = bool(self._failed) and self._rng.random() < self._shares["failed"]
-        if is_again:
-            self._episode, self._is_hopeless = self._failed.popleft()
-        else:
-            self._episode = int(self._rng.integers(2**31))
-            is_due = self._shares["hopeless"] > 0 and self._steps_left <= 0
-            self._is_hopeless = is_due and self._rng.random() < self._shares["hopeless"]
-        self._is_drawn = not is_again and not self._is_hopeless
-        if self._is_hopeless:
+        is_again = bool(self._failed) and self._rng.random() < self._failed_share
+        self._episode = self._failed.popleft() if is_again else int(self._rng.integers(2**31))
+        share = 0.0 if is_again else self._out_of_reach_share
+        self._is_out_of_reach = share > 0 and self._rng.random() < share
+        self._is_ordinary = not is_again and not self._is_out_of_reach
+        if self._is_out_of_reach:
             env: Any = self.env.unwrapped
-            options = env.extreme_options("target", np.random.default_rng([self._episode, 1]))
+            extreme = env.extreme_options("target", np.random.default_rng([self._episode, 1, 1]))
+            options = {**extreme, **(options or {})}
         return super().reset(seed=self._episode, options=options)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = super().step(action)
-        self._steps_left -= 1
-        has_ended = terminated or (truncated and not self._is_hopeless)
-        if has_ended and not info.get("is_success", True):
-            self._failed.append((self._episode, self._is_hopeless))
-        return observation, reward, terminated, truncated, {**info, "is_drawn": self._is_drawn}
+        has_failed = (terminated or truncated) and not info.get("is_success", True)
+        if has_failed and not self._is_out_of_reach:  # which nobody succeeds in
+            self._failed.append(self._episode)
+        return observation, reward, terminated, truncated, {**info, "is_ordinary": self._is_ordinary}
 
 
-def _make_chosen(env_id: str, failed: float, hopeless: float, after: int, env_config: dict[str, Any]) -> ChosenEpisodes:
-    return ChosenEpisodes(gymnasium.make(env_id, disable_env_checker=True, **env_config), failed, hopeless, after)
+def _chosen_episodes(settings: dict[str, Any]) -> dict[str, float]:
+    """Return the shares for ChosenEpisodes. Raises UsageError."""
+    shares = {}
+    for name, argument in (("failed_again", "failed_share"), ("out_of_reach", "out_of_reach_share")):
+        share = shares[argument] = settings.get(name) or 0
+        if not isinstance(share, int | float) or not 0 <= share <= 1:
+            raise errors.UsageError(f"{name} is {share!r}: expected a share of the episodes, 0 to 1")
+    return shares
+
+
+def _make_chosen(env_id: str, shares: dict[str, float], env_config: dict[str, Any]) -> ChosenEpisodes:
+    return ChosenEpisodes(gymnasium.make(env_id, disable_env_checker=True, **env_config), **shares)
 
 
 class ActionPenaltyLearner(PPOTorchLearner):
@@ -259,7 +265,7 @@ def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any 
     chunks = [*(prev_episode_chunks or ()), episode]  # an episode is cut where a sampling phase ended
     total, length = sum(chunk.get_return() for chunk in chunks), sum(map(len, chunks))
     info = episode.get_infos(-1) or {}
-    if not info.get("is_drawn", True):
+    if not info.get("is_ordinary", True):
         return  # the curve is of the episodes that the environment draws
     success, judgements = info.get("is_success", False), "is_success" in info
     for key, value in zip(SUMS, (1, judgements, total, length, success), strict=True):
@@ -274,11 +280,10 @@ class Validation:
     seed: int
     env_steps: int  # from one to the next
     above: float  # training success below which it is not worth the time
-    since: int = 0  # environment steps, likewise
     _next: int = 0
 
     def is_due(self, row: Row) -> bool:
-        if row.env_steps < max(self._next, self.since) or row.success < self.above:
+        if row.env_steps < self._next or row.success < self.above:
             return False
         self._next = row.env_steps + self.env_steps
         return True

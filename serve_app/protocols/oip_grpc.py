@@ -286,7 +286,7 @@ class OipGrpcCodec:
         for name, value in answer.parameters.items():
             _set(reply.parameters[name], value)
         arrays = {name: np.ascontiguousarray(array) for name, array in answer.outputs.items()}
-        datatypes = {name: NAMES[array.dtype] for name, array in arrays.items()}
+        datatypes = {name: NAMES[array.dtype.newbyteorder("=")] for name, array in arrays.items()}
         # A reply is bytes altogether or typed fields altogether, and not every type has a field.
         raw = request.reply_options.binary or any(datatype not in FIELDS for datatype in datatypes.values())
         for name, array in arrays.items():
@@ -421,7 +421,7 @@ def _explain(error: Exception) -> tuple[grpc.StatusCode, str, str]:
     return status, error.message, error.code
 
 
-@functools.lru_cache(maxsize=1024)  # the peers of open connections: to read an address costs as much as to decide
+@functools.lru_cache(maxsize=1024)  # the peers of open connections
 def is_local(peer: str) -> bool:
     """Whether a gRPC peer ('ipv4:127.0.0.1:4711', 'ipv6:%5B::1%5D:4711', 'unix:...') is on this machine."""
     scheme, _, address = peer.partition(":")
