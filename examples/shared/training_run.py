@@ -230,8 +230,9 @@ def _sigterm_as_ctrl_c() -> Iterator[Callable[[], None]]:
 
     def forward(number: int, frame: FrameType | None) -> None:
         handler = signal.getsignal(signal.SIGINT)  # Tune's while it runs, Python's otherwise
-        if callable(handler):
-            handler(signal.SIGINT, frame)
+        if not callable(handler):  # a shell starts its background jobs with SIGINT ignored
+            handler = signal.default_int_handler
+        handler(signal.SIGINT, frame)
 
     def take() -> None:
         signal.signal(signal.SIGTERM, forward)

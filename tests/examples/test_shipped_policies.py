@@ -11,6 +11,7 @@ import importlib.util
 import json
 import math
 import pickle
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -410,6 +411,21 @@ def test_failed_episodes_come_again_in_that_training_alone(monkeypatch: pytest.M
         settings = evaluate_shipped.load_settings(name)
         train_shipped.algorithm_config(settings, 0)
         assert _global_registry.contains(ENV_CREATOR, settings["env"]) == comes_again
+
+
+@pytest.mark.parametrize("ctrl_c", [signal.SIG_IGN, signal.default_int_handler], ids=["ignored", "Python's"])
+def test_sigterm_ends_a_training_also_where_a_shell_has_ctrl_c_ignored(
+    monkeypatch: pytest.MonkeyPatch, ctrl_c: Any
+) -> None:
+    """As in a script's background job."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    training_run = importlib.import_module("shared.training_run")
+    before = signal.signal(signal.SIGINT, ctrl_c)
+    try:
+        with training_run._sigterm_as_ctrl_c(), pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_training_begins_with_another_network_without_the_elements_it_shall_forget(trained: Any) -> None:
