@@ -325,12 +325,15 @@ def _inputs(message: Any) -> dict[str, NDArray[Any]]:
         raise RequestError(
             f"there are {len(message.inputs)} inputs and {len(raw)} raw_input_contents: one for each, or none"
         )
+    seen: set[str] = set()
+    for tensor in message.inputs:
+        if tensor.name in seen:
+            raise RequestError(f"input '{tensor.name[:64]}' is there twice")
+        seen.add(tensor.name)
     inputs: dict[str, NDArray[Any]] = {}
     for index, tensor in enumerate(message.inputs):
         name, shape = tensor.name, tuple(tensor.shape)
         label = name[:64]
-        if name in inputs:
-            raise RequestError(f"input '{label}' is there twice")
         dtype = check_form(label, shape, tensor.datatype, tensor.parameters)
         if raw:
             content = raw[index]
