@@ -39,7 +39,7 @@ from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
 from rlservo.serve_app.protocols.http_errors import retry_after_s, status_of
 from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, NAMES, check_form, check_size, from_bytes
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, check_form, check_size, datatype_of, from_bytes
 from rlservo.serve_app.server.access_checks import StreamKey, authorize, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
@@ -286,7 +286,7 @@ class OipGrpcCodec:
         for name, value in answer.parameters.items():
             _set(reply.parameters[name], value)
         arrays = {name: np.ascontiguousarray(array) for name, array in answer.outputs.items()}
-        datatypes = {name: NAMES[array.dtype.newbyteorder("=")] for name, array in arrays.items()}
+        datatypes = {name: datatype_of(array.dtype) for name, array in arrays.items()}
         # A reply is bytes altogether or typed fields altogether, and not every type has a field.
         raw = request.reply_options.binary or any(datatype not in FIELDS for datatype in datatypes.values())
         for name, array in arrays.items():

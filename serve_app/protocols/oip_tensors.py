@@ -43,9 +43,9 @@ def is_shape(shape: Sequence[Any]) -> bool:
     return bool(math.prod(n for n in shape if n) < MOST_NUMBERS)
 
 
-def datatype_of(dtype: str) -> str:
-    """Return the protocol's name of a contract's dtype ('float32' is 'FP32')."""
-    return NAMES[np.dtype(dtype)]
+def datatype_of(dtype: str | np.dtype[Any]) -> str:
+    """Return the protocol's name of a contract's or an array's dtype ('float32' is 'FP32')."""
+    return NAMES[np.dtype(dtype).newbyteorder("=")]
 
 
 def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDArray[Any], int]:
@@ -102,7 +102,7 @@ def check_size(label: str, shape: Sequence[int], dtype: np.dtype[Any], size: int
     expected = math.prod(shape) * dtype.itemsize
     if size != expected:
         raise RequestError(
-            f"input '{label}' of shape {list(shape)} and datatype {datatype_of(dtype.name)} is {expected} bytes, "
+            f"input '{label}' of shape {list(shape)} and datatype {datatype_of(dtype)} is {expected} bytes, "
             f"but its {given} {size}"
         )
 
@@ -163,7 +163,7 @@ def write_tensor(name: str, array: NDArray[Any], *, binary: bool) -> tuple[dict[
     """Return the tensor's JSON and, in binary form, its bytes; `data` is the flat array, for orjson to write."""
     document: dict[str, Any] = {
         "name": name,
-        "datatype": NAMES[array.dtype.newbyteorder("=")],
+        "datatype": datatype_of(array.dtype),
         "shape": array.shape,
     }
     if not binary:

@@ -338,9 +338,7 @@ def test_a_share_of_the_others_has_its_target_out_of_reach_and_does_not_come_aga
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     train_shipped = load("train_shipped")
-    env = train_shipped.ChosenEpisodes(
-        gymnasium.Wrapper(OfOneStep()), failed_share=0.3, out_of_reach_share=0.2
-    )  # fmt: skip
+    env = train_shipped.ChosenEpisodes(gymnasium.Wrapper(OfOneStep()), failed_share=0.3, out_of_reach_share=0.2)
     seeds, targets, ordinary = episodes(env, 7, 1000)
     far = [seed for seed, target in zip(seeds, targets, strict=True) if target is not None]
     assert 80 <= len(far) <= 200 and all(seeds.count(seed) == 1 for seed in far)
@@ -377,6 +375,8 @@ def test_what_the_settings_say_of_episodes_reaches_the_environment(monkeypatch: 
     assert not info["is_success"] and info["is_ordinary"]
     env.reset()
     assert env.unwrapped.simulation.target == first and not env.step(np.zeros(2, np.float32))[-1]["is_ordinary"]
+    train_shipped.algorithm_config({**settings, "failed_again": 0}, 0)  # nothing is left for tests after this one
+    assert not _global_registry.contains(ENV_CREATOR, settings["env"])
 
 
 @pytest.mark.parametrize("is_ordinary", [False, True])
