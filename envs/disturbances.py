@@ -9,7 +9,7 @@ import numpy as np
 MAX_MODEL_ERROR = 0.5  # of a figure of the model: half of it
 
 Extreme = Literal["target", "start"]
-"""What is placed where no policy was trained: the target out of reach, or the robot in a corner."""
+"""What is placed where the tasks themselves never do: the target out of reach, or the robot in a corner."""
 
 
 class SensorError(NamedTuple):
@@ -68,5 +68,5 @@ class HasExtremes(Protocol):
     """An environment that can place its target out of reach and its robot in a corner."""
 
     def extreme_options(self, what: Extreme, rng: np.random.Generator) -> dict[str, Any]:
-        """Return the reset options of an episode that no policy was trained for."""
+        """Return the reset options of an episode that the task itself never draws."""
         ...

@@ -92,6 +92,7 @@ def test_these_policies_ship() -> None:
         "cartpole_dqn",
         "mir100_navigation",
         "mir100_obstacle_avoidance",
+        "mir100_obstacle_avoidance_waiting",
         "mir100_sparse_fixes",
         "pendulum_sac",
         "ur5_positioning",
