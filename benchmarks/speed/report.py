@@ -39,6 +39,7 @@ from speed.rounds import (
     LINE,
     ONE,
     ONES,
+    PACED_TURNS,
     PLANNED_HZ,
     STREAM,
     Sample,
@@ -318,7 +319,8 @@ def robots(result: Result) -> list[list[str]]:
 def markdown(result: Result, facts: dict[str, Any]) -> str:
     """Return the tables and the verdicts."""
     lines = [
-        f"{facts['cores']} cores, {facts['rounds']} rounds of {facts['seconds']} s, taking turns; "
+        f"{facts['cores']} cores, {facts['rounds']} rounds of {facts['seconds']} s "
+        f"(robots at their pace {PACED_TURNS * facts['seconds']} s), taking turns; "
         f"load average {facts['load_average'][0]:.1f} before. Compare ratios, not times.",
         "",
         *_markdown(HEADINGS, table(result)),

@@ -16,7 +16,7 @@ SWEPT = sorted(path.stem for path in sweep.VARIANTS.glob("*.yaml"))
 
 @pytest.mark.parametrize("name", SWEPT)
 def test_variants_have_settings_that_rllib_and_the_training_know(name: str) -> None:
-    known = sweep.evaluate_shipped.load_settings(name).keys() | {"orthogonal_weights", "out_of_reach", "begin"}
+    known = sweep.evaluate_shipped.load_settings(name).keys() | {"orthogonal_weights", "out_of_reach"}
     for settings in sweep.variants_of(name, ["all"]).values():
         assert settings.keys() <= known
         PPOConfig().training(**settings["training"])  # it refuses what it does not know
