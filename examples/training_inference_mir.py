@@ -3,9 +3,10 @@
     python examples/training_inference_mir.py
 
 Without obstacles by default; `--obstacles` trains robo-gym's obstacle avoidance instead. The settings are those in
-examples/checkpoints/mir100_navigation/training.yaml and mir100_obstacle_avoidance/training.yaml. This script made the
-first of the two policies; the second is of train_shipped.py, which gives the network the logarithm of the distances,
-keeps its mean within the action's bounds, lets a collision cost more, and judges checkpoints without exploration.
+examples/checkpoints/mir100_navigation/training.yaml and mir100_obstacle_avoidance/training.yaml, as far as RLlib itself
+knows them. The two policies are of train_shipped.py, which gives the network the logarithm of distances and the sine
+and cosine of directions, lets the action's steps cost something (navigation), keeps its mean within the action's
+bounds, lets a collision cost more, and judges checkpoints without exploration (obstacle avoidance).
 """
 
 from __future__ import annotations
