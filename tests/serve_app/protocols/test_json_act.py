@@ -205,8 +205,9 @@ def test_a_body_that_never_arrives_is_answered_in_time(port: int) -> None:
     with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
         client.sendall(HALF_SENT)
         started = time.monotonic()
-        reply = client.recv(65536)
-    assert reply.startswith(b"HTTP/1.1 408") and b"did not arrive within 1 s" in reply
+        reply = http.client.HTTPResponse(client)
+        reply.begin()
+        assert reply.status == 408 and b"did not arrive within 1 s" in reply.read()  # head and body may come apart
     assert time.monotonic() - started < 5
 
 
