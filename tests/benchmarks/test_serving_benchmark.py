@@ -132,10 +132,9 @@ def test_a_round_samples_every_measure_it_can(server: Server, case: Case, tmp_pa
             [taken[0].load] for (measure, _), taken in samples.items() if measure.startswith(f"paced {protocol}")
         ]
         assert 0 < load.p50_ms <= load.p99_ms <= (load.p999_ms or 0) and load.late is not None
-        waited_s = (load.p999_ms or 0) / 1e3  # before the second that counts, on a busy machine
-        assert (
-            load.count <= 4 * 20 * (load.seconds + waited_s) + 10
-        )  # no more than robots ask, however quick the server is
+        waited_s = (load.p999_ms or 0) / 1e3  # before the seconds that count, on a busy machine
+        # No more than robots ask, however quick the server is.
+        assert load.count <= 4 * 20 * (load.seconds + waited_s) + 10
 
 
 @needs_wrk
