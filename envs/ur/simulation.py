@@ -7,6 +7,7 @@ objects stand or move along paths. The Gymnasium environments and the robot serv
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -188,10 +189,11 @@ class URSimulation:
         """
         goal = np.asarray(joint_positions, dtype=np.float64)
         way = goal - self.data.act
-        duration = max(MIN_TRAJECTORY_S, float(np.max(np.abs(way) / self.max_velocity)))
+        duration = max(MIN_TRAJECTORY_S, float((np.abs(way) / self.max_velocity).max()))
+        timestep = self.model.opt.timestep
         # Whole substeps, rounded up so that no joint exceeds its limit and the last substep ends at the goal.
-        self._remaining = max(1, int(np.ceil(duration / self.model.opt.timestep - 1e-9)))
-        np.divide(way, self._remaining * self.model.opt.timestep, out=self._velocity)
+        self._remaining = max(1, math.ceil(duration / timestep - 1e-9))
+        np.divide(way, self._remaining * timestep, out=self._velocity)
 
     def hold(self) -> None:
         """Stop where the arm is: the robot server does so when a cycle passes without a command."""
@@ -217,12 +219,12 @@ class URSimulation:
         mujoco.mj_kinematics(self.model, data)
 
     def _step(self, count: int) -> None:
-        model, data = self.model, self.data
+        model, data, moving, step = self.model, self.data, self._moving, mujoco.mj_step
         for _ in range(count):
-            if self._moving:
+            if moving:
                 self._move_objects()
                 self._tick += 1
-            mujoco.mj_step(model, data)
+            step(model, data)
             if data.ncon:
                 self.in_collision = True
 

@@ -17,6 +17,7 @@ module and its classes: under other names they could not be read.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -27,12 +28,14 @@ from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from ray.rllib.connectors import env_to_module, module_to_env
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.core.columns import Columns
+from ray.rllib.core.distribution.torch.torch_distribution import TorchDiagGaussian
 from ray.rllib.utils.filter import MeanStdFilter as RunningFilter
 from ray.rllib.utils.filter import RunningStat
 from ray.rllib.utils.numpy import SMALL_NUMBER, convert_to_numpy
 from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.rllib.batched_env_runner import BatchedEnvRunner
 
 SUMS = ("mean_array", "sum_sq_diff_array")  # of a running filter
 
@@ -73,6 +76,8 @@ def use_batched_connectors(
         add_default_connectors_to_module_to_env_pipeline=False,
         episode_lookback_horizon=max(config.episode_lookback_horizon, (num_frames - 1) * every),
     )
+    if config.env_runner_cls is None:
+        config.env_runners(env_runner_cls=BatchedEnvRunner)
 
 
 def supports(observation_space: Any, action_space: Any) -> bool:
@@ -299,7 +304,10 @@ class NormalizeAndClipActions(module_to_env.NormalizeAndClipActions):
         return space
 
     def __call__(self, *, batch: Any, **kwargs: Any) -> dict[str, Any]:
-        drawn = self._get_actions(batch=batch, **kwargs)
+        if kwargs["explore"] and _is_gaussian(kwargs["rl_module"], batch):
+            drawn = {**batch, **_draw(batch[Columns.ACTION_DIST_INPUTS])}
+        else:
+            drawn = self._get_actions(batch=batch, **kwargs)
         columns = {name: _array(value) for name, value in drawn.items()}
         actions, space = columns[Columns.ACTIONS], self._space
         if self.normalize_actions and self._range is not None:
@@ -310,6 +318,48 @@ class NormalizeAndClipActions(module_to_env.NormalizeAndClipActions):
         elif self.clip_actions:
             columns[Columns.ACTIONS_FOR_ENV] = clip_action(actions.copy(), space)
         return columns
+
+
+HALF_LOG_OF_TWO_PI = math.log(math.sqrt(2.0 * math.pi))
+
+
+def _draw(inputs: torch.Tensor) -> dict[str, Any]:
+    """Draw from normal distributions as RLlib does, from the same random numbers, and round as it does.
+
+    What numpy need not round as torch, exponential, logarithm and sum, torch computes.
+    """
+    inputs = inputs.detach()
+    size = inputs.shape[-1] // 2
+    spread = inputs[..., size:].exp()
+    mean, std, log_std = inputs.numpy()[..., :size], spread.numpy(), spread.log().numpy()
+    actions = torch.randn(std.shape).numpy() * std + mean
+    way = actions - mean
+    each = -(way * way) / (2 * (std * std)) - log_std - HALF_LOG_OF_TWO_PI
+    return {Columns.ACTIONS: actions, Columns.ACTION_LOGP: torch.from_numpy(each).sum(-1)}
+
+
+def _is_gaussian(module: Any, outputs: dict[str, Any]) -> bool:
+    """Return whether `_draw` does for the actions to these outputs of a network."""
+    return (
+        Columns.ACTIONS not in outputs
+        and module.get_exploration_action_dist_cls() is TorchDiagGaussian
+        and outputs[Columns.ACTION_DIST_INPUTS].is_cpu
+        and _draws_the_same()
+    )
+
+
+@functools.cache
+def _draws_the_same() -> bool:
+    """Return whether these versions of RLlib, torch and numpy draw the same with `_draw`, bit by bit."""
+    with torch.random.fork_rng(devices=[]):
+        inputs = torch.randn((5, 12), generator=torch.Generator().manual_seed(1))
+        torch.manual_seed(0)
+        theirs: Any = TorchDiagGaussian.from_logits(inputs)
+        actions = theirs.sample()
+        torch.manual_seed(0)
+        ours = _draw(inputs)
+    same_actions = ours[Columns.ACTIONS].tobytes() == actions.numpy().tobytes()
+    return same_actions and bool(torch.equal(ours[Columns.ACTION_LOGP], theirs.logp(actions)))
 
 
 def _check_box(space: Any) -> Any:
@@ -342,10 +392,10 @@ def _evaluate(module: Any) -> Any:
 
 
 def _array(value: Any) -> Any:
-    """Return a tensor as RLlib's `convert_to_numpy` does, and whatever else through it."""
-    if not isinstance(value, torch.Tensor) or value.dim() == 0:
+    """Return a tensor or array as RLlib's `convert_to_numpy` does, and whatever else through it."""
+    array = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value
+    if not isinstance(array, np.ndarray) or array.ndim == 0:
         return convert_to_numpy(value)
-    array = value.detach().cpu().numpy()
     kind = array.dtype.kind
     if kind == "f":
         return array.astype(np.float32, copy=False)

@@ -29,7 +29,7 @@ def runner(config: Any, env: str, envs: int, *, batched: bool, filtered: bool = 
         config.env_runners(env_to_module_connector=lambda *_: MeanStdFilter())
     for seed in (random.seed, np.random.seed, torch.manual_seed):
         seed(3)
-    return SingleAgentEnvRunner(config=config, worker_index=0)
+    return (config.env_runner_cls or SingleAgentEnvRunner)(config=config, worker_index=0)
 
 
 def filter_state(one: Any) -> dict[str, Any]:
