@@ -35,7 +35,6 @@ from ray.rllib.utils.numpy import SMALL_NUMBER, convert_to_numpy
 from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.export.rllib.batched_env_runner import BatchedEnvRunner
 
 SUMS = ("mean_array", "sum_sq_diff_array")  # of a running filter
 
@@ -57,6 +56,9 @@ def use_batched_connectors(
     Connectors of the configuration's own are replaced. How actions are scaled it must say before, with
     `environment(normalize_actions=..., clip_actions=...)`.
     """
+    # Here, since exports import this module and have no use for RLlib's env runner.
+    from rlservo.export.rllib.batched_env_runner import BatchedEnvRunner
+
     scaling = {"normalize_actions": config.normalize_actions, "clip_actions": config.clip_actions}
 
     def before(_env: Any, _spaces: Any, device: Any) -> list[ConnectorV2]:
