@@ -79,6 +79,18 @@ def test_a_runner_samples_the_same_bit_by_bit(kind: Any, env: str, envs: int, fi
     assert filtered == ("MeanStdFilter" in ours[-1])
 
 
+def test_actions_are_drawn_by_rllib_where_its_arithmetic_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert batched_connectors._draws_the_same()
+    expected = in_bytes(sampled(runner(PPOConfig(), "Pendulum-v1", 2, batched=True), True))
+    monkeypatch.setattr(batched_connectors, "HALF_LOG_OF_TWO_PI", 1.0)
+    batched_connectors._draws_the_same.cache_clear()
+    try:
+        assert not batched_connectors._draws_the_same()
+        assert in_bytes(sampled(runner(PPOConfig(), "Pendulum-v1", 2, batched=True), True)) == expected
+    finally:
+        batched_connectors._draws_the_same.cache_clear()
+
+
 def test_runners_are_merged_to_the_statistics_of_all_observations(monkeypatch: pytest.MonkeyPatch) -> None:
     _check_filter()  # which pushes numbers of its own
     seen: list[Any] = []

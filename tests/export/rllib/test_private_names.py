@@ -33,7 +33,7 @@ def test_no_private_attribute_is_read_past_the_check() -> None:
     for file in RLLIB.glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.endswith("__"):
-                if ast.unparse(node.value) != "self":
+                if ast.unparse(node.value) not in ("self", "super()"):
                     past.append(f"{file.name}:{node.lineno}: {ast.unparse(node)}")
             elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("ray"):
                 past += [f"{file.name}: {alias.name}" for alias in node.names if alias.name.startswith("_")]
