@@ -23,12 +23,24 @@ from ray.rllib.utils.metrics import (
     CONNECTOR_PIPELINE_TIMER,
     ENV_STEP_TIMER,
     ENV_TO_MODULE_CONNECTOR,
+    ENV_TO_MODULE_SUM_EPISODES_LENGTH_IN,
+    ENV_TO_MODULE_SUM_EPISODES_LENGTH_OUT,
     MODULE_TO_ENV_CONNECTOR,
     RLMODULE_INFERENCE_TIMER,
     WEIGHTS_SEQ_NO,
 )
 
 logger = logging.getLogger(__name__)
+
+REPLACED = (
+    RLMODULE_INFERENCE_TIMER,
+    ENV_STEP_TIMER,
+    ENV_TO_MODULE_CONNECTOR,
+    MODULE_TO_ENV_CONNECTOR,
+    ENV_TO_MODULE_SUM_EPISODES_LENGTH_IN,
+    ENV_TO_MODULE_SUM_EPISODES_LENGTH_OUT,
+)
+"""What RLlib has noted while it reset the environments: of what is not measured here it would stay for ever."""
 
 
 class BatchedEnvRunner(SingleAgentEnvRunner):
@@ -65,7 +77,6 @@ class BatchedEnvRunner(SingleAgentEnvRunner):
         rounds = steps = 0
         done: list[SingleAgentEpisode] = []
         while steps < num_timesteps:
-            rounds += 1
             began = clock()
             outputs = self._infer(steps, explore)
             inferred = clock()
@@ -83,6 +94,7 @@ class BatchedEnvRunner(SingleAgentEnvRunner):
             started = [index for index, episode in enumerate(episodes) if not episode.is_reset]
             self._add(episodes, actions, outputs, results)
             steps += len(episodes) - len(started)
+            rounds += 1
             added = clock()
             self._cached_to_module = self._through(self._env_to_module, {}, explore)
             before_s += clock() - added
@@ -98,14 +110,15 @@ class BatchedEnvRunner(SingleAgentEnvRunner):
                     self._make_on_episode_callback("on_episode_end", index, episodes)
                     done.append(self._to_return(episodes[index]))
                     self._new_episode(index, episodes)  # type: ignore[no-untyped-call]
-        for key, seconds in (
+        for key in REPLACED:
+            self.metrics.delete((key,), key_error=False)
+        for path, seconds in (
             ((RLMODULE_INFERENCE_TIMER,), network_s),
             ((MODULE_TO_ENV_CONNECTOR, CONNECTOR_PIPELINE_TIMER), after_s),
             ((ENV_STEP_TIMER,), environments_s),
             ((ENV_TO_MODULE_CONNECTOR, CONNECTOR_PIPELINE_TIMER), before_s),
         ):
-            self.metrics.delete(*key, key_error=False)  # RLlib would take a hundredth of the new value
-            self.metrics.log_value(key, seconds / max(rounds, 1))
+            self.metrics.log_value(path, seconds / max(rounds, 1))
         self._done_episodes_for_metrics.extend(done)
         self._log_env_steps(metric=self._metrics_num_try_env_step, num_steps=rounds)
         self._log_env_steps(metric=self._metrics_num_env_steps_sampled, num_steps=steps)
@@ -134,7 +147,13 @@ class BatchedEnvRunner(SingleAgentEnvRunner):
 
     def _through(self, pipeline: Any, batch: dict[str, Any], explore: bool) -> dict[str, Any]:
         for piece in pipeline.connectors:
-            batch = piece(rl_module=self.module, batch=batch, episodes=self._ongoing_episodes, explore=explore)
+            batch = piece(
+                rl_module=self.module,
+                batch=batch,
+                episodes=self._ongoing_episodes,
+                explore=explore,
+                shared_data=self._shared_data,
+            )
         return batch
 
     def _add(self, episodes: list[Any], actions: Any, outputs: dict[str, Any], results: Any) -> None:

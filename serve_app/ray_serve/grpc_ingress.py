@@ -13,15 +13,10 @@ Serve does with one takes longer than the rest of it. Streams go by way of Serve
 from __future__ import annotations
 
 import asyncio
-import os
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 import grpc
-
-# grpcio (1.85) reads this when the first server is made. Its newer listener passes each call through more threads: p50
-# 1.01 instead of 0.97 times MLServer's, medians of twelve rounds in turns.
-os.environ.setdefault("GRPC_EXPERIMENTS", "-event_engine_listener")
 
 SERVICE = "inference.GRPCInferenceService"
 UNARY = (
