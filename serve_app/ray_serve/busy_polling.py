@@ -14,7 +14,7 @@ import asyncio
 import threading
 import time
 
-AWAKE_S = 120e-6
+AWAKE_S = 160e-6
 MOST_SKIPPED = 64  # replies
 
 

@@ -20,6 +20,7 @@ from rlservo.serve_app.ray_serve.ports import claim_port, free_ports, is_free
 from rlservo.serve_app.ray_serve.processes import MARK
 from rlservo.serve_app.ray_serve.server_log import LOG_BYTES
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
+from rlservo.serve_app.wire import replica_sockets
 
 FIRST_PORT, SERVERS, PORTS_PER_SERVER = 30_000, 21, 64  # up to 32687; outgoing connections begin at 32768
 LOG_BACKUPS = 1  # how many earlier files of each of Ray's logs are kept
@@ -132,6 +133,8 @@ def ray_environment(
     )
     if haproxy is None:
         return environment
+    if replica_sockets.is_usable(str(folder)):
+        environment[replica_sockets.VARIABLE] = str(folder)
     environment.update(
         {
             **HAPROXY,

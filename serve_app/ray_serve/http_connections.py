@@ -40,6 +40,7 @@ from rlservo.serve_app.ray_serve.uvicorn_parts import (
     auto,
 )
 from rlservo.serve_app.ray_serve.websocket_connections import BoundedStream
+from rlservo.serve_app.wire.replica_sockets import ASKER
 from rlservo.serve_app.wire.request_stamp import STAMP
 
 if TYPE_CHECKING:
@@ -195,15 +196,17 @@ class TimedProtocol(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first head."""
         super().connection_made(transport)
+        connection = transport.get_extra_info("socket")
+        if self.client is None:
+            self.client = ASKER
+        elif connection is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
+            # The kernel ends the connection, whoever else still holds it: uvicorn's WebSockets, too.
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1000))
         app: Any = self.app
         self._inner_app = cast("Any", app.app) if isinstance(app, ProxyHeadersMiddleware) else app
         self._replies = JoinedWrites(transport)
         self._head_since = self.loop.time()
         self._timer = self.loop.call_later(CHECK_PERIOD_S, self._check_phase)
-        # The kernel ends the connection, whoever else still holds it: uvicorn's WebSockets, too.
-        connection = transport.get_extra_info("socket")
-        if connection is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1000))
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop the timer."""

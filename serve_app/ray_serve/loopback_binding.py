@@ -15,9 +15,11 @@ import importlib
 import os
 import socket
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from rlservo.serve_app.ray_serve.ray_parts import KNOWN, find
+from rlservo.serve_app.wire.replica_sockets import socket_path
 
 VARIABLE = "RLSERVO_BIND_LOOPBACK"
 ALL = "1"
@@ -60,10 +62,19 @@ def _on_loopback(add: Any) -> Any:
 
 
 class _LoopbackSocket(socket.socket):
-    """A TCP socket that binds its port on loopback, whatever address it is given."""
+    """A TCP socket that binds its port on loopback, whatever address it is given, or a Unix socket in its place."""
+
+    def __init__(self, family: int, kind: int) -> None:
+        super().__init__(family if socket_path(0) is None else socket.AF_UNIX, kind)
 
     def bind(self, address: Any) -> None:
-        super().bind((LOOPBACK, address[1]))
+        path = socket_path(address[1])
+        if path is None:
+            super().bind((LOOPBACK, address[1]))
+            return
+        Path(path).unlink(missing_ok=True)  # of a replica that was killed: Serve gives a port to one at a time
+        super().bind(path)
+        Path(path).chmod(0o600)
 
 
 class _Sockets:

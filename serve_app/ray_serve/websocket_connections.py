@@ -23,6 +23,7 @@ from rlservo.serve_app.ray_serve.uvicorn_parts import (
     WebSocketsSansIOProtocol,
     apply_mask,  # pyright: ignore[reportPrivateImportUsage]
 )
+from rlservo.serve_app.wire.replica_sockets import ASKER
 
 if TYPE_CHECKING:
     from starlette.types import Message
@@ -57,6 +58,11 @@ class BoundedStream(WebSocketsSansIOProtocol):
         """Call `on_lost` when the connection has ended."""
         super().__init__(*arguments, **more)
         self._on_lost = on_lost
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take HAProxy for who asks where the socket has no address."""
+        super().connection_made(transport)
+        self.client = self.client or ASKER
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Say so."""

@@ -38,6 +38,7 @@ from rlservo.serve_app.ray_serve.haproxy.error_replies import (
     TOO_SLOW_REPLICA,
     UNREACHABLE,
 )
+from rlservo.serve_app.wire.replica_sockets import socket_path
 from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
 
 ACTING = "{ path_end /act /infer /ModelInfer }"
@@ -103,6 +104,7 @@ def patch_configuration(text: str, replies: Path, *, limits: Limits | None = Non
     if "RAY_SERVE_HAPROXY_TIMEOUT_CONNECT_S" not in os.environ:
         text = _replace(text, r"^( *timeout connect) .*$", rf"\1 {CONNECT_TIMEOUT_MS}ms", "'timeout connect'")
     text = _leave_hung_replicas(text)
+    text = _by_unix_sockets(text)
     if not knows_replicas(text):
         text = _answer_without_replicas(text)
     # What is put into a frontend last comes first: connections are bounded before requests are read and stamped.
@@ -210,6 +212,15 @@ def _leave_hung_replicas(text: str) -> str:
     backends = sum(part.startswith("backend ") and "\n    server " in part for part in sections)
     rule = f"    http-request set-timeout server {ACTION_TIMEOUT_S}s if {ACTING}"
     return _replace(text, _BACKEND, rf"\g<0>\n{rule}", "a backend with servers", times=backends)
+
+
+def _by_unix_sockets(text: str) -> str:
+    """Ask replicas, and Serve's own proxy, by Unix sockets where they have them; gRPC stays with TCP."""
+    if socket_path(0) is None:
+        return text
+    times = _count(r"^ *server ", text) - _count(r"^ *server .* proto h2", text)
+    server = r"^( *server \S+) 127\.0\.0\.1:(\d+)(?= )(?!.* proto h2)"
+    return _replace(text, server, lambda one: f"{one[1]} unix@{socket_path(one[2])}", "a server's address", times=times)
 
 
 def _stamp(text: str) -> str:

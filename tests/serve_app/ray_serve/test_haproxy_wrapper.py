@@ -23,6 +23,7 @@ from typing import Any
 import pytest
 
 from rlservo.serve_app.ray_serve import environment as environment_module
+from rlservo.serve_app.ray_serve import loopback_binding
 from rlservo.serve_app.ray_serve.environment import cluster_environment, ray_environment
 from rlservo.serve_app.ray_serve.haproxy import (
     configuration,
@@ -34,7 +35,7 @@ from rlservo.serve_app.ray_serve.haproxy import (
 )
 from rlservo.serve_app.ray_serve.ports import free_ports, is_free
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.wire import request_stamp
+from rlservo.serve_app.wire import replica_sockets, request_stamp
 from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
 
 BINARY = installation.find_binary() or ""
@@ -457,6 +458,40 @@ def test_replicas_under_another_name_are_an_error_and_not_left_as_ray_has_them(t
         configuration.patch_configuration(text.replace("server SERVE_REPLICA", "server REPLICA"), tmp_path)
     patched = configuration.patch_configuration(text, tmp_path)
     assert patched.count("on-marked-down shutdown-sessions") == patched.count("set-timeout server") == 2
+
+
+def test_replicas_of_one_machine_are_asked_by_unix_sockets_and_their_grpc_servers_by_tcp(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error_replies.write_error_replies(tmp_path)
+    text = rendered(tmp_path, replicas=True, grpc=True, lost=True)
+    monkeypatch.setenv(replica_sockets.VARIABLE, str(tmp_path))
+    mended = configuration.patch_configuration(text, tmp_path)
+    assert is_valid(mended, tmp_path) == ""
+    servers = re.findall(r"^ *server \S+ (\S+)(?: (proto h2)|) check", mended, re.MULTILINE)
+    assert [address for address, h2 in servers if not h2] == [f"unix@{tmp_path}/{port}.http" for port in (1, 2)]
+    assert {address for address, h2 in servers if h2} == {"127.0.0.1:1", "127.0.0.1:2"}
+    elsewhere = text.replace("rlservo-a 127.0.0.1:1 check", "rlservo-a 10.0.0.1:1 check")
+    with pytest.raises(configuration.TemplateError, match="a server's address is there 1 times, not 2"):
+        configuration.patch_configuration(elsewhere, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("folder", "usable"),
+    [("/tmp/rlservo-1", True), ("/tmp/a b", False), ("/tmp/" + "x" * 100, False), ("/tmp/\u00e4\n", False)],
+)
+def test_a_folder_that_a_configuration_cannot_name_has_no_sockets(folder: str, usable: bool) -> None:
+    assert replica_sockets.is_usable(folder) == usable
+
+
+def test_a_port_in_a_folder_is_a_socket_of_this_user_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(replica_sockets.VARIABLE, str(tmp_path))
+    for _ in range(2):  # the second finds what a killed replica left
+        listening = loopback_binding.SOCKETS.socket(socket.AF_INET, socket.SOCK_STREAM)
+        with listening:
+            listening.bind(("0.0.0.0", 30000))
+            assert listening.getsockname() == str(tmp_path / "30000.http")
+        assert (tmp_path / "30000.http").stat().st_mode & 0o777 == 0o600
 
 
 @pytest.mark.parametrize(
