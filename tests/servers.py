@@ -56,6 +56,20 @@ except RlservoError as error:
 """
 
 
+def connected(address: int | Path, timeout_s: float) -> socket.socket:
+    """Connect to a port of this machine or to a Unix socket."""
+    if isinstance(address, int):
+        return socket.create_connection(("127.0.0.1", address), timeout=timeout_s)
+    connection = socket.socket(socket.AF_UNIX)
+    connection.settimeout(timeout_s)
+    try:
+        connection.connect(str(address))
+    except OSError:
+        connection.close()
+        raise
+    return connection
+
+
 @contextlib.contextmanager
 def over_uvicorn(app: Any, port: int = 0) -> Iterator[int]:
     """Serve an ASGI application from a thread; gives the port, by default a free one."""

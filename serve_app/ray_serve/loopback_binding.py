@@ -2,15 +2,16 @@
 
 A server of one machine needs one port that others reach: HAProxy's, or without HAProxy that of Serve's own proxy. Serve
 (ray 2.60) binds the replicas' HTTP ports and the fallback proxy's where the public port is, and gRPC ports to every
-interface, whatever its options say. `rlservo serve` sets the variable; a cluster of several machines cannot have it,
-since its machines ask each other. Ray's own ports follow the node's address, which `launcher.py` and
-`cluster_process.py` set.
+interface, whatever its options say. Where HAProxy can ask by Unix sockets (`wire/replica_sockets.py`), HTTP gets one in
+its port's place. `rlservo serve` sets the variable; a cluster of several machines cannot have it, since its machines
+ask each other. Ray's own ports follow the node's address, which `launcher.py` and `cluster_process.py` set.
 
 Serve calls `ingress.middlewares` in each process before it binds anything, and that calls `install`.
 """
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import socket
@@ -72,7 +73,10 @@ class _LoopbackSocket(socket.socket):
         if path is None:
             super().bind((LOOPBACK, address[1]))
             return
-        Path(path).unlink(missing_ok=True)  # of a replica that was killed: Serve gives a port to one at a time
+        with socket.socket(socket.AF_UNIX) as other:
+            other.setblocking(False)
+            if other.connect_ex(path) == errno.ECONNREFUSED:  # nobody listens: it is what a killed process left
+                Path(path).unlink()
         super().bind(path)
         Path(path).chmod(0o600)
 

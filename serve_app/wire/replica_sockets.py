@@ -1,7 +1,7 @@
 """Unix sockets by which HAProxy asks the replicas of a server of one machine, instead of their TCP ports.
 
 A request over loopback's TCP costs HAProxy and a replica twice what it does over a Unix socket, and nobody but this
-user can connect to these. Whose port would be 30000 has the file `30000.http` in the folder that the variable names.
+user can connect to these. Whose port would be 30000 has the file `30000.sock` in the folder that the variable names.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import re
 VARIABLE = "RLSERVO_REPLICA_SOCKETS"
 ASKER = ("127.0.0.1", 0)
 """Who asks by a socket that has no address: HAProxy, whose word for whom it asks uvicorn takes from this machine."""
-LONGEST = 107 - len("/65535.http")  # of a folder: what a socket's address has room for
+LONGEST = 107 - len("/65535.sock")  # of a folder: what a socket's address has room for
 
 
 def is_usable(folder: str) -> bool:
@@ -23,4 +23,4 @@ def is_usable(folder: str) -> bool:
 def socket_path(port: int | str) -> str | None:
     """Return the path of the socket in a port's place; None where TCP is meant."""
     folder = os.environ.get(VARIABLE)
-    return None if folder is None else f"{folder}/{port}.http"
+    return None if folder is None else f"{folder}/{port}.sock"

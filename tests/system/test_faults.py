@@ -22,14 +22,14 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-from websockets.sync.client import connect
+from websockets.sync.client import unix_connect
 
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary
 from rlservo.serve_app.ray_serve.haproxy.process_table import command_of, process_ids
 from rlservo.serve_app.ray_serve.ports import check_port, port_holder
 from rlservo.serve_app.wire.msgpack_arrays import pack
-from servers import Run, launched, processes_of
+from servers import Run, connected, launched, processes_of
 
 pytestmark = [
     pytest.mark.serve,
@@ -59,10 +59,10 @@ class Server:
         """Return the server's processes of this title."""
         return sorted(pid for pid, command in processes_of(self.run.run_id).items() if command.startswith(title))
 
-    def replica_port(self) -> int:
+    def replica_socket(self) -> Path:
         (file,) = self.run.folder.rglob("haproxy.cfg")
-        line = r"server SERVE_REPLICA\S+ [\d.]+:(\d+) check"
-        return int(until(lambda: re.search(line, file.read_text()))[1])  # it may be being written
+        line = r"server SERVE_REPLICA\S+ unix@(\S+) check"
+        return Path(until(lambda: re.search(line, file.read_text()))[1])  # it may be being written
 
 
 def until(condition: Callable[[], Any], timeout_s: float = 60) -> Any:
@@ -80,10 +80,11 @@ def server(policies: Path) -> Iterator[Server]:
         yield Server(run)
 
 
-def act(port: int, timeout_s: float = 60) -> tuple[int, str]:
+def act(address: int | Path, timeout_s: float = 60) -> tuple[int, str]:
     """Return (status, code) of a request for an action; (0, the exception) of one without an answer."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=timeout_s)
+    connection = http.client.HTTPConnection("127.0.0.1")
     try:
+        connection.sock = connected(address, timeout_s)
         body = json.dumps({"obs": OBS})
         connection.request("POST", "/v1/policies/ur5/act", body, {"content-type": "application/json"})
         reply = connection.getresponse()
@@ -137,11 +138,11 @@ class GrpcStream:
 
 def test_what_waited_in_a_replica_that_stood_still_is_refused_as_late(server: Server) -> None:
     (replica,) = server.pids("ray::ServeReplica")
-    direct = server.replica_port()
+    direct = server.replica_socket()
     assert act(server.port)[0] == act(direct)[0] == 200
-    url = f"ws://127.0.0.1:{direct}/v1/policies/ur5/stream?errors=keep"
+    url = "ws://127.0.0.1/v1/policies/ur5/stream?errors=keep"
     frame = pack({"obs": np.array(OBS, np.float32)})
-    with connect(url) as stream, contextlib.closing(GrpcStream(server.grpc_port)) as grpc_stream:
+    with unix_connect(str(direct), url) as stream, contextlib.closing(GrpcStream(server.grpc_port)) as grpc_stream:
         stream.recv()  # the metadata
         stream.send(frame)
         assert isinstance(stream.recv(), bytes)

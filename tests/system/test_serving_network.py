@@ -28,7 +28,7 @@ from rlservo.serve_app.ray_serve.processes import MARK
 from rlservo.serve_app.ray_serve.server_log import LOG_BYTES, cut_log
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
-from servers import STREAM_IDLE_S, LiveServer, served_in_thread
+from servers import STREAM_IDLE_S, LiveServer, connected, served_in_thread
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
@@ -136,17 +136,31 @@ def test_the_dashboards_agent_does_not_run(server: Server) -> None:
     assert not [command for command in commands if command.startswith(b"ray::DashboardAgent")]
 
 
-def http_ports(server: Server) -> list[int]:
-    """Return the ports where HTTP is spoken: HAProxy's, the replica's, the fallback proxy's."""
+def get(address: int | Path, path: str) -> tuple[int, bytes]:
+    with connected(address, 10) as connection, contextlib.closing(http.client.HTTPConnection("127.0.0.1")) as asking:
+        asking.sock = connection
+        asking.request("GET", path)
+        reply = asking.getresponse()
+        return reply.status, reply.read()
+
+
+def http_addresses(server: Server) -> list[int | Path]:
+    """Return where HTTP is spoken: HAProxy's port, the replica's and the fallback proxy's, or their Unix sockets."""
+    ports = {server.port, *server.ports("ray::ServeReplica"), *server.ports("ray::ProxyActor")}
     spoken = []
-    for port in {server.port, *server.ports("ray::ServeReplica"), *server.ports("ray::ProxyActor")}:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    for address in (*ports, *server.folder.glob("[0-9]*.sock")):
         with contextlib.suppress(OSError, http.client.HTTPException):
-            connection.request("GET", "/healthz")
-            if connection.getresponse().status == 200:
-                spoken.append(port)
-        connection.close()
+            if get(address, "/healthz")[0] == 200:
+                spoken.append(address)
     return spoken
+
+
+def test_no_replica_has_an_http_port(server: Server) -> None:
+    found = http_addresses(server)
+    sockets = [address for address in found if isinstance(address, Path)]
+    assert [address for address in found if address not in sockets] == [server.port] and len(sockets) == 2
+    assert {path.stat().st_mode & 0o777 for path in sockets} == {0o600}
+    assert {path.parent.stat().st_mode & 0o777 for path in sockets} == {0o700}
 
 
 PATHS = (
@@ -162,15 +176,13 @@ PATHS = (
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_serves_own_paths_answer_nobody_at_any_port(server: Server, path: str) -> None:
-    ports = http_ports(server)
-    assert len(ports) == 3
-    for port in ports:
-        with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
-            connection.request("GET", path)
-            reply = connection.getresponse()
-            assert reply.status in (400, 401, 404), (port, path)
-            assert b"rlservo" not in reply.read()
+def test_serves_own_paths_answer_nobody_at_any_address(server: Server, path: str) -> None:
+    addresses = http_addresses(server)
+    assert len(addresses) == 3
+    for address in addresses:
+        status, body = get(address, path)
+        assert status in (400, 401, 404), (address, path)
+        assert b"rlservo" not in body
 
 
 def test_serves_own_methods_answer_nobody_at_any_port(server: Server) -> None:
@@ -226,14 +238,14 @@ def test_a_silent_websocket_is_ended_by_the_replica_with_a_sentence(server: Serv
     "more", [b"content-length: %d\r\n\r\n%s" % (len(BODY), BODY), b"content-length: 2000000\r\n\r\n" + b"x" * 100_000]
 )
 @pytest.mark.parametrize("upgrade", [b"", HANDSHAKE])
-def test_every_request_ends_in_time_at_every_port(server: Server, more: bytes, upgrade: bytes) -> None:
-    for port in http_ports(server):
+def test_every_request_ends_in_time_at_every_address(server: Server, more: bytes, upgrade: bytes) -> None:
+    for address in http_addresses(server):
         head = ACT % (server.port, upgrade + b"authorization: Bearer %s\r\n" % server.key.encode())
-        with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
+        with connected(address, 20) as connection:
             started = time.monotonic()
             connection.sendall(head.replace(b"connection: upgrade", b"connection: upgrade, close") + more)
             answer = connection.recv(65536)
-            assert answer.startswith(b"HTTP/1.1 "), (port, answer)
+            assert answer.startswith(b"HTTP/1.1 "), (address, answer)
             assert answer.split()[1] in (b"200", b"400", b"408")
             if b"x" * 100 in more:
                 with contextlib.suppress(ConnectionResetError):

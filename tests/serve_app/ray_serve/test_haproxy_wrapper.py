@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import http.client
 import json
 import os
@@ -469,7 +470,7 @@ def test_replicas_of_one_machine_are_asked_by_unix_sockets_and_their_grpc_server
     mended = configuration.patch_configuration(text, tmp_path)
     assert is_valid(mended, tmp_path) == ""
     servers = re.findall(r"^ *server \S+ (\S+)(?: (proto h2)|) check", mended, re.MULTILINE)
-    assert [address for address, h2 in servers if not h2] == [f"unix@{tmp_path}/{port}.http" for port in (1, 2)]
+    assert [address for address, h2 in servers if not h2] == [f"unix@{tmp_path}/{port}.sock" for port in (1, 2)]
     assert {address for address, h2 in servers if h2} == {"127.0.0.1:1", "127.0.0.1:2"}
     elsewhere = text.replace("rlservo-a 127.0.0.1:1 check", "rlservo-a 10.0.0.1:1 check")
     with pytest.raises(configuration.TemplateError, match="a server's address is there 1 times, not 2"):
@@ -487,11 +488,16 @@ def test_a_folder_that_a_configuration_cannot_name_has_no_sockets(folder: str, u
 def test_a_port_in_a_folder_is_a_socket_of_this_user_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(replica_sockets.VARIABLE, str(tmp_path))
     for _ in range(2):  # the second finds what a killed replica left
-        listening = loopback_binding.SOCKETS.socket(socket.AF_INET, socket.SOCK_STREAM)
-        with listening:
+        with loopback_binding.SOCKETS.socket(socket.AF_INET, socket.SOCK_STREAM) as listening:
             listening.bind(("0.0.0.0", 30000))
-            assert listening.getsockname() == str(tmp_path / "30000.http")
-        assert (tmp_path / "30000.http").stat().st_mode & 0o777 == 0o600
+            listening.listen(0)
+            assert listening.getsockname() == str(tmp_path / "30000.sock")
+            assert (tmp_path / "30000.sock").stat().st_mode & 0o777 == 0o600
+            for _ in range(3):  # also of a replica that hangs, and has more to take than it can
+                with loopback_binding.SOCKETS.socket(socket.AF_INET, socket.SOCK_STREAM) as another:
+                    with pytest.raises(OSError) as raised:  # noqa: PT011
+                        another.bind(("0.0.0.0", 30000))
+                    assert raised.value.errno == errno.EADDRINUSE
 
 
 @pytest.mark.parametrize(
@@ -796,7 +802,8 @@ def test_a_replica_that_takes_too_long_is_not_waited_for(node: Node) -> None:
     copy = node.folder / "serve_app/ray_serve/haproxy"
     shutil.copytree(installation.PROGRAM.parent, copy)
     (copy.parents[1] / "wire").mkdir()
-    shutil.copy(request_stamp.__file__, copy.parents[1] / "wire")
+    for module in (replica_sockets, request_stamp):
+        shutil.copy(str(module.__file__), copy.parents[1] / "wire")
     replies = copy / "error_replies.py"
     replies.write_text(replies.read_text().replace(f"ACTION_TIMEOUT_S = {seconds}", "ACTION_TIMEOUT_S = 1"))
     program = str(copy / installation.PROGRAM.name)
