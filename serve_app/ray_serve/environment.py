@@ -133,11 +133,10 @@ def ray_environment(
     )
     if haproxy is None:
         return environment
-    if replica_sockets.is_usable(str(folder)):
-        environment[replica_sockets.VARIABLE] = str(folder)
     environment.update(
         {
             **HAPROXY,
+            replica_sockets.VARIABLE: str(folder),
             # One thread carries what one core's replicas can.
             "RAY_SERVE_HAPROXY_NBTHREAD": "1",
             HAPROXY_BINARY: str(install_wrapper(folder, haproxy)),

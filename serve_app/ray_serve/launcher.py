@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import queue
+import re
 import secrets
 import signal
 import subprocess
@@ -45,6 +46,7 @@ START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 30.0
 ENDED_S = 5.0  # from the end of a process's reports to its own
 MAX_FOLDER = 28  # HAProxy and Ray put Unix sockets up to 76 characters below it, and a socket's path ends at 107
+IN_CONFIGURATIONS = re.compile(r"[\w./-]+", re.ASCII)  # what HAProxy's names a path with, without quoting
 # Ray opens its own folder to every user. Ours, with the proxy's script and sockets, stays closed to them.
 RAY_FOLDER = "r"
 DIRECT_SOCKET = "d.sock"
@@ -227,9 +229,10 @@ def _stop_event(stop: threading.Event | None, events: queue.SimpleQueue[Any]) ->
 
 @contextlib.contextmanager
 def _folder() -> Iterator[Path]:
-    """Make a private folder with a short path, and remove it."""
+    """Make a private folder with a short and plain path, and remove it."""
     parent = tempfile.gettempdir()
-    if len(parent) + len("/rlservo-12345678") > MAX_FOLDER and Path("/tmp").is_dir():
+    is_short = len(parent) + len("/rlservo-12345678") <= MAX_FOLDER
+    if not (is_short and IN_CONFIGURATIONS.fullmatch(parent)) and Path("/tmp").is_dir():
         parent = "/tmp"
     folder = Path(tempfile.mkdtemp(prefix="rlservo-", dir=parent))
     try:

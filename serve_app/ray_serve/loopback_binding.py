@@ -2,8 +2,8 @@
 
 A server of one machine needs one port that others reach: HAProxy's, or without HAProxy that of Serve's own proxy. Serve
 (ray 2.60) binds the replicas' HTTP ports and the fallback proxy's where the public port is, and gRPC ports to every
-interface, whatever its options say. Where HAProxy can ask by Unix sockets (`wire/replica_sockets.py`), HTTP gets one in
-its port's place. `rlservo serve` sets the variable; a cluster of several machines cannot have it, since its machines
+interface, whatever its options say. Where HAProxy asks by Unix sockets (`wire/replica_sockets.py`), each gets one in its
+port's place. `rlservo serve` sets the variable; a cluster of several machines cannot have it, since its machines
 ask each other. Ray's own ports follow the node's address, which `launcher.py` and `cluster_process.py` set.
 
 Serve calls `ingress.middlewares` in each process before it binds anything, and that calls `install`.
@@ -54,10 +54,12 @@ def _replace(name: str, wrap: Callable[[Any], Any]) -> None:
 
 
 def _on_loopback(add: Any) -> Any:
-    """Wrap a function that binds a gRPC server to an address `host:port`."""
+    """Wrap a function that binds a gRPC server to an address `host:port`; port 0, any, is for Serve itself."""
 
     def add_on_loopback(server: Any, address: str) -> Any:
-        return add(server, f"{LOOPBACK}:{address.rpartition(':')[2]}")
+        port = address.rpartition(":")[2]
+        path = None if port == "0" else socket_path(port)
+        return add(server, f"{LOOPBACK}:{port}" if path is None else f"unix:{path}")
 
     return add_on_loopback
 

@@ -1,23 +1,16 @@
 """Unix sockets by which HAProxy asks the replicas of a server of one machine, instead of their TCP ports.
 
-A request over loopback's TCP costs HAProxy and a replica twice what it does over a Unix socket, and nobody but this
-user can connect to these. Whose port would be 30000 has the file `30000.sock` in the folder that the variable names.
+Loopback's TCP costs a request more than HAProxy's own work does, and nobody but this user can connect to these. Whose
+port would be 30000 has the file `30000.sock` in the folder that the variable names.
 """
 
 from __future__ import annotations
 
 import os
-import re
 
 VARIABLE = "RLSERVO_REPLICA_SOCKETS"
 ASKER = ("127.0.0.1", 0)
 """Who asks by a socket that has no address: HAProxy, whose word for whom it asks uvicorn takes from this machine."""
-LONGEST = 107 - len("/65535.sock")  # of a folder: what a socket's address has room for
-
-
-def is_usable(folder: str) -> bool:
-    """Whether sockets can be there, and a HAProxy configuration can name them."""
-    return len(os.fsencode(folder)) <= LONGEST and re.fullmatch(r"[A-Za-z0-9_./-]+", folder) is not None
 
 
 def socket_path(port: int | str) -> str | None:

@@ -215,11 +215,11 @@ def _leave_hung_replicas(text: str) -> str:
 
 
 def _by_unix_sockets(text: str) -> str:
-    """Ask replicas, and Serve's own proxy, by Unix sockets where they have them; gRPC stays with TCP."""
+    """Ask replicas, and Serve's own proxy, by Unix sockets where they have them."""
     if socket_path(0) is None:
         return text
-    times = _count(r"^ *server ", text) - _count(r"^ *server .* proto h2", text)
-    server = r"^( *server \S+) 127\.0\.0\.1:(\d+)(?= )(?!.* proto h2)"
+    server = r"^( *server \S+) 127\.0\.0\.1:(\d+)(?= )"
+    times = _count(r"^ *server ", text)
     return _replace(text, server, lambda one: f"{one[1]} unix@{socket_path(one[2])}", "a server's address", times=times)
 
 
