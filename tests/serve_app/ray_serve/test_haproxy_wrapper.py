@@ -13,6 +13,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import warnings
@@ -24,7 +25,7 @@ from typing import Any
 import pytest
 
 from rlservo.serve_app.ray_serve import environment as environment_module
-from rlservo.serve_app.ray_serve import loopback_binding
+from rlservo.serve_app.ray_serve import launcher, loopback_binding
 from rlservo.serve_app.ray_serve.environment import cluster_environment, ray_environment
 from rlservo.serve_app.ray_serve.haproxy import (
     configuration,
@@ -470,8 +471,19 @@ def test_replicas_of_one_machine_are_asked_by_unix_sockets(tmp_path: Path, monke
     addresses = re.findall(r"^ *server \S+ (\S+)", mended, re.MULTILINE)
     assert len(addresses) == 4 and set(addresses) == {f"unix@{tmp_path}/{port}.sock" for port in (1, 2)}
     elsewhere = text.replace("rlservo-a 127.0.0.1:1 check", "rlservo-a 10.0.0.1:1 check")
-    with pytest.raises(configuration.TemplateError, match="a server's address is there [0-9] times, not 4"):
+    with pytest.raises(configuration.TemplateError, match=r"a server's address is there [0-3] times, not 4"):
         configuration.patch_configuration(elsewhere, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("temporary", "parent"), [("/var/tmp", "/var/tmp"), ("/tmp/a b", "/tmp"), ("/tmp/" + "x" * 80, "/tmp")]
+)
+def test_a_server_makes_its_folder_where_sockets_and_configurations_can_be(
+    temporary: str, parent: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", temporary)
+    with launcher._folder() as folder:
+        assert folder.parent == Path(parent)
 
 
 def test_a_port_in_a_folder_is_a_socket_of_this_user_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
