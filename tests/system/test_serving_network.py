@@ -185,10 +185,12 @@ def test_serves_own_paths_answer_nobody_at_any_address(server: Server, path: str
         assert b"rlservo" not in body
 
 
-def test_serves_own_methods_answer_nobody_at_any_port(server: Server) -> None:
+def test_serves_own_methods_answer_nobody_at_any_address(server: Server) -> None:
     spoken = 0
-    for port in {server.grpc_port, *server.ports("ray::ServeReplica"), *server.ports("ray::ProxyActor")}:
-        with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+    ports = {server.grpc_port, *server.ports("ray::ServeReplica"), *server.ports("ray::ProxyActor")}
+    sockets = (f"unix:{path}" for path in server.folder.glob("[0-9]*.sock"))
+    for address in (*(f"127.0.0.1:{port}" for port in ports), *sockets):
+        with grpc.insecure_channel(address) as channel:
             try:
                 live = channel.unary_unary("/inference.GRPCInferenceService/ServerLive")(b"", timeout=5)
             except grpc.RpcError:
@@ -198,7 +200,7 @@ def test_serves_own_methods_answer_nobody_at_any_port(server: Server) -> None:
             for method in ("Healthz", "ListApplications"):
                 with pytest.raises(grpc.RpcError) as raised:
                     channel.unary_unary(f"/ray.serve.RayServeAPIService/{method}")(b"", timeout=5)
-                assert raised.value.code() is grpc.StatusCode.UNIMPLEMENTED, (port, method)
+                assert raised.value.code() is grpc.StatusCode.UNIMPLEMENTED, (address, method)
     assert spoken == 3
 
 
