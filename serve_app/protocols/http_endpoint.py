@@ -13,7 +13,7 @@ import logging
 import secrets
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Awaitable, Mapping
 from typing import Any, NamedTuple
 
 from fastapi import FastAPI
@@ -105,10 +105,10 @@ class PolicyApp(FastAPI):
         """Return whether such a request may be read; if not, count it as turned away."""
         return self._core.admission.admit_unread()
 
-    async def answer_ahead(self, match: DirectMatch, scope: Scope, receive: Receive, send: Send) -> None:
+    def answer_ahead(self, match: DirectMatch, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
         """Answer as Serve would have it answered: under its prefix, and with the request's id on the reply."""
         scope["root_path"] = self._mount
-        await self.answer_found(match, scope, receive, send, offer=self.offer)
+        return self.answer_found(match, scope, receive, send, offer=self.offer)
 
     async def answer_found(
         self, match: DirectMatch, scope: Scope, receive: Receive, send: Send, *, offer: Headers = ()

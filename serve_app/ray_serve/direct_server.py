@@ -18,6 +18,7 @@ import logging
 import socket
 import struct
 import time
+from collections.abc import Awaitable
 from email.utils import formatdate
 from typing import Any
 
@@ -25,7 +26,7 @@ import uvicorn
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.server import ServerState
 
-from rlservo.serve_app.protocols.http_endpoint import PolicyApp
+from rlservo.serve_app.protocols.http_endpoint import DirectMatch, PolicyApp
 from rlservo.serve_app.ray_serve import ingress
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol, refusal
 from rlservo.serve_app.server.settings import ServerSettings
@@ -211,9 +212,9 @@ class DirectConnection(TimedProtocol):
         if self.cycle is not None and not self.cycle.response_complete:
             self.cycle.keep_alive = False
 
-    def is_immediate(self, scope: Scope) -> bool:
-        """Whether it is a request for an action; while draining, none is: replies end their connection."""
-        return not self._server.is_draining and self._server.app.is_immediate(scope)
+    def find_app(self, scope: Scope) -> ASGIApp | None:
+        """Return what answers a request for an action; while draining none is answered so: replies end connections."""
+        return None if self._server.is_draining else self._server.app.find(scope)
 
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
         if self._server.is_draining:
@@ -227,19 +228,19 @@ class DirectApp:
     def __init__(self, app: PolicyApp) -> None:
         self._app = app
 
-    def is_immediate(self, scope: Scope) -> bool:
-        """Whether it is a request for an action."""
-        return self._app.find_direct(scope, scope["path"]) is not None
+    def find(self, scope: Scope) -> ASGIApp | None:
+        """Return what answers a request for an action, or a stream."""
+        match = self._app.find_direct(scope, scope["path"])
+        return None if match is None else functools.partial(self._answer, match)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one connection or request."""
-        match = self._app.find_direct(scope, scope["path"])
-        if match is None:
-            await self._app.answer(scope, receive, send)
-        elif scope["type"] == "http" and not self._app.admit_ahead():
-            await ingress.turn_away(send)
-        else:
-            await self._app.answer_found(match, scope, receive, send)
+        await (self.find(scope) or self._app.answer)(scope, receive, send)
+
+    def _answer(self, match: DirectMatch, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
+        if scope["type"] == "http" and not self._app.admit_ahead():
+            return ingress.turn_away(scope, receive, send)
+        return self._app.answer_found(match, scope, receive, send)
 
 
 def stamp_of(connection: socket.socket, limit_s: float) -> bytes | None:

@@ -16,13 +16,12 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.ray_serve import loopback_binding
 from rlservo.serve_app.ray_serve.haproxy.configuration import CHECK_SECRET
 from rlservo.serve_app.ray_serve.haproxy.installation import find_binary, install_wrapper
-from rlservo.serve_app.ray_serve.ports import claim_port, free_ports, is_free
+from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.ray_serve.processes import MARK
 from rlservo.serve_app.ray_serve.server_log import LOG_BYTES
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
 from rlservo.serve_app.wire import replica_sockets
 
-FIRST_PORT, SERVERS, PORTS_PER_SERVER = 30_000, 21, 64  # up to 32687; outgoing connections begin at 32768
 LOG_BACKUPS = 1  # how many earlier files of each of Ray's logs are kept
 DEFAULT_MESSAGE = 4 << 20  # [bytes]
 HAPROXY_BINARY = "RAY_SERVE_HAPROXY_BINARY_PATH"
@@ -111,7 +110,7 @@ def cluster_environment(
 
 
 def ray_environment(
-    folder: Path, *, haproxy: str | None, mark: str, port: int = 8000, max_message: int = DEFAULT_MESSAGE
+    folder: Path, *, haproxy: str | None, mark: str, max_message: int = DEFAULT_MESSAGE
 ) -> dict[str, str]:
     """Return the environment of `rlservo serve`'s own cluster: this process's, without its Ray settings, with ours."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
@@ -126,7 +125,6 @@ def ray_environment(
             "RAY_SERVE_LOG_TO_STDERR": "0",
             **proxy_ports(),
             "RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(max_message),
-            **_replica_ports(port),
             # Requests take microseconds: replicas need not wait half a minute for stragglers when the server stops.
             DRAINING: "0",
         }
@@ -162,31 +160,3 @@ def proxy_files(folder: Path) -> dict[str, str]:
         "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
         "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
     }
-
-
-def _replica_ports(port: int) -> dict[str, str]:
-    """Return where replicas listen: below the ports of outgoing connections, and not where another server's do.
-
-    Ray's own range is the same for every cluster of a machine: a proxy that does not yet know that a replica is
-    gone would ask the other server's that took its port. And gRPC servers of two clusters share a port without a word
-    (ray 2.60 means to forbid it, in a form that gRPC does not read), so that each gets some of the other's requests.
-    """
-    first = port % SERVERS
-    ranges = _ranges(next((n % SERVERS for n in range(first, first + SERVERS) if _is_unused(n % SERVERS)), first))
-    return {
-        f"RAY_SERVE_DIRECT_INGRESS_{bound}_{protocol}_PORT": str(first + more)
-        for protocol, first in ranges.items()
-        for bound, more in (("MIN", 0), ("MAX", PORTS_PER_SERVER - 1))
-    }
-
-
-def _ranges(number: int) -> dict[str, int]:
-    """Return the first port by protocol of one of the servers that fit beside each other."""
-    window = FIRST_PORT + PORTS_PER_SERVER * number
-    return {"HTTP": window, "GRPC": window + SERVERS * PORTS_PER_SERVER}
-
-
-def _is_unused(number: int) -> bool:
-    """Whether nobody listens on any of a server's ports, nor has another that is starting chosen them."""
-    ports = [first + more for first in _ranges(number).values() for more in range(PORTS_PER_SERVER)]
-    return claim_port(ports[0]) and all(is_free(port) for port in ports)

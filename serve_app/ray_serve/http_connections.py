@@ -35,7 +35,6 @@ from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
 from rlservo.serve_app.ray_serve.uvicorn_parts import (
     STATUS_LINE,
     HttpToolsProtocol,
-    ProxyHeadersMiddleware,
     RequestResponseCycle,
     auto,
 )
@@ -176,7 +175,8 @@ class TimedProtocol(HttpToolsProtocol):
     """A connection that ends when one of its phases takes too long, and writes each reply at once."""
 
     body_s = BODY_S
-    is_request_immediate: Callable[[Scope], bool] = staticmethod(lambda _: False)
+    find: Callable[[Scope], ASGIApp | None] = staticmethod(lambda _: None)
+    """Finds what answers a request, once it is whole, without waiting for anything; None for all others."""
     _head_since: float | None = None  # since when a head is awaited; None while something else is
     _idle_since: float | None = None  # since when nothing has come after a reply
     _body_since = 0.0  # since when the request's body is awaited
@@ -190,7 +190,6 @@ class TimedProtocol(HttpToolsProtocol):
     _known: RepeatedHead | None = None  # the head that is expected to come again
     _lessons = MOST_LESSONS
     _answered: Any = None  # the scope of the request that was answered at once in this read
-    _inner_app: ASGIApp  # the application, without what looks for the client that a proxy names
     _spare: EarlyEnd | None = None  # of a known request that was answered at once, for the next one
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -202,8 +201,6 @@ class TimedProtocol(HttpToolsProtocol):
         elif connection is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
             # The kernel ends the connection, whoever else still holds it: uvicorn's WebSockets, too.
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1000))
-        app: Any = self.app
-        self._inner_app = cast("Any", app.app) if isinstance(app, ProxyHeadersMiddleware) else app
         self._replies = JoinedWrites(transport)
         self._head_since = self.loop.time()
         self._timer = self.loop.call_later(CHECK_PERIOD_S, self._check_phase)
@@ -242,7 +239,7 @@ class TimedProtocol(HttpToolsProtocol):
 
     def _repeat(self, scope: Any, body: bytes) -> bool:
         """Answer a request whose head need not be parsed; return False where it is to take the ordinary way."""
-        if not self.is_immediate(scope):
+        if (app := self.find_app(scope)) is None:
             return False
         self._idle_since = None
         self._replies.head = None
@@ -265,7 +262,7 @@ class TimedProtocol(HttpToolsProtocol):
                 on_response=self.on_response_complete,
             )
             cycle.more_body = False
-        self._spare = cycle if self._answer(cycle, body, self._inner_app) else None
+        self._spare = cycle if self._answer(cycle, body, app) else None
         return True
 
     def handle_websocket_upgrade(self) -> None:
@@ -359,14 +356,14 @@ class TimedProtocol(HttpToolsProtocol):
         if cycle.scope["method"] == "POST":  # of a HEAD there would be no body for its head to wait for
             self._replies.head = None
             cycle.transport = self._replies
-            if cycle.more_body and self._is_first and app is self.app and self.is_immediate(cycle.scope):
+            if cycle.more_body and self._is_first and app is self.app and self.find_app(cycle.scope) is not None:
                 self._awaited = cycle
                 return
         super()._start_asgi_task(cycle, app)
 
-    def is_immediate(self, scope: Scope) -> bool:
-        """Whether the application answers a request, once it is whole, without waiting for anything."""
-        return self.is_request_immediate(scope)
+    def find_app(self, scope: Scope) -> ASGIApp | None:
+        """Return what answers a request, once it is whole, without waiting for anything; None for all others."""
+        return self.find(scope)
 
     def _answer(self, cycle: Any, body: bytes, app: ASGIApp) -> bool:
         """Answer a request that is whole; return whether that is over, and nothing uses `cycle` any more."""
@@ -453,13 +450,13 @@ def leave_time_for_bodies(seconds: float) -> None:
     TimedProtocol.body_s = max(BODY_S, seconds)
 
 
-def install(is_immediate: Callable[[Scope], bool]) -> None:
-    """Let uvicorn's servers of this process use it; `is_immediate` knows the requests that are answered at once.
+def install(find: Callable[[Scope], ASGIApp | None]) -> None:
+    """Let uvicorn's servers of this process use it; `find` knows what answers the requests that need not wait.
 
     Raises RuntimeError for another uvicorn than is known here.
     """
     if auto.AutoHTTPProtocol is TimedProtocol:
         return
     uvicorn_parts.check()
-    TimedProtocol.is_request_immediate = staticmethod(is_immediate)
+    TimedProtocol.find = staticmethod(find)
     auto.AutoHTTPProtocol = TimedProtocol

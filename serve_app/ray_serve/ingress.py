@@ -19,6 +19,8 @@ imported by Serve's proxies as well, so it imports little.
 from __future__ import annotations
 
 import asyncio
+import functools
+from collections.abc import Awaitable
 from typing import Any, Protocol
 
 from starlette.middleware import Middleware
@@ -52,7 +54,7 @@ class Application(Protocol):
         """Return whether one more request may be read; if not, count it as turned away."""
         ...
 
-    async def answer_ahead(self, match: Any, scope: Scope, receive: Receive, send: Send) -> None:
+    def answer_ahead(self, match: Any, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
         """Answer by the route that was found."""
         ...
 
@@ -70,21 +72,31 @@ class ServeBypass:
         """From now on, in this event loop, refuse what there is no room for, and let `app` answer, if it `answers`."""
         self._app, self._loop, self.answers = app, asyncio.get_running_loop(), answers
 
-    def find(self, scope: Scope) -> tuple[Application, Any] | None:
-        """Return (application, route) for a connection that it answers, None for all that Serve handles."""
+    def find(self, scope: Scope) -> ASGIApp | None:
+        """Return what answers a connection in Serve's place, None for all that Serve handles."""
         app = self._app
         if app is None or asyncio.get_running_loop() is not self._loop:
             return None
         match = app.find_ahead(scope)
-        return None if match is None else (app, match)
+        if match is None:
+            return None
+        if self.answers:
+            return functools.partial(_answer, app, match)
+        return None if scope["type"] != "http" or app.admit_ahead() else turn_away
+
+
+def _answer(app: Application, match: Any, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
+    if scope["type"] == "http" and not app.admit_ahead():
+        return turn_away(scope, receive, send)
+    return app.answer_ahead(match, scope, receive, send)
 
 
 bypass = ServeBypass()
 
 
-def is_immediate(scope: Scope) -> bool:
-    """Whether `Ingress` has the application answer an HTTP request, and nothing that may wait."""
-    return bypass.answers and bypass.find(scope) is not None
+def find_at_once(scope: Scope) -> ASGIApp | None:
+    """Return what answers an HTTP request without anything that may wait, None for all others."""
+    return bypass.find(scope) if bypass.answers else None
 
 
 class Ingress:
@@ -95,15 +107,9 @@ class Ingress:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         http = scope["type"] == "http"
-        found = bypass.find(scope)
-        if found is not None:
-            app, match = found
-            if http and not app.admit_ahead():
-                await turn_away(send)
-                return
-            if bypass.answers:
-                await app.answer_ahead(match, scope, receive, send)
-                return
+        if (found := bypass.find(scope)) is not None:
+            await found(scope, receive, send)
+            return
         headers = mend_headers(scope["headers"])
         scope.pop(AT_ONCE, None)  # Serve reads a stream itself
         if http:
@@ -116,7 +122,7 @@ class Ingress:
         await self._app(scope, receive, send)
 
 
-async def turn_away(send: Send) -> None:
+async def turn_away(_scope: Scope, _receive: Receive, send: Send) -> None:
     """Answer a request that nothing is read of."""
     await send({"type": "http.response.start", "status": 503, "headers": list(TURNED_AWAY)})
     await send({"type": "http.response.body", "body": FULL})
@@ -124,7 +130,7 @@ async def turn_away(send: Send) -> None:
 
 def middlewares() -> list[Middleware]:
     """Return what Serve puts around each HTTP server it starts; it calls this before it binds the server's port."""
-    http_connections.install(is_immediate)
+    http_connections.install(find_at_once)
     closed_endpoints.install()
     if loopback_binding.is_wanted():
         loopback_binding.install()

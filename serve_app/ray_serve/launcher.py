@@ -253,7 +253,7 @@ def _child(
     mark = secrets.token_hex(16)
     settings = plan["settings"]
     environment = ray_environment(
-        folder, haproxy=haproxy, mark=mark, port=plan["port"], max_message=settings["max_body_bytes"]
+        folder, haproxy=haproxy, mark=mark, max_message=settings["max_body_bytes"]
     )
     if haproxy is None and not is_loopback(plan["host"]):
         environment[loopback_binding.VARIABLE] = loopback_binding.INNER

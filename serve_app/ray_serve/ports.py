@@ -11,7 +11,7 @@ import psutil
 
 from rlservo.export.contract.errors import UnavailableError, UsageError
 
-# Where `free_ports` looks: above those Ray gives its workers, below those of replicas (`environment.py`, 30000 and up)
+# Where `free_ports` looks: above those Ray gives its workers, below those of a cluster's replicas (30000 and up)
 # and those of outgoing connections (Linux: 32768 and up).
 PORTS = range(20_000, 30_000)
 _claimed: set[int] = set()  # ports that this process means to listen on, or has somebody listen on

@@ -639,35 +639,6 @@ def test_the_cluster_gets_the_variables_that_the_launcher_sets(tmp_path: Path) -
     assert len(local[secret]) == 32
 
 
-def test_a_server_whose_replicas_ports_are_in_use_gets_others(tmp_path: Path) -> None:
-    def first(port: int, protocol: str) -> int:
-        environment = ray_environment(tmp_path, haproxy=None, mark="test", port=port)
-        return int(environment[f"RAY_SERVE_DIRECT_INGRESS_MIN_{protocol}_PORT"])
-
-    for protocol in ("HTTP", "GRPC"):
-        port = first(8000, protocol)
-        with socket.create_server(("127.0.0.1", port + 3), reuse_port=True):  # as gRPC listens
-            assert first(8000, protocol) != port
-        assert first(8000, protocol) == port
-
-
-def test_servers_on_ports_next_to_each_other_have_replicas_on_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(environment_module, "_is_unused", lambda number: True)  # other tests' servers may run
-    taken: set[int] = set()
-    for port in range(8000, 8021):
-        environment = ray_environment(tmp_path, haproxy=None, mark="test", port=port)
-        for protocol in ("HTTP", "GRPC"):
-            first, last = (
-                int(environment[f"RAY_SERVE_DIRECT_INGRESS_{bound}_{protocol}_PORT"]) for bound in ("MIN", "MAX")
-            )
-            ports = set(range(first, last + 1))
-            assert len(ports) == 64 and not ports & taken
-            taken |= ports
-    assert min(taken) >= 30_000 and max(taken) < 32_768  # where Linux begins with outgoing connections
-
-
 def ask_in_threads(node: Node, goes_on: Callable[[], bool], turns: list[int]) -> tuple[int, list[str], list[str]]:
     """Ask as long as it goes on, once more at once when that failed.
 

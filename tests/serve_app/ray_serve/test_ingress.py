@@ -221,7 +221,7 @@ def test_who_was_refused_behind_the_proxy_is_logged(
 
         async def at_once(scope: Scope, receive: Receive, send: Send) -> None:
             scope["client"] = (asked_by, 4711)
-            assert ingress_module.is_immediate(scope)
+            assert ingress_module.find_at_once(scope) is not None
             await server.loaded_app(scope, receive, send)
 
         assert (await ask(at_once, headers=headers))[0] == 401
