@@ -252,9 +252,7 @@ def _child(
     """Start the cluster's process, pass on what it reports, and end all that carries its mark."""
     mark = secrets.token_hex(16)
     settings = plan["settings"]
-    environment = ray_environment(
-        folder, haproxy=haproxy, mark=mark, max_message=settings["max_body_bytes"]
-    )
+    environment = ray_environment(folder, haproxy=haproxy, mark=mark, max_message=settings["max_body_bytes"])
     if haproxy is None and not is_loopback(plan["host"]):
         environment[loopback_binding.VARIABLE] = loopback_binding.INNER
     if settings["direct_port"] is not None:
