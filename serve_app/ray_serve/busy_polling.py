@@ -11,20 +11,16 @@ requests a second cost one moment in `MOST_SKIPPED` replies.
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 
 AWAKE_S = 160e-6
 MOST_SKIPPED = 64  # replies
 
 
-class BusyPolling(threading.local):
-    """Keeps this thread's event loop awake for a moment."""
+class BusyPolling:
+    """Keeps an event loop awake for a moment."""
 
-    def __init__(self) -> None:
-        self._loop: asyncio.AbstractEventLoop | None = None
-
-    def _begin(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._replies = 0  # of this turn
         self._connection = 0  # the `id` of the one that the last turn replied on; no reference keeps it
@@ -34,15 +30,12 @@ class BusyPolling(threading.local):
 
     def note_reply(self, connection: object) -> None:
         """Take note of a reply on a connection."""
-        loop = asyncio.get_running_loop()
-        if self._loop is not loop:  # the first, or the one before has ended
-            self._begin(loop)
         if self._replies == 0:
-            loop.call_soon(self._end_turn, loop)
+            self._loop.call_soon(self._end_turn)
             self._is_same, self._connection = self._connection == id(connection), id(connection)
         self._replies += 1
 
-    def _end_turn(self, loop: asyncio.AbstractEventLoop) -> None:
+    def _end_turn(self) -> None:
         is_single, self._replies = self._replies == 1, 0
         if not (is_single and self._is_same):
             return
@@ -50,16 +43,13 @@ class BusyPolling(threading.local):
             self._skipped += 1
             return
         self._until = time.perf_counter() + AWAKE_S
-        loop.call_soon(self._poll, loop)
+        self._loop.call_soon(self._poll)
 
-    def _poll(self, loop: asyncio.AbstractEventLoop) -> None:
+    def _poll(self) -> None:
         """Let the loop look at its sockets once more: it does not sleep while something is to be called."""
         if self._replies and self._is_same:
             self._to_skip //= 2
         elif not self._replies and time.perf_counter() < self._until:
-            loop.call_soon(self._poll, loop)
+            self._loop.call_soon(self._poll)
         else:
             self._to_skip, self._skipped = min(2 * self._to_skip + 1, MOST_SKIPPED), 0
-
-
-polling = BusyPolling()

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 from rlservo.serve_app.protocols.http_endpoint import REPLY, WholeBody
 from rlservo.serve_app.ray_serve import uvicorn_parts
 from rlservo.serve_app.ray_serve.eager_tasks import start_at_once
-from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, turn
+from rlservo.serve_app.ray_serve.joined_writes import JoinedWrites, Turn, turn_of
 from rlservo.serve_app.ray_serve.uvicorn_parts import (
     STATUS_LINE,
     HttpToolsProtocol,
@@ -181,6 +181,7 @@ class TimedProtocol(HttpToolsProtocol):
     _idle_since: float | None = None  # since when nothing has come after a reply
     _body_since = 0.0  # since when the request's body is awaited
     _timer: asyncio.TimerHandle | None = None
+    _turn: Turn
     _replies: JoinedWrites
     _unread = 0  # bytes that came since the last request was complete, so at least those of the head that is read
     _refuse: ASGIApp | None = None  # answers the next request instead of the application, and ends the connection
@@ -201,7 +202,8 @@ class TimedProtocol(HttpToolsProtocol):
         elif connection is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
             # The kernel ends the connection, whoever else still holds it: uvicorn's WebSockets, too.
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1000))
-        self._replies = JoinedWrites(transport)
+        self._turn = turn_of(self.loop)
+        self._replies = JoinedWrites(transport, self._turn)
         self._head_since = self.loop.time()
         self._timer = self.loop.call_later(CHECK_PERIOD_S, self._check_phase)
 
@@ -300,11 +302,11 @@ class TimedProtocol(HttpToolsProtocol):
 
     def send_400_response(self, msg: str) -> None:
         """End the connection, whose bytes are no HTTP."""
-        turn.flush()
+        self._turn.flush()
         super().send_400_response(msg)
 
     def _end_with(self, reply: bytes) -> None:
-        turn.flush()  # a reply that is held was before this one
+        self._turn.flush()  # a reply that is held was before this one
         self.transport.write(reply)
         self.transport.close()
 
@@ -331,7 +333,7 @@ class TimedProtocol(HttpToolsProtocol):
 
     def shutdown(self) -> None:
         """End the connection when what is being answered is written."""
-        turn.flush()  # a reply that is held counts as written
+        self._turn.flush()  # a reply that is held counts as written
         super().shutdown()
 
     def _linger(self) -> None:
@@ -390,10 +392,10 @@ class TimedProtocol(HttpToolsProtocol):
             pieces += (name, b": ", value, b"\r\n")
         pieces += (b"\r\n" if cycle.keep_alive else b"connection: close\r\n\r\n", body)
         cycle.response_started = cycle.response_complete = True
-        turn.write(self.transport, b"".join(pieces))
+        self._turn.write(self.transport, b"".join(pieces))
         cycle.message_event.set()
         if not cycle.keep_alive:
-            turn.flush()
+            self._turn.flush()
             self.transport.close()
         cycle.on_response()
         return True

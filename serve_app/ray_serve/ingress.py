@@ -18,8 +18,8 @@ imported by Serve's proxies as well, so it imports little.
 
 from __future__ import annotations
 
-import asyncio
 import functools
+import threading
 from collections.abc import Awaitable
 from typing import Any, Protocol
 
@@ -65,17 +65,17 @@ class ServeBypass:
     def __init__(self) -> None:
         """Leave everything to Serve, as in a proxy."""
         self._app: Application | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread = 0
         self.answers = False
 
     def install(self, app: Application, *, answers: bool = True) -> None:
-        """From now on, in this event loop, refuse what there is no room for, and let `app` answer, if it `answers`."""
-        self._app, self._loop, self.answers = app, asyncio.get_running_loop(), answers
+        """From now on, in this thread, refuse what there is no room for, and let `app` answer, if it `answers`."""
+        self._app, self._thread, self.answers = app, threading.get_ident(), answers
 
     def find(self, scope: Scope) -> ASGIApp | None:
         """Return what answers a connection in Serve's place, None for all that Serve handles."""
         app = self._app
-        if app is None or asyncio.get_running_loop() is not self._loop:
+        if app is None or threading.get_ident() != self._thread:
             return None
         match = app.find_ahead(scope)
         if match is None:

@@ -14,26 +14,24 @@ import asyncio
 import threading
 from typing import Any
 
-from rlservo.serve_app.ray_serve.busy_polling import polling
+from rlservo.serve_app.ray_serve.busy_polling import BusyPolling
 
 MOST_HELD = 16  # replies: the first of them waits for the last
 INFORMATIONAL = b"HTTP/1.1 1"  # 100 Continue: the client waits for it before it sends the body
 
 
-class Turn(threading.local):
-    """The replies of one turn of this thread's event loop."""
+class Turn:
+    """The replies of one turn of an event loop."""
 
-    def __init__(self) -> None:
-        self._loop: asyncio.AbstractEventLoop | None = None
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.loop = loop
+        self.polling = BusyPolling(loop)
         self._replies = 0
         self._several = False  # in the turn before
         self._held: list[tuple[Any, bytes]] = []
 
     def write(self, transport: Any, reply: bytes) -> None:
         """Write a reply, now or at the end of the turn."""
-        loop = asyncio.get_running_loop()
-        if self._loop is not loop:  # the first, or the one before has ended and taken its connections with it
-            self._loop, self._replies, self._several, self._held = loop, 0, False, []
         if not self._several:
             transport.write(reply)
         else:
@@ -42,9 +40,9 @@ class Turn(threading.local):
                 self.flush()
         # After the write: the client waits for it.
         if self._replies == 0:
-            loop.call_soon(self._end)
+            self.loop.call_soon(self._end)
         self._replies += 1
-        polling.note_reply(transport)
+        self.polling.note_reply(transport)
 
     def flush(self) -> None:
         """Write what is held."""
@@ -58,16 +56,28 @@ class Turn(threading.local):
         self.flush()
 
 
-turn = Turn()
+class _Latest(threading.local):
+    turn: Turn | None = None
+
+
+_latest = _Latest()
+
+
+def turn_of(loop: asyncio.AbstractEventLoop) -> Turn:
+    """Return what all connections of an event loop share, which runs in this thread."""
+    found = _latest.turn
+    if found is None or found.loop is not loop:  # the first, or the one before has ended
+        found = _latest.turn = Turn(loop)
+    return found
 
 
 class JoinedWrites:
     """A connection's transport for replies: holds the head until the first piece of the body, writes both at once."""
 
-    __slots__ = ("_transport", "head")
+    __slots__ = ("_transport", "_turn", "head")
 
-    def __init__(self, transport: Any) -> None:
-        self._transport = transport
+    def __init__(self, transport: Any, turn: Turn) -> None:
+        self._transport, self._turn = transport, turn
         self.head: bytes | None = None
         """The reply's head, while it is held: None before it came (set so to begin a reply), empty once written."""
 
@@ -76,17 +86,17 @@ class JoinedWrites:
         head = self.head
         if head:
             self.head = b""
-            turn.write(self._transport, head + data)
+            self._turn.write(self._transport, head + data)
         elif head is None and not data.startswith(INFORMATIONAL):
             self.head = data
         else:
             if data:
-                turn.flush()  # what comes before this may be held
+                self._turn.flush()  # what comes before this may be held
             self._transport.write(data)
 
     def close(self) -> None:
         """Write what is held and close."""
-        turn.flush()
+        self._turn.flush()
         if self.head:
             self._transport.write(self.head)
             self.head = b""

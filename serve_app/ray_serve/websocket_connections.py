@@ -16,8 +16,8 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from rlservo.serve_app.protocols.http_endpoint import AT_ONCE
-from rlservo.serve_app.ray_serve.busy_polling import polling
 from rlservo.serve_app.ray_serve.eager_tasks import start_at_once
+from rlservo.serve_app.ray_serve.joined_writes import turn_of
 from rlservo.serve_app.ray_serve.uvicorn_parts import (
     OPEN,
     WebSocketsSansIOProtocol,
@@ -63,6 +63,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
         """Take HAProxy for who asks where the socket has no address."""
         super().connection_made(transport)
         self.client = self.client or ASKER
+        self._polling = turn_of(self.loop).polling
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Say so."""
@@ -175,7 +176,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
         else:
             head = b"\x82\x7f" + size.to_bytes(8, "big")
         self.transport.write(head + content)
-        polling.note_reply(self.transport)  # after it: the client waits for the frame
+        self._polling.note_reply(self.transport)  # after it: the client waits for the frame
 
     async def receive(self) -> Message:  # type: ignore[override]
         """Return the next message; others have their turn before one that has come already."""

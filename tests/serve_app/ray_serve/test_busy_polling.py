@@ -27,12 +27,12 @@ class Counted(BusyPolling):
     """Counts how often the loop was kept awake."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(asyncio.get_running_loop())
         self.polls = 0
 
-    def _poll(self, loop: asyncio.AbstractEventLoop) -> None:
+    def _poll(self) -> None:
         self.polls += 1
-        super()._poll(loop)
+        super()._poll()
 
     async def has_begun(self, *connections: object) -> bool:
         """Whether the loop was kept awake after a turn with replies on these connections, in moments of no length."""
@@ -45,19 +45,13 @@ class Counted(BusyPolling):
 
 
 @pytest.fixture
-def polling() -> Counted:
-    return Counted()
-
-
-@pytest.fixture
 def awake_s(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     return lambda seconds: monkeypatch.setattr(busy_polling, "AWAKE_S", seconds)
 
 
-def test_the_loop_stays_awake_until_a_request_is_answered(
-    run: Any, polling: Counted, awake_s: Callable[[float], None]
-) -> None:
+def test_the_loop_stays_awake_until_a_request_is_answered(run: Any, awake_s: Callable[[float], None]) -> None:
     async def turns() -> None:
+        polling = Counted()
         for _ in range(2):
             polling.note_reply(run)
             await asyncio.sleep(0.02)
@@ -73,10 +67,9 @@ def test_the_loop_stays_awake_until_a_request_is_answered(
     run(turns())
 
 
-def test_the_loop_sleeps_when_nothing_has_come_in_time(
-    run: Any, polling: Counted, awake_s: Callable[[float], None]
-) -> None:
+def test_the_loop_sleeps_when_nothing_has_come_in_time(run: Any, awake_s: Callable[[float], None]) -> None:
     async def turns() -> None:
+        polling = Counted()
         for _ in range(2):
             polling.note_reply(run)
             await asyncio.sleep(0)
@@ -90,10 +83,9 @@ def test_the_loop_sleeps_when_nothing_has_come_in_time(
     run(turns())
 
 
-def test_a_moment_for_nothing_is_tried_ever_more_rarely(
-    run: Any, polling: Counted, awake_s: Callable[[float], None]
-) -> None:
+def test_a_moment_for_nothing_is_tried_ever_more_rarely(run: Any, awake_s: Callable[[float], None]) -> None:
     async def turns() -> list[bool]:
+        polling = Counted()
         await polling.has_begun(run)
         return [await polling.has_begun(run) for _ in range(400)]
 
@@ -104,9 +96,10 @@ def test_a_moment_for_nothing_is_tried_ever_more_rarely(
 
 
 def test_each_that_paid_halves_what_is_skipped_after_the_next_failure(
-    run: Any, polling: Counted, awake_s: Callable[[float], None]
+    run: Any, awake_s: Callable[[float], None]
 ) -> None:
     async def turns() -> list[bool]:
+        polling = Counted()
         await polling.has_begun(run)
         for _ in range(1 + 1 + 1 + 3 + 1):  # three failures with what is skipped between them
             await polling.has_begun(run)
@@ -124,27 +117,25 @@ def test_each_that_paid_halves_what_is_skipped_after_the_next_failure(
 
 
 def test_only_a_client_that_had_the_reply_before_keeps_the_loop_awake(
-    run: Any, polling: Counted, awake_s: Callable[[float], None], monkeypatch: pytest.MonkeyPatch
+    run: Any, awake_s: Callable[[float], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     a, b = object(), object()
 
     async def turns() -> list[bool]:
+        polling = Counted()
         each = ((a,), (a,), (a,), (b,), (a,), (a,), (a, b), (a, a), (a,))
         return [await polling.has_begun(*connections) for connections in each]
 
     awake_s(0.0)
     monkeypatch.setattr(busy_polling, "MOST_SKIPPED", 0)
-    expected = [False, True, True, False, False, True, False, False, True]
-    assert run(turns()) == expected
-    assert run(turns()) == expected  # in another loop, which knows nothing of the one before
+    assert run(turns()) == [False, True, True, False, False, True, False, False, True]
 
 
-def test_a_request_of_another_client_is_none_that_it_was_awake_for(
-    run: Any, polling: Counted, awake_s: Callable[[float], None]
-) -> None:
+def test_a_request_of_another_client_is_none_that_it_was_awake_for(run: Any, awake_s: Callable[[float], None]) -> None:
     a, b = object(), object()
 
     async def turns() -> list[bool]:
+        polling = Counted()
         await polling.has_begun(a)
         begun = [await polling.has_begun(a)]
         awake_s(0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -272,7 +273,7 @@ def test_where_the_application_is_not_to_answer_serve_gets_the_request_as_it_cam
     run(scenario)
 
 
-def test_in_another_event_loop_everything_is_left_to_serve(app: Any) -> None:
+def test_in_another_threads_event_loop_everything_is_left_to_serve(app: Any) -> None:
     async def here() -> tuple[Serve, Any]:
         serve, ingress = await opened(app)
         assert (await ask(ingress))[0] == 200 and not serve.seen
@@ -284,7 +285,8 @@ def test_in_another_event_loop_everything_is_left_to_serve(app: Any) -> None:
         assert (await ask(ingress))[0] == 200
         assert len(serve.seen) == 1
 
-    run(elsewhere)
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(run, elsewhere).result()
 
 
 def test_in_a_proxy_everything_is_left_to_serve(app: Any) -> None:

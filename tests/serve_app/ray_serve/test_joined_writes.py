@@ -11,6 +11,7 @@ from starlette.types import Receive, Scope, Send
 from uvicorn.server import ServerState
 
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
+from rlservo.serve_app.ray_serve.joined_writes import Turn, turn_of
 
 
 class Recorder(asyncio.Transport):
@@ -168,6 +169,14 @@ def test_in_a_crowd_the_replies_of_a_turn_are_written_after_all_were_computed() 
 def test_no_more_than_sixteen_replies_are_held() -> None:
     events, _ = crowd(echo, rounds=2, number=20)
     assert events == ["asked"] * 16 + ["written"] * 16 + ["asked"] * 4 + ["written"] * 4
+
+
+def test_all_connections_of_an_event_loop_share_a_turn_and_another_loop_has_another() -> None:
+    async def find() -> list[Turn]:
+        return [turn_of(asyncio.get_running_loop()) for _ in range(2)]
+
+    (first, again), (other, _) = asyncio.run(find()), asyncio.run(find())
+    assert first is again and first is not other
 
 
 def test_in_a_crowd_a_stream_keeps_its_order_and_a_failure_its_head() -> None:

@@ -16,7 +16,7 @@ from uvicorn.server import ServerState
 
 from rlservo.serve_app.protocols.http_endpoint import REPLY
 from rlservo.serve_app.ray_serve import ingress
-from rlservo.serve_app.ray_serve.busy_polling import polling
+from rlservo.serve_app.ray_serve.busy_polling import BusyPolling
 from rlservo.serve_app.ray_serve.http_connections import RepeatedHead, TimedProtocol
 
 IDLE_S = 60
@@ -175,7 +175,7 @@ def test_a_head_that_comes_again_is_not_searched_for_a_client_again(monkeypatch:
 
 def test_every_reply_is_one_that_the_loop_may_stay_awake_after(monkeypatch: pytest.MonkeyPatch) -> None:
     noted: list[Any] = []
-    monkeypatch.setattr(polling, "note_reply", noted.append)
+    monkeypatch.setattr(BusyPolling, "note_reply", lambda _, connection: noted.append(connection))
     written = replies([request(b"%d" % number) for number in range(4)], [1] * 4)
     assert written.count(b"200 OK") == len(noted) == 4 and len(set(noted)) == 1
 

@@ -13,7 +13,7 @@ import uvicorn
 from uvicorn.server import ServerState
 
 from rlservo.serve_app.protocols.http_endpoint import AT_ONCE
-from rlservo.serve_app.ray_serve.busy_polling import polling
+from rlservo.serve_app.ray_serve.busy_polling import BusyPolling
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 
 HANDSHAKE = (
@@ -109,7 +109,7 @@ async def echo(message: Any) -> Any:
 
 def test_every_reply_is_one_that_the_loop_may_stay_awake_after(monkeypatch: pytest.MonkeyPatch) -> None:
     noted: list[Any] = []
-    monkeypatch.setattr(polling, "note_reply", noted.append)
+    monkeypatch.setattr(BusyPolling, "note_reply", lambda _, connection: noted.append(connection))
 
     async def run() -> None:
         stream = Stream(echo)
