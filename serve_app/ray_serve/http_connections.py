@@ -40,7 +40,7 @@ from rlservo.serve_app.ray_serve.uvicorn_parts import (
 )
 from rlservo.serve_app.ray_serve.websocket_connections import BoundedStream
 from rlservo.serve_app.wire.replica_sockets import ASKER
-from rlservo.serve_app.wire.request_stamp import STAMP
+from rlservo.serve_app.wire.request_stamp import STAMP, client_of
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
@@ -203,7 +203,7 @@ class TimedProtocol(HttpToolsProtocol):
             # The kernel ends the connection, whoever else still holds it: uvicorn's WebSockets, too.
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1000))
         self._turn = turn_of(self.loop)
-        self._replies = JoinedWrites(transport, self._turn)
+        self._replies = JoinedWrites(self, transport, self._turn)
         self._head_since = self.loop.time()
         self._timer = self.loop.call_later(CHECK_PERIOD_S, self._check_phase)
 
@@ -383,6 +383,13 @@ class TimedProtocol(HttpToolsProtocol):
         task.add_done_callback(self.tasks.discard)
         return False
 
+    def client_id(self) -> object:
+        """Return who asked last: of a proxy's requests the stamp says so, since any may come over any connection."""
+        for name, value in self.headers:
+            if name == VARYING[1]:
+                return client_of(value)
+        return id(self)
+
     def _reply(self, cycle: Any, status: int, headers: Any, body: bytes) -> bool:
         """Write a whole reply; return False where that has to wait, since the client does not read."""
         if cycle.disconnected or cycle.response_started or cycle.flow.write_paused:
@@ -392,7 +399,7 @@ class TimedProtocol(HttpToolsProtocol):
             pieces += (name, b": ", value, b"\r\n")
         pieces += (b"\r\n" if cycle.keep_alive else b"connection: close\r\n\r\n", body)
         cycle.response_started = cycle.response_complete = True
-        self._turn.write(self.transport, b"".join(pieces))
+        self._turn.write(self, self.transport, b"".join(pieces))
         cycle.message_event.set()
         if not cycle.keep_alive:
             self._turn.flush()

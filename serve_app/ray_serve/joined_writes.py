@@ -14,7 +14,7 @@ import asyncio
 import threading
 from typing import Any
 
-from rlservo.serve_app.ray_serve.busy_polling import BusyPolling
+from rlservo.serve_app.ray_serve.busy_polling import BusyPolling, Connection
 
 MOST_HELD = 16  # replies: the first of them waits for the last
 INFORMATIONAL = b"HTTP/1.1 1"  # 100 Continue: the client waits for it before it sends the body
@@ -30,8 +30,8 @@ class Turn:
         self._several = False  # in the turn before
         self._held: list[tuple[Any, bytes]] = []
 
-    def write(self, transport: Any, reply: bytes) -> None:
-        """Write a reply, now or at the end of the turn."""
+    def write(self, connection: Connection, transport: Any, reply: bytes) -> None:
+        """Write a connection's reply, now or at the end of the turn."""
         if not self._several:
             transport.write(reply)
         else:
@@ -42,7 +42,7 @@ class Turn:
         if self._replies == 0:
             self.loop.call_soon(self._end)
         self._replies += 1
-        self.polling.note_reply(transport)
+        self.polling.note_reply(connection)
 
     def flush(self) -> None:
         """Write what is held."""
@@ -74,10 +74,10 @@ def turn_of(loop: asyncio.AbstractEventLoop) -> Turn:
 class JoinedWrites:
     """A connection's transport for replies: holds the head until the first piece of the body, writes both at once."""
 
-    __slots__ = ("_transport", "_turn", "head")
+    __slots__ = ("_connection", "_transport", "_turn", "head")
 
-    def __init__(self, transport: Any, turn: Turn) -> None:
-        self._transport, self._turn = transport, turn
+    def __init__(self, connection: Connection, transport: Any, turn: Turn) -> None:
+        self._connection, self._transport, self._turn = connection, transport, turn
         self.head: bytes | None = None
         """The reply's head, while it is held: None before it came (set so to begin a reply), empty once written."""
 
@@ -86,7 +86,7 @@ class JoinedWrites:
         head = self.head
         if head:
             self.head = b""
-            self._turn.write(self._transport, head + data)
+            self._turn.write(self._connection, self._transport, head + data)
         elif head is None and not data.startswith(INFORMATIONAL):
             self.head = data
         else:

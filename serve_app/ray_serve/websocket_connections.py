@@ -65,6 +65,10 @@ class BoundedStream(WebSocketsSansIOProtocol):
         self.client = self.client or ASKER
         self._polling = turn_of(self.loop).polling
 
+    def client_id(self) -> object:
+        """Return who asks: a WebSocket is one client's, through a proxy, too."""
+        return id(self)
+
     def connection_lost(self, exc: Exception | None) -> None:
         """Say so."""
         super().connection_lost(exc)
@@ -176,7 +180,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
         else:
             head = b"\x82\x7f" + size.to_bytes(8, "big")
         self.transport.write(head + content)
-        self._polling.note_reply(self.transport)  # after it: the client waits for the frame
+        self._polling.note_reply(self)  # after it: the client waits for the frame
 
     async def receive(self) -> Message:  # type: ignore[override]
         """Return the next message; others have their turn before one that has come already."""

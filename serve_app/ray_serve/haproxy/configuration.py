@@ -39,7 +39,7 @@ from rlservo.serve_app.ray_serve.haproxy.error_replies import (
     UNREACHABLE,
 )
 from rlservo.serve_app.wire.replica_sockets import socket_path
-from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
+from rlservo.serve_app.wire.request_stamp import STAMP, stamp_format
 
 ACTING = "{ path_end /act /infer /ModelInfer }"
 CONNECT_TIMEOUT_MS = 250
@@ -120,7 +120,7 @@ def bridge_configuration(text: str, *, hung_since: float | None = None) -> str:
     What comes in the beginning may have waited since a HAProxy hung (`hung_since`, `time.time`).
     """
     if hung_since is not None:
-        stamp = f"http-request set-header {STAMP} {hung_since * 1e3:.0f}-{clock_id()}-%[rand]"
+        stamp = f"http-request set-header {STAMP} {stamp_format(f'{hung_since * 1e3:.0f}')}"
         until = f"if {{ date(0,ms) -m int lt {time.time() * 1e3 + SETTLE_MS:.0f} }}"
         own = rf"^( *)http-request set-header {STAMP} .*$"
         text = _replace(text, own, rf"\g<0>\n\1{stamp} {until}", "the stamp", times=1 + _has_grpc(text))
@@ -225,7 +225,7 @@ def _by_unix_sockets(text: str) -> str:
 
 def _stamp(text: str) -> str:
     """Note on every request when it came. A body that is slow to come waits for itself, so only after it."""
-    stamp = f"    http-request set-header {STAMP} %[date(0,ms)]-{clock_id()}-%[rand]"
+    stamp = f"    http-request set-header {STAMP} {stamp_format('%[date(0,ms)]')}"
     text = _insert(text, "http", f"    http-request wait-for-body time {REQUEST_TIMEOUT_S}s\n{stamp}")
     if not _has_grpc(text):
         return text

@@ -23,6 +23,16 @@ def run(request: pytest.FixtureRequest) -> Callable[[Coroutine[Any, Any, Any]], 
     return asyncio.run if request.param == "asyncio" else uvloop.run
 
 
+class Client:
+    """A connection that is one client's."""
+
+    def client_id(self) -> object:
+        return id(self)
+
+
+CLIENT = Client()
+
+
 class Counted(BusyPolling):
     """Counts how often the loop was kept awake."""
 
@@ -34,7 +44,7 @@ class Counted(BusyPolling):
         self.polls += 1
         super()._poll()
 
-    async def has_begun(self, *connections: object) -> bool:
+    async def has_begun(self, *connections: Client) -> bool:
         """Whether the loop was kept awake after a turn with replies on these connections, in moments of no length."""
         before = self.polls
         for connection in connections:
@@ -53,11 +63,11 @@ def test_the_loop_stays_awake_until_a_request_is_answered(run: Any, awake_s: Cal
     async def turns() -> None:
         polling = Counted()
         for _ in range(2):
-            polling.note_reply(run)
+            polling.note_reply(CLIENT)
             await asyncio.sleep(0.02)
         assert polling.polls > 20
         awake_s(0.0)
-        polling.note_reply(run)  # the request has come; after this reply it is looked for once more, in vain
+        polling.note_reply(CLIENT)  # the request has come; after this reply it is looked for once more, in vain
         await asyncio.sleep(0.02)
         over = polling.polls
         await asyncio.sleep(0.02)
@@ -71,7 +81,7 @@ def test_the_loop_sleeps_when_nothing_has_come_in_time(run: Any, awake_s: Callab
     async def turns() -> None:
         polling = Counted()
         for _ in range(2):
-            polling.note_reply(run)
+            polling.note_reply(CLIENT)
             await asyncio.sleep(0)
         await asyncio.sleep(0.05)
         over = polling.polls
@@ -86,8 +96,8 @@ def test_the_loop_sleeps_when_nothing_has_come_in_time(run: Any, awake_s: Callab
 def test_a_moment_for_nothing_is_tried_ever_more_rarely(run: Any, awake_s: Callable[[float], None]) -> None:
     async def turns() -> list[bool]:
         polling = Counted()
-        await polling.has_begun(run)
-        return [await polling.has_begun(run) for _ in range(400)]
+        await polling.has_begun(CLIENT)
+        return [await polling.has_begun(CLIENT) for _ in range(400)]
 
     awake_s(0.0)
     tried = [number for number, has_begun in enumerate(run(turns())) if has_begun]
@@ -100,17 +110,17 @@ def test_each_that_paid_halves_what_is_skipped_after_the_next_failure(
 ) -> None:
     async def turns() -> list[bool]:
         polling = Counted()
-        await polling.has_begun(run)
+        await polling.has_begun(CLIENT)
         for _ in range(1 + 1 + 1 + 3 + 1):  # three failures with what is skipped between them
-            await polling.has_begun(run)
+            await polling.has_begun(CLIENT)
         awake_s(FOR_EVER)
         for _ in range(7):  # which the third has skipped
-            assert not await polling.has_begun(run)
+            assert not await polling.has_begun(CLIENT)
         for _ in range(3):  # 7, 3, 1 and 0
-            assert await polling.has_begun(run)
+            assert await polling.has_begun(CLIENT)
         awake_s(0.0)
-        await polling.has_begun(run)
-        return [await polling.has_begun(run) for _ in range(3)]
+        await polling.has_begun(CLIENT)
+        return [await polling.has_begun(CLIENT) for _ in range(3)]
 
     awake_s(0.0)
     assert run(turns()) == [False, True, False]
@@ -119,7 +129,7 @@ def test_each_that_paid_halves_what_is_skipped_after_the_next_failure(
 def test_only_a_client_that_had_the_reply_before_keeps_the_loop_awake(
     run: Any, awake_s: Callable[[float], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    a, b = object(), object()
+    a, b = Client(), Client()
 
     async def turns() -> list[bool]:
         polling = Counted()
@@ -132,7 +142,7 @@ def test_only_a_client_that_had_the_reply_before_keeps_the_loop_awake(
 
 
 def test_a_request_of_another_client_is_none_that_it_was_awake_for(run: Any, awake_s: Callable[[float], None]) -> None:
-    a, b = object(), object()
+    a, b = Client(), Client()
 
     async def turns() -> list[bool]:
         polling = Counted()

@@ -18,6 +18,7 @@ from rlservo.serve_app.protocols.http_endpoint import REPLY
 from rlservo.serve_app.ray_serve import ingress
 from rlservo.serve_app.ray_serve.busy_polling import BusyPolling
 from rlservo.serve_app.ray_serve.http_connections import RepeatedHead, TimedProtocol
+from rlservo.serve_app.wire.request_stamp import STAMP, clock_id
 
 IDLE_S = 60
 OUTSIDE = b"by another way"
@@ -175,9 +176,14 @@ def test_a_head_that_comes_again_is_not_searched_for_a_client_again(monkeypatch:
 
 def test_every_reply_is_one_that_the_loop_may_stay_awake_after(monkeypatch: pytest.MonkeyPatch) -> None:
     noted: list[Any] = []
-    monkeypatch.setattr(BusyPolling, "note_reply", lambda _, connection: noted.append(connection))
-    written = replies([request(b"%d" % number) for number in range(4)], [1] * 4)
-    assert written.count(b"200 OK") == len(noted) == 4 and len(set(noted)) == 1
+    monkeypatch.setattr(BusyPolling, "note_reply", lambda _, connection: noted.append(connection.client_id()))
+    pieces = [request(b"%d" % number) for number in range(4)]
+    assert replies(pieces, [1] * 4).count(b"200 OK") == len(noted) == 4 and len(set(noted)) == 1
+    noted.clear()
+    stamps = [f"{STAMP}: {1764126123456 + at}-{clock_id()}-{port}-{at}" for at, port in enumerate([4711] * 4 + [4712])]
+    pieces = [request(b"1", "/act", stamp) for stamp in stamps]
+    assert replies(pieces, [1] * 5).count(b"200 OK") == 5  # of a proxy, whose client the stamp tells
+    assert noted == [b"4711"] * 4 + [b"4712"]
 
 
 def test_requests_sent_ahead_are_all_answered(repeated: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
