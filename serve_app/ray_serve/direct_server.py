@@ -207,6 +207,10 @@ class DirectConnection(TimedProtocol):
             self._stamp = None
         super().on_headers_complete()
 
+    def client_id(self) -> object:
+        """Return who asks: here a stamp is the client's own word."""
+        return id(self)
+
     def drain(self) -> None:
         """End the connection with the next reply, or with the one that is being made."""
         if self.cycle is not None and not self.cycle.response_complete:

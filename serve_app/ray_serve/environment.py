@@ -56,7 +56,8 @@ HAPROXY = {
     # Its log lines per request cost a Python process that reads them.
     "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
     # A replica that dies leaves requests unanswered: another one answers them, since acting changes nothing.
-    # More tries than errors after which HAProxy gives up on a replica (3, Ray's default), for about 5 s.
+    # More tries than errors after which HAProxy gives up on a replica (3, Ray's default): over TCP for about 5 s, over
+    # a Unix socket at once, where a refusal is known at once.
     "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
     "RAY_SERVE_HAPROXY_RETRIES": "20",
     # Whenever a replica comes or goes, Serve replaces HAProxy. The old one keeps the WebSockets that it carries
@@ -114,6 +115,7 @@ def ray_environment(
 ) -> dict[str, str]:
     """Return the environment of `rlservo serve`'s own cluster: this process's, without its Ray settings, with ours."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    environment.pop(replica_sockets.VARIABLE, None)  # another server's, whose child this is
     environment.update(
         {
             MARK: mark,

@@ -38,8 +38,8 @@ from rlservo.serve_app.ray_serve.uvicorn_parts import (
     RequestResponseCycle,
     auto,
 )
-from rlservo.serve_app.ray_serve.websocket_connections import BoundedStream
-from rlservo.serve_app.wire.replica_sockets import ASKER
+from rlservo.serve_app.ray_serve.websocket_connections import UNREAD_S, BoundedStream
+from rlservo.serve_app.wire.replica_sockets import ASKER, is_unix
 from rlservo.serve_app.wire.request_stamp import STAMP, client_of
 
 if TYPE_CHECKING:
@@ -53,8 +53,6 @@ BODY_S = 30.0
 """[s] for a body, where a route has no time of its own (`body_timeout_s`); never less (`leave_time_for_bodies`)."""
 LINGER_S = 1.0
 """[s] in which a client that still sends may take the reply: closed at once, what it sends would destroy the reply."""
-UNREAD_S = 10.0
-"""[s] that sent bytes may wait for a client that does not read."""
 MOST_LESSONS = 8
 """Heads of a connection that are looked at for whether the next is the same: a client may change it every time."""
 CHECK_PERIOD_S = 1.0
@@ -175,7 +173,7 @@ class TimedProtocol(HttpToolsProtocol):
     """A connection that ends when one of its phases takes too long, and writes each reply at once."""
 
     body_s = BODY_S
-    find: Callable[[Scope], ASGIApp | None] = staticmethod(lambda _: None)
+    find_app: Callable[[Scope], ASGIApp | None] = staticmethod(lambda _: None)
     """Finds what answers a request, once it is whole, without waiting for anything; None for all others."""
     _head_since: float | None = None  # since when a head is awaited; None while something else is
     _idle_since: float | None = None  # since when nothing has come after a reply
@@ -197,7 +195,7 @@ class TimedProtocol(HttpToolsProtocol):
         """Begin to wait for the first head."""
         super().connection_made(transport)
         connection = transport.get_extra_info("socket")
-        if self.client is None:
+        if is_unix(transport):
             self.client = ASKER
         elif connection is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
             # The kernel ends the connection, whoever else still holds it: uvicorn's WebSockets, too.
@@ -363,10 +361,6 @@ class TimedProtocol(HttpToolsProtocol):
                 return
         super()._start_asgi_task(cycle, app)
 
-    def find_app(self, scope: Scope) -> ASGIApp | None:
-        """Return what answers a request, once it is whole, without waiting for anything; None for all others."""
-        return self.find(scope)
-
     def _answer(self, cycle: Any, body: bytes, app: ASGIApp) -> bool:
         """Answer a request that is whole; return whether that is over, and nothing uses `cycle` any more."""
 
@@ -467,5 +461,5 @@ def install(find: Callable[[Scope], ASGIApp | None]) -> None:
     if auto.AutoHTTPProtocol is TimedProtocol:
         return
     uvicorn_parts.check()
-    TimedProtocol.find = staticmethod(find)
+    TimedProtocol.find_app = staticmethod(find)
     auto.AutoHTTPProtocol = TimedProtocol

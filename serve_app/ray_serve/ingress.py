@@ -73,7 +73,10 @@ class ServeBypass:
         self._app, self._thread, self.answers = app, threading.get_ident(), answers
 
     def find(self, scope: Scope) -> ASGIApp | None:
-        """Return what answers a connection in Serve's place, None for all that Serve handles."""
+        """Return what answers a connection in Serve's place, None for all that Serve handles.
+
+        Where that is nothing but a refusal, the request counts as turned away with this call.
+        """
         app = self._app
         if app is None or threading.get_ident() != self._thread:
             return None

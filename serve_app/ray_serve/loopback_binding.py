@@ -1,4 +1,4 @@
-"""Ports that Ray Serve's processes open for each other, bound to loopback.
+"""Ports that Ray Serve's processes open for each other, bound to loopback or replaced by Unix sockets.
 
 A server of one machine needs one port that others reach: HAProxy's, or without HAProxy that of Serve's own proxy. Serve
 (ray 2.60) binds the replicas' HTTP ports and the fallback proxy's where the public port is, and gRPC ports to every
@@ -59,13 +59,30 @@ def _on_loopback(add: Any) -> Any:
     def add_on_loopback(server: Any, address: str) -> Any:
         port = address.rpartition(":")[2]
         path = None if port == "0" else socket_path(port)
-        return add(server, f"{LOOPBACK}:{port}" if path is None else f"unix:{path}")
+        if path is None:
+            return add(server, f"{LOOPBACK}:{port}")
+        try:
+            _vacate(path)
+        except OSError as error:  # gRPC itself would take it over, and remove it when the other one stops
+            raise RuntimeError(f"port {port} cannot be had") from error
+        return add(server, f"unix:{path}")
 
     return add_on_loopback
 
 
+def _vacate(path: str) -> None:
+    """Remove the socket that a killed process left at a path. Raises OSError where somebody listens, as on a port."""
+    with socket.socket(socket.AF_UNIX) as other:
+        other.setblocking(False)
+        error = other.connect_ex(path)
+    if error == errno.ECONNREFUSED:
+        Path(path).unlink()
+    elif error != errno.ENOENT:
+        raise OSError(errno.EADDRINUSE, os.strerror(errno.EADDRINUSE), path)
+
+
 class _LoopbackSocket(socket.socket):
-    """A TCP socket that binds its port on loopback, whatever address it is given, or a Unix socket in its place."""
+    """Binds a port on loopback, whatever address it is given, or a Unix socket in its place."""
 
     def __init__(self, family: int, kind: int) -> None:
         super().__init__(family if socket_path(0) is None else socket.AF_UNIX, kind)
@@ -75,12 +92,10 @@ class _LoopbackSocket(socket.socket):
         if path is None:
             super().bind((LOOPBACK, address[1]))
             return
-        with socket.socket(socket.AF_UNIX) as other:
-            other.setblocking(False)
-            if other.connect_ex(path) == errno.ECONNREFUSED:  # nobody listens: it is what a killed process left
-                Path(path).unlink()
+        _vacate(path)
         super().bind(path)
         Path(path).chmod(0o600)
+        self.listen()  # or another one would take it for a dead one's: uvicorn listens a turn later
 
 
 class _Sockets:

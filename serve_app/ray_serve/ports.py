@@ -102,8 +102,6 @@ def claim_port(port: int) -> bool:
     Seconds pass between the choice of a port and whoever listens there, and another server may be starting meanwhile.
     The claim is a socket's name in the same network namespace as the port, which goes with its process.
     """
-    if port in _claimed:
-        return is_free(port)
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
         claim.bind(f"\0rlservo-port-{port}")

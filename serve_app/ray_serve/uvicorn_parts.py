@@ -23,7 +23,6 @@ def refusal(name: str) -> RuntimeError:
 
 
 try:
-    from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
     from uvicorn.protocols.http import auto
     from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
     from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
@@ -39,7 +38,6 @@ __all__ = [
     "OPEN",
     "STATUS_LINE",
     "HttpToolsProtocol",
-    "ProxyHeadersMiddleware",
     "RequestResponseCycle",
     "WebSocketsSansIOProtocol",
     "apply_mask",
@@ -69,18 +67,17 @@ METHODS: dict[type, tuple[str, ...]] = {
 
 FIELDS: dict[type, tuple[str, ...]] = {
     HttpToolsProtocol: (
-        *("access_log", "access_logger", "app", "config", "cycle", "flow", "headers", "logger", "loop", "parser"),
-        *("pipeline", "scope", "server_state", "tasks", "timeout_keep_alive", "transport"),
+        *("access_log", "access_logger", "app", "client", "config", "cycle", "flow", "headers", "logger", "loop"),
+        *("parser", "pipeline", "scope", "server_state", "tasks", "timeout_keep_alive", "transport"),
         "ws_protocol_class",
     ),
-    ProxyHeadersMiddleware: ("app",),
     RequestResponseCycle: (
         *("body", "chunked_encoding", "default_headers", "disconnected", "expected_content_length", "flow"),
         *("keep_alive", "message_event", "more_body", "on_response", "response_complete", "response_started"),
         *("scope", "transport"),
     ),
     WebSocketsSansIOProtocol: (
-        *("close_sent", "conn", "disconnected", "handshake_initiated", "loop", "queue", "read_paused"),
+        *("client", "close_sent", "conn", "disconnected", "handshake_initiated", "loop", "queue", "read_paused"),
         *("transport", "writable"),
     ),
 }

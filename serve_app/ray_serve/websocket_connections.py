@@ -23,12 +23,14 @@ from rlservo.serve_app.ray_serve.uvicorn_parts import (
     WebSocketsSansIOProtocol,
     apply_mask,  # pyright: ignore[reportPrivateImportUsage]
 )
-from rlservo.serve_app.wire.replica_sockets import ASKER
+from rlservo.serve_app.wire.replica_sockets import ASKER, is_unix
 
 if TYPE_CHECKING:
     from starlette.types import Message
     from websockets.frames import Frame
 
+UNREAD_S = 10.0
+"""[s] that sent bytes may wait for a client that does not read."""
 PIECE_BYTES = 16384
 """Of a WebSocket, between two checks of how much has come: uvloop reads 256 KB at once, which are 40,000 frames."""
 MOST_AHEAD = 64
@@ -51,7 +53,8 @@ class BoundedStream(WebSocketsSansIOProtocol):
     _is_at_frame = False  # whether what is read next begins a frame
     _answer: Callable[[Message], Awaitable[Message]] | None = None  # the application's, for a message at once
     _is_awaited = False  # whether the application waits for a message
-    _turn: asyncio.Task[None] | None = None  # the rest of an answer that has to wait
+    _rest: asyncio.Task[None] | None = None  # of an answer that has to wait
+    _unread_timer: asyncio.TimerHandle | None = None
     _failure: BaseException | None = None  # of an answer that was begun
 
     def __init__(self, *arguments: Any, on_lost: Callable[[], None] | None = None, **more: Any) -> None:
@@ -60,10 +63,12 @@ class BoundedStream(WebSocketsSansIOProtocol):
         self._on_lost = on_lost
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take HAProxy for who asks where the socket has no address."""
+        """Over a Unix socket take HAProxy for who asks, and look for whether it reads, as TCP would."""
         super().connection_made(transport)
-        self.client = self.client or ASKER
         self._polling = turn_of(self.loop).polling
+        if is_unix(transport):
+            self.client = ASKER
+            self._check_unread(0)
 
     def client_id(self) -> object:
         """Return who asks: a WebSocket is one client's, through a proxy, too."""
@@ -71,6 +76,8 @@ class BoundedStream(WebSocketsSansIOProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Say so."""
+        if self._unread_timer is not None:
+            self._unread_timer.cancel()
         super().connection_lost(exc)
         if self._on_lost is not None:
             self._on_lost()
@@ -144,8 +151,8 @@ class BoundedStream(WebSocketsSansIOProtocol):
         try:
             await super().run_asgi()
         finally:  # what it began ends with it, and no cycle of references is left
-            if self._turn is not None:
-                self._turn.cancel()
+            if self._rest is not None:
+                self._rest.cancel()
             scope.pop(AT_ONCE, None)
             self._answer = None
 
@@ -153,8 +160,8 @@ class BoundedStream(WebSocketsSansIOProtocol):
         self._answer = answer
 
     def _begin(self, answer: Callable[[Message], Awaitable[Message]], event: Message) -> None:
-        self._turn = start_at_once(self._take_turn(answer, event), self.loop)
-        if self._turn is not None or self._failure is not None:
+        self._rest = start_at_once(self._take_turn(answer, event), self.loop)
+        if self._rest is not None or self._failure is not None:
             wake: Any = {"type": WAKE}
             self.queue.put_nowait(wake)
 
@@ -192,14 +199,25 @@ class BoundedStream(WebSocketsSansIOProtocol):
                 message: Any = await super().receive()
             finally:
                 self._is_awaited = False
-            if self._turn is not None:
-                await self._turn
-                self._turn = None
+            if self._rest is not None:
+                await self._rest
+                self._rest = None
             if self._failure is not None:
                 failure, self._failure = self._failure, None
                 raise failure
             if message["type"] != WAKE:
                 return message  # type: ignore[no-any-return]
+
+    def _check_unread(self, before: int) -> None:
+        """End the connection, however it was closed, where none of what is to be written is taken (TCP_USER_TIMEOUT).
+
+        `before` is how many bytes that were at the last look.
+        """
+        left = self.transport.get_write_buffer_size()
+        if left >= before > 0:
+            self.transport.abort()
+        else:
+            self._unread_timer = self.loop.call_later(UNREAD_S, self._check_unread, left)
 
     def _count(self) -> None:
         now = self.loop.time()

@@ -7,13 +7,21 @@ port would be 30000 has the file `30000.sock` in the folder that the variable na
 from __future__ import annotations
 
 import os
+import socket
+from typing import Any
 
 VARIABLE = "RLSERVO_REPLICA_SOCKETS"
 ASKER = ("127.0.0.1", 0)
-"""Who asks by a socket that has no address: HAProxy, whose word for whom it asks uvicorn takes from this machine."""
+"""Who asks over a Unix socket: HAProxy, whose word for whom it asks uvicorn takes, as from this machine."""
 
 
 def socket_path(port: int | str) -> str | None:
     """Return the path of the socket in a port's place; None where TCP is meant."""
     folder = os.environ.get(VARIABLE)
     return None if folder is None else f"{folder}/{port}.sock"
+
+
+def is_unix(transport: Any) -> bool:
+    """Whether a connection came over a Unix socket. (A TCP connection that was reset has no address either.)"""
+    connection = transport.get_extra_info("socket")
+    return connection is not None and connection.family == socket.AF_UNIX

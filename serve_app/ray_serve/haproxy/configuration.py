@@ -13,7 +13,7 @@ What Ray's (2.60, `haproxy_templates.py` there) lacks:
   tried again elsewhere (`RAY_SERVE_HAPROXY_RETRY_ON`), but only what HAProxy had seen whole before it passed it on:
   a client that sends head and body apart got nothing. So it waits for a body, or for what fits its buffer. Where a
   connection breaks it waits a second, or the time it gives a connection, before it tries another replica: a quarter
-  is enough, with four times the retries.
+  is enough, with four times the retries. (That a Unix socket is nobody's it knows at once, and goes on at once.)
 - A replica that hangs keeps what it was sent. HAProxy closes what it has open there as soon as the replica's health
   checks fail, asks another one or answers 503, and 504 where an action takes too long. Every request is stamped with
   when it came (`STAMP`), so that a replica knows how old an observation is that waited elsewhere.

@@ -71,7 +71,7 @@ class PassedFiles:
 def bypass(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServeBypass]:
     """The process's bypass, for one test, and what connections of replicas answer at once by it."""
     monkeypatch.setattr(ingress_module, "bypass", ServeBypass())
-    monkeypatch.setattr(TimedProtocol, "find", staticmethod(ingress_module.find_at_once))
+    monkeypatch.setattr(TimedProtocol, "find_app", staticmethod(ingress_module.find_at_once))
     yield ingress_module.bypass
 
 

@@ -18,10 +18,12 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import grpc
 import pytest
 
 from rlservo.serve_app.ray_serve import environment as environment_module
@@ -488,17 +490,45 @@ def test_a_server_makes_its_folder_where_sockets_and_configurations_can_be(
 
 def test_a_port_in_a_folder_is_a_socket_of_this_user_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(replica_sockets.VARIABLE, str(tmp_path))
+    path, address = tmp_path / "30000.sock", ("0.0.0.0", 30000)
+
+    def listening() -> socket.socket:
+        return loopback_binding.SOCKETS.socket(socket.AF_INET, socket.SOCK_STREAM)
+
     for _ in range(2):  # the second finds what a killed replica left
-        with loopback_binding.SOCKETS.socket(socket.AF_INET, socket.SOCK_STREAM) as listening:
-            listening.bind(("0.0.0.0", 30000))
-            listening.listen(0)
-            assert listening.getsockname() == str(tmp_path / "30000.sock")
-            assert (tmp_path / "30000.sock").stat().st_mode & 0o777 == 0o600
+        with listening() as one:
+            one.bind(address)
+            assert one.getsockname() == str(path) and path.stat().st_mode & 0o777 == 0o600
+            one.listen(0)
             for _ in range(3):  # also of a replica that hangs, and has more to take than it can
-                with loopback_binding.SOCKETS.socket(socket.AF_INET, socket.SOCK_STREAM) as another:
-                    with pytest.raises(OSError) as raised:
-                        another.bind(("0.0.0.0", 30000))
-                    assert raised.value.errno == errno.EADDRINUSE
+                with listening() as another, pytest.raises(OSError) as raised:
+                    another.bind(address)
+                assert raised.value.errno == errno.EADDRINUSE
+
+
+def test_grpc_gets_a_socket_that_nobody_listens_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(replica_sockets.VARIABLE, str(tmp_path))
+    add = loopback_binding._on_loopback(lambda server, address: server.add_insecure_port(address))
+    with ThreadPoolExecutor(1) as pool:
+        first, second = grpc.server(pool), grpc.server(pool)
+        assert add(first, "[::]:40000") and add(second, "[::]:0") > 1024  # Serve's own, between replicas
+        with pytest.raises(RuntimeError, match="port 40000 cannot be had") as raised:
+            add(second, "[::]:40000")
+        assert isinstance(raised.value.__cause__, OSError) and raised.value.__cause__.errno == errno.EADDRINUSE
+        first.start()
+        first.stop(None).wait()
+        with socket.socket(socket.AF_UNIX) as killed:
+            killed.bind(str(tmp_path / "40000.sock"))
+        assert add(second, "[::]:40000")
+        second.stop(None).wait()
+
+
+def test_a_server_without_haproxy_has_no_sockets_of_the_server_that_started_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(replica_sockets.VARIABLE, "/tmp/another")
+    assert replica_sockets.VARIABLE not in ray_environment(tmp_path, haproxy=None, mark="test")
+    assert ray_environment(tmp_path, haproxy="/bin/true", mark="test")[replica_sockets.VARIABLE] == str(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import http.client
 import json
 import random
@@ -12,6 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,10 +21,11 @@ import uvicorn
 from uvicorn.protocols.http import auto, httptools_impl
 from uvicorn.server import ServerState
 
-from rlservo.serve_app.ray_serve import http_connections, uvicorn_parts
+from rlservo.serve_app.ray_serve import http_connections, uvicorn_parts, websocket_connections
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 from rlservo.serve_app.ray_serve.ingress import Ingress
 from rlservo.serve_app.ray_serve.websocket_connections import BoundedStream
+from rlservo.serve_app.wire.replica_sockets import ASKER
 
 SOON_S = 10.0  # a busy machine's
 HANDSHAKE = (
@@ -53,6 +56,21 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
     await send({"type": "http.response.body", "body": body})
 
 
+@contextlib.contextmanager
+def running(listener: socket.socket) -> Iterator[uvicorn.Server]:
+    config = uvicorn.Config(Ingress(app), http=TimedProtocol, log_level="critical", lifespan="off")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        while not server.started:
+            time.sleep(0.01)
+        yield server
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[uvicorn.Server]:
     """A server whose phases end after a second."""
@@ -60,18 +78,8 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[uvicorn.Server]:
     monkeypatch.setattr(TimedProtocol, "body_s", 1.0)
     monkeypatch.setattr(http_connections, "UNREAD_S", 1.0)
     monkeypatch.setattr(http_connections, "CHECK_PERIOD_S", 0.2)
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        config = uvicorn.Config(Ingress(app), http=TimedProtocol, log_level="critical", lifespan="off")
-        server = uvicorn.Server(config)
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
-        try:
-            while not server.started:
-                time.sleep(0.01)
-            yield server
-        finally:
-            server.should_exit = True
-            thread.join()
+    with socket.create_server(("127.0.0.1", 0)) as listener, running(listener) as server:
+        yield server
 
 
 @pytest.fixture
@@ -142,6 +150,56 @@ def test_many_replies_at_once_are_not_lost(port: int) -> None:
         for connection in made:
             connection.sendall(head)
         assert all(rest(connection).endswith(b"no") for connection in made)
+
+
+@pytest.mark.parametrize("closes", [False, True])
+def test_nor_is_a_stream_over_a_unix_socket_kept(closes: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no kernel ends it; also when it is closing, which waits for what is to be written."""
+    monkeypatch.setattr(websocket_connections, "UNREAD_S", 0.5)
+    mask, size = bytes(4), 1 << 20
+    frame = b"\x82\xff" + size.to_bytes(8, "big") + mask + bytes(size)
+    with socket.socket(socket.AF_UNIX) as listener, socket.socket(socket.AF_UNIX) as client:
+        listener.bind(str(tmp_path / "s"))
+        with running(listener) as server:
+            client.settimeout(SOON_S)
+            client.connect(str(tmp_path / "s"))
+            client.sendall(f"GET / HTTP/1.1\r\nhost: x\r\n{HANDSHAKE}\r\n".encode())
+            assert client.recv(65536).startswith(b"HTTP/1.1 101")
+            client.sendall(frame)
+            if closes:
+                client.sendall(b"\x88\x80" + mask)
+            deadline = time.monotonic() + SOON_S
+            while server.server_state.connections:
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+
+
+@pytest.mark.parametrize(("family", "client"), [(socket.AF_INET, None), (socket.AF_UNIX, ASKER)])
+@pytest.mark.parametrize("protocol", [TimedProtocol, BoundedStream])
+def test_a_connection_that_was_reset_is_not_taken_for_haproxys(
+    protocol: type[TimedProtocol | BoundedStream], family: socket.AddressFamily, client: Any
+) -> None:
+    class Reset(socket.socket):
+        def getpeername(self) -> Any:
+            raise OSError(errno.ENOTCONN, "not connected")
+
+    class Transport(asyncio.Transport):
+        def get_write_buffer_size(self) -> int:
+            return 0
+
+        def close(self) -> None: ...
+
+    async def run() -> Any:
+        config = uvicorn.Config(Ingress(app), log_level="critical", lifespan="off")
+        config.load()
+        with Reset(family) as connection:
+            made = protocol(config=config, server_state=ServerState(), app_state={})
+            made.connection_made(Transport({"socket": connection}))
+            found = made.client
+            made.connection_lost(None)
+        return found
+
+    assert asyncio.run(run()) == client
 
 
 def test_a_client_that_does_not_read_is_left(port: int, server: uvicorn.Server) -> None:
