@@ -472,6 +472,7 @@ def test_replicas_of_one_machine_are_asked_by_unix_sockets(tmp_path: Path, monke
     assert is_valid(mended, tmp_path) == ""
     addresses = re.findall(r"^ *server \S+ (\S+)", mended, re.MULTILINE)
     assert len(addresses) == 4 and set(addresses) == {f"unix@{tmp_path}/{port}.sock" for port in (1, 2)}
+    assert f"tune.maxaccept {configuration.MAX_ACCEPT}\n" in mended
     elsewhere = text.replace("rlservo-a 127.0.0.1:1 check", "rlservo-a 10.0.0.1:1 check")
     with pytest.raises(configuration.TemplateError, match=r"a server's address is there [0-3] times, not 4"):
         configuration.patch_configuration(elsewhere, tmp_path)
