@@ -25,7 +25,7 @@ from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.ray_serve import direct_port, direct_server, http_connections
-from rlservo.serve_app.ray_serve.direct_server import DirectServer
+from rlservo.serve_app.ray_serve.direct_server import DirectConnection, DirectServer
 from rlservo.serve_app.ray_serve.http_connections import TimedProtocol
 from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.runtime.options import PolicyOptions
@@ -33,6 +33,7 @@ from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import load_policy
 from rlservo.serve_app.wire.direct_offer import OFFER, find_offer, make_offer
+from rlservo.serve_app.wire.request_stamp import STAMP
 from servers import over_uvicorn
 from stores import store_of
 
@@ -493,3 +494,11 @@ def test_a_port_that_is_taken_is_refused_with_a_sentence(tmp_path: Path) -> None
             pass
         with pytest.raises(UsageError, match=f"direct port {number}"):
             direct_port.open_port("127.0.0.1", number)
+
+
+def test_a_stamp_does_not_say_here_who_asks() -> None:
+    """Many connections that say the same would keep a replica awake for all of them."""
+    connection = object.__new__(DirectConnection)
+    connection.headers = [(STAMP.encode(), b"1764126123456-clock-4711-1")]
+    assert connection.client_id() == id(connection)
+    assert TimedProtocol.client_id(connection) == b"4711"
