@@ -55,6 +55,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
     _is_awaited = False  # whether the application waits for a message
     _rest: asyncio.Task[None] | None = None  # of an answer that has to wait
     _unread_timer: asyncio.TimerHandle | None = None
+    _has_sent = False  # since the last look for whether the client reads
     _failure: BaseException | None = None  # of an answer that was begun
 
     def __init__(self, *arguments: Any, on_lost: Callable[[], None] | None = None, **more: Any) -> None:
@@ -175,6 +176,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
         """Send a message; a binary one as a frame of its own."""
         if not self.writable.is_set():  # until the client reads, or has gone
             await self.writable.wait()
+        self._has_sent = True
         content = message.get("bytes")
         if content is None or self.close_sent or self.disconnected or self.conn.state is not OPEN:
             await super().send(message)
@@ -211,10 +213,11 @@ class BoundedStream(WebSocketsSansIOProtocol):
     def _check_unread(self, before: int) -> None:
         """End the connection, however it was closed, where none of what is to be written is taken (TCP_USER_TIMEOUT).
 
-        `before` is how many bytes that were at the last look.
+        `before` is how many bytes that were at the last look. Where more has been sent since, some may have been taken:
+        for a client that reads nothing, nothing is sent any more when enough waits.
         """
-        left = self.transport.get_write_buffer_size()
-        if left >= before > 0:
+        left, has_sent, self._has_sent = self.transport.get_write_buffer_size(), self._has_sent, False
+        if left >= before > 0 and not has_sent:
             self.transport.abort()
         else:
             self._unread_timer = self.loop.call_later(UNREAD_S, self._check_unread, left)

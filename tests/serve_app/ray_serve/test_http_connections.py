@@ -174,6 +174,35 @@ def test_nor_is_a_stream_over_a_unix_socket_kept(closes: bool, tmp_path: Path, m
                 time.sleep(0.05)
 
 
+def test_a_stream_whose_client_reads_slowly_is_kept() -> None:
+    """What is taken may be as much as has been sent meanwhile."""
+
+    class Transport(asyncio.Transport):
+        aborted = False
+
+        def get_write_buffer_size(self) -> int:
+            return 70_000
+
+        def abort(self) -> None:
+            self.aborted = True
+
+    async def run() -> None:
+        config = uvicorn.Config(Ingress(app), log_level="critical", lifespan="off")
+        config.load()
+        stream = BoundedStream(config=config, server_state=ServerState(), app_state={})
+        stream.transport = transport = Transport()
+        for _ in range(3):
+            stream._has_sent = True
+            stream._check_unread(70_000)
+        assert not transport.aborted
+        stream._check_unread(70_000)
+        assert transport.aborted
+        assert stream._unread_timer is not None
+        stream._unread_timer.cancel()
+
+    asyncio.run(run())
+
+
 @pytest.mark.parametrize(("family", "client"), [(socket.AF_INET, None), (socket.AF_UNIX, ASKER)])
 @pytest.mark.parametrize("protocol", [TimedProtocol, BoundedStream])
 def test_a_connection_that_was_reset_is_not_taken_for_haproxys(
