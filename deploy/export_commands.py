@@ -33,6 +33,12 @@ def export(
         str | None, typer.Option(help="For which agent, where a module serves several that are filtered differently.")
     ] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+    untrained_filter: Annotated[
+        bool,
+        typer.Option(
+            "--untrained-filter", help="Export even if the observation filter's statistics are empty or evaluation's."
+        ),
+    ] = False,
     metric: Annotated[
         str | None, typer.Option(help="Of a Tune trial or experiment, the checkpoint with the best of this metric.")
     ] = None,
@@ -73,6 +79,7 @@ def export(
                 version=version,
                 description=description,
                 app_dir=app_dir,
+                untrained_filter=untrained_filter,
                 notify=note,
                 progress=status.update,
             )
@@ -86,6 +93,7 @@ def export(
                 module_id=module_id,
                 agent_id=agent_id,
                 app_dir=app_dir,
+                untrained_filter=untrained_filter,
                 notify=note,
                 progress=status.update,
             )

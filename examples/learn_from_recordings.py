@@ -40,7 +40,7 @@ from rlservo import errors
 from rlservo.export.checkpoints.location import (
     ENV_TO_MODULE,
     MODULE_TO_ENV,
-    RUNNERS,
+    TRAINING_RUNNER,
     CheckpointFiles,
     locate_checkpoint,
 )
@@ -233,7 +233,7 @@ def learn(config: AlgorithmConfig, episodes: list[SingleAgentEpisode], epochs: i
             print(f"pass {epoch + 1:>3} of {epochs}  {losses}", flush=True)
         algorithm.save_to_path(str(folder.resolve()))
     # An offline algorithm has no environment runner, and so none of what stands around its module.
-    runner = folder.resolve() / RUNNERS[0]
+    runner = folder.resolve() / TRAINING_RUNNER
     for pipeline, name in ((start.env_to_module, ENV_TO_MODULE), (start.module_to_env, MODULE_TO_ENV)):
         pipeline.save_to_path(str(runner / name), state=pipeline.get_state())  # else it misses pieces without a state
 

@@ -53,7 +53,7 @@ def trained(script: str) -> Path:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that need these checkpoints."""
     for item in items:
-        if {"zoo", "wide_zoo", "old_zoo"} & set(getattr(item, "fixturenames", ())):
+        if {"zoo", "wide_zoo", "old_zoo", "layout_zoo"} & set(getattr(item, "fixturenames", ())):
             item.add_marker("trained")
 
 
@@ -73,3 +73,9 @@ def wide_zoo() -> Path:
 def old_zoo() -> Path:
     """The same for RLlib's old API stack."""
     return trained("train_old_zoo.py")
+
+
+@pytest.fixture(scope="session")
+def layout_zoo() -> Path:
+    """The same for every place where a checkpoint may hold a filter's statistics."""
+    return trained("train_layout_zoo.py")

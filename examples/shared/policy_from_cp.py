@@ -88,11 +88,15 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
     from rlservo.export.checkpoints.location import locate_checkpoint
     from rlservo.export.checkpoints.unpickle import user_code
     from rlservo.export.recipe.recipe import leaf_transform
+    from rlservo.export.rllib.frozen_filter import why_untrained
     from rlservo.export.rllib.restore import restore
 
+    files = locate_checkpoint(path, None)
     with user_code(app_dir) as folder:
-        restored = restore(locate_checkpoint(path, None), folder, print)
+        restored = restore(files, folder, print)
     recipe = restored.recipe
+    if why := why_untrained(files, recipe):
+        print(why)
     for side, ours, theirs in (
         ("observation", recipe.observation_space, env.observation_space),
         ("action", recipe.action_space, env.action_space),

@@ -22,8 +22,7 @@ from rlservo.export.checkpoints.old_location import (
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 
 MODULES = Path("learner_group") / "learner" / "rl_module"
-RUNNERS = ("env_runner", "eval_env_runner")
-"""Where the connectors are; an algorithm that trains from recorded data has a runner only if it was evaluated."""
+TRAINING_RUNNER, EVALUATION_RUNNER = "env_runner", "eval_env_runner"
 ENV_TO_MODULE = "env_to_module_connector"
 MODULE_TO_ENV = "module_to_env_connector"
 CTOR_FILE = "class_and_ctor_args.pkl"
@@ -40,7 +39,8 @@ _TUNE_CHECKPOINT = re.compile(r"checkpoint_(\d{6,})")
 class CheckpointFiles:
     """The folders of one policy in one new-stack algorithm checkpoint, or of one RLModule alone.
 
-    An algorithm that trains from recorded data may have no environment runner, and then no connector folders either.
+    The connector folders are in the local environment runner's, or at the root where training has only remote ones. An
+    algorithm that trains from recorded data has none, or evaluation's.
     """
 
     api_stack: ClassVar[Literal["new"]] = "new"
@@ -63,13 +63,28 @@ class CheckpointFiles:
 
     @property
     def runner(self) -> Path:
-        """The environment runner's folder, which holds the connector pipelines; it may not exist."""
-        return next((self.root / name for name in RUNNERS if (self.root / name).is_dir()), self.root / RUNNERS[0])
+        """The folder that holds the connector pipelines: training's before evaluation's; it may not exist."""
+        if (self.root / TRAINING_RUNNER).is_dir():
+            return self.root / TRAINING_RUNNER
+        if self.has_root_pipelines:
+            return self.root
+        evaluation = self.root / EVALUATION_RUNNER
+        return evaluation if evaluation.is_dir() else self.root / TRAINING_RUNNER
+
+    @property
+    def has_root_pipelines(self) -> bool:
+        """Whether training had only remote environment runners, whose merged connectors RLlib saves at the root."""
+        return any((self.root / name).is_dir() for name in (ENV_TO_MODULE, MODULE_TO_ENV))
 
     @property
     def has_pipelines(self) -> bool:
         """Whether the checkpoint holds the connector pipelines, with what they have learned."""
         return self.runner.is_dir()
+
+    @property
+    def is_of_evaluation(self) -> bool:
+        """Whether only evaluation has filled what the connector pipelines have learned."""
+        return self.runner == self.root / EVALUATION_RUNNER
 
     @property
     def env_to_module(self) -> Path:
@@ -225,11 +240,16 @@ def _check_complete(files: CheckpointFiles) -> None:
         (files.env_to_module, STATE_STEMS["connector"], "the observation filter and other steps before the network"),
         (files.module_to_env, STATE_STEMS["connector"], "the action scaling and other steps after the network"),
     )
+    if (files.root / TRAINING_RUNNER).is_dir() and files.has_root_pipelines:
+        raise CheckpointError(
+            f"{files.root} has connectors both in {TRAINING_RUNNER}/ and at its root, saved by two trainings: only one "
+            "of them belongs to the weights; move the other away"
+        )
     if files.has_pipelines:
         needed += pipelines
     elif not files.alone and not (files.root / CTOR_FILE).is_file():
         raise CheckpointError(
-            f"{files.root} is incomplete: it has neither {RUNNERS[0]}/ (the connector pipelines) nor "
+            f"{files.root} is incomplete: it has neither {TRAINING_RUNNER}/ (the connector pipelines) nor "
             f"{CTOR_FILE} (the configuration they are built from)"
         )
     for folder, stem, what in needed:

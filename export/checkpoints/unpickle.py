@@ -50,6 +50,48 @@ def unpickle(file: Path) -> Any:
         raise CheckpointError(f"{file} cannot be loaded: {reason}") from error
 
 
+def unpickle_plain(file: Path) -> Any:
+    """Return the numbers, texts and containers pickled in `file`; whatever takes code to load is a stand-in.
+
+    For a configuration that names modules which are not there. Raises CheckpointError when the file is damaged.
+    """
+    try:
+        with file.open("rb") as stream:
+            return _PlainUnpickler(stream).load()
+    except Exception as error:  # a damaged pickle raises almost anything
+        raise CheckpointError(f"{file} cannot be loaded: {explain(error)}") from error
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    """Imports nothing."""
+
+    def find_class(self, _module: str, _name: str) -> Any:
+        return _StandIn
+
+    def persistent_load(self, _pid: Any) -> Any:
+        return _StandIn()
+
+
+class _StandIn:
+    """Takes whatever a pickle does to an object, and forgets it."""
+
+    def __new__(cls, *_args: Any, **_kwargs: Any) -> _StandIn:
+        return object.__new__(cls)
+
+    def __init__(self, *_args: Any, **_kwargs: Any) -> None: ...
+
+    def __call__(self, *_args: Any, **_kwargs: Any) -> _StandIn:
+        return _StandIn()
+
+    def __setitem__(self, _key: Any, _value: Any) -> None: ...
+
+    def __setstate__(self, _state: Any) -> None: ...
+
+    def extend(self, _items: Any) -> None: ...
+
+    append = add = extend
+
+
 def explain(error: BaseException) -> str:
     """Return in one clause why loading failed: the file, the code it names, or what that code raised."""
     if isinstance(error, ModuleNotFoundError) and error.name:

@@ -37,7 +37,7 @@ from rlservo.export.contract.bundle import (
     write_golden,
 )
 from rlservo.export.contract.contract import Contract, Distribution, Parity, Provenance, TensorSpec, contract_json
-from rlservo.export.contract.errors import AgentsDifferError, ParityError, UsageError
+from rlservo.export.contract.errors import AgentsDifferError, CheckpointError, ParityError, UsageError
 from rlservo.export.graph.one_thread import one_thread
 from rlservo.export.proof.parity import GraphLoop, Reference, prove, record, record_perturbed, replay, ties
 from rlservo.export.recipe.describe import baked_steps
@@ -82,6 +82,7 @@ class _Options:
     version: str | None
     description: str
     value: bool
+    untrained_filter: bool
     notify: Notify
     progress: Notify
 
@@ -97,6 +98,7 @@ def export_checkpoint(
     agent_id: str | None = None,
     app_dir: str | Path = ".",
     value: bool = True,
+    untrained_filter: bool = False,
     notify: Notify = logger.warning,
     progress: Notify = silent,
 ) -> ExportResult:
@@ -105,7 +107,8 @@ def export_checkpoint(
     `checkpoint` is what `locate_checkpoint` takes, or a URI of such a folder. `name` defaults to the environment's (of
     several policies with the module's behind it), `version` to the next integer after the newest one present.
     `app_dir` holds the user's own classes, if the checkpoint needs any. `value` False leaves the value head out, which
-    other servers compute for each action, too: a third of a small policy's time. `notify` gets one sentence for each
+    other servers compute for each action, too: a third of a small policy's time. `untrained_filter` also exports an
+    observation filter whose statistics are empty, or only evaluation's. `notify` gets one sentence for each
     thing a person should know (by default they are logged), `progress` what is being done.
 
     Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
@@ -113,7 +116,7 @@ def export_checkpoint(
     """
     with fetch(checkpoint, progress) as local:
         files = locate_checkpoint(local, module_id, agent_id)
-        options = _Options(Path(out), name, version, description, value, notify, progress)
+        options = _Options(Path(out), name, version, description, value, untrained_filter, notify, progress)
         return _export([files], options, app_dir, checkpoint)[0]
 
 
@@ -126,6 +129,7 @@ def export_all_modules(
     description: str = "",
     app_dir: str | Path = ".",
     value: bool = True,
+    untrained_filter: bool = False,
     notify: Notify,
     progress: Notify = silent,
 ) -> list[ExportResult]:
@@ -135,7 +139,7 @@ def export_all_modules(
     as for `export_checkpoint`.
     """
     with fetch(checkpoint, progress) as local:
-        options = _Options(Path(out), name, version, description, value, notify, progress)
+        options = _Options(Path(out), name, version, description, value, untrained_filter, notify, progress)
         return _export(locate_modules(local), options, app_dir, checkpoint, name_all=True)
 
 
@@ -191,6 +195,7 @@ def _build(
     from rlservo.export.rllib.restore import restore
 
     restored = restore(files, app_dir, options.notify, value=options.value)
+    _check_filter(files, facts, restored.recipe, options)
     for warning in loose_bounds(restored.recipe):
         options.notify(warning)
     elements = read_elements(facts.env_id, facts.env_config, restored.recipe, options.notify)
@@ -218,6 +223,26 @@ def _build(
         )
         _write_rest(folder, contract, inputs, outputs)
     return folder, ExportResult(target, contract)
+
+
+def _check_filter(files: Files, facts: CheckpointFacts, recipe: Recipe, options: _Options) -> None:
+    """Raise CheckpointError for an observation filter that training has not filled, unless it was asked for."""
+    from rlservo.export.rllib.frozen_filter import why_untrained
+
+    steps = facts.env_steps
+    trained = "how long training took is unknown" if steps is None else f"training took {steps:,} environment steps"
+    if why := why_untrained(files, recipe):
+        if not options.untrained_filter:
+            raise CheckpointError(
+                f"{files.root}: {why}; {trained}. Give --untrained-filter to export what the checkpoint holds, or "
+                "train on and save again"
+            )
+        options.notify(f"{why}; {trained}")
+    elif recipe.filter is not None and steps is not None and recipe.filter.count < steps / 2:
+        options.notify(
+            f"the observation filter's statistics are of {recipe.filter.count:,} observations; {trained}: those that "
+            "acted in training had seen more than the checkpoint holds"
+        )
 
 
 @contextlib.contextmanager

@@ -40,18 +40,22 @@ def contract_report(contract: Contract) -> RenderableType:
 
 
 def export_report(contract: Contract) -> Text:
-    """Return the same in four lines, for the end of an export."""
+    """Return the same in a few lines, for the end of an export."""
     observation, action = contract.observation_space, contract.action_space
     differences = ", ".join(f"{name} {result.max_rel:.1e}" for name, result in contract.parity.formats.items())
     rate = f" at {contract.control_rate_hz:g} Hz" if contract.control_rate_hz else ""
     outcome = f"one of {action.n} actions" if isinstance(action, DiscreteSpec) else f"{action.size} action elements"
     if contract.state:
         outcome += f", remembering {', '.join(state.name for state in contract.state)}"
+    frozen = next((step for step in contract.baked_in if step.step == "mean_std_filter"), None)
+    steps = contract.provenance.env_steps
+    trained = f"; training took {steps:,} environment steps" if steps is not None else ""
+    seen = f"filter    statistics of {frozen.values['count']:,} observations{trained}\n" if frozen else ""
     return Text(
         f"policy    {contract.name} version {contract.version}\n"
         f"graph     {observation.size} observation elements to {outcome}{rate}\n"
         f"baked in  {', '.join(step.step for step in contract.baked_in)}\n"
-        f"proven    {contract.parity.samples:,} observations; largest relative difference to RLlib: {differences}"
+        f"{seen}proven    {contract.parity.samples:,} observations; largest relative difference to RLlib: {differences}"
     )
 
 

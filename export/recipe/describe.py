@@ -45,11 +45,6 @@ def baked_steps(recipe: Recipe, module_class: str, module: Any) -> tuple[BakedSt
 def unexpected_steps(recipe: Recipe) -> list[str]:
     """Return a sentence for each thing that RLlib does, and the export with it, and a person may not expect."""
     sentences: list[str] = []
-    if recipe.filter is not None and recipe.filter.count == 0:
-        clipped = " and clips" if recipe.filter.clip is not None else ""
-        sentences.append(
-            f"the observation filter has seen nothing yet: RLlib divides by 1e-6{clipped}, and so does the export"
-        )
     for name, space in recipe.action_leaves.items():
         if isinstance(space, Discrete) and space.start != 0:
             which = "the action space" if name == "action" else name

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from rlservo.export.checkpoints.location import CheckpointFiles, Files
 from rlservo.export.contract.errors import CheckpointError
-from rlservo.export.recipe.recipe import ObservationFilter
+from rlservo.export.recipe.recipe import ObservationFilter, Recipe
 
 
 def frozen_filter(running: Any) -> ObservationFilter:
@@ -18,3 +19,16 @@ def frozen_filter(running: Any) -> ObservationFilter:
         raise CheckpointError("the observation filter's mean or standard deviation is not finite: training diverged")
     clip = float(running.clip) if running.clip else None  # RLlib tests for truth: 0 means no clipping, too
     return ObservationFilter(int(stats.n), mean, std, clip, bool(running.demean), bool(running.destd))
+
+
+def why_untrained(files: Files, recipe: Recipe) -> str:
+    """Return why the observation filter's statistics are not training's; '' where they are or there is no filter."""
+    if (frozen := recipe.filter) is None:
+        return ""
+    seen = f"{frozen.count:,} observation{'' if frozen.count == 1 else 's'}"
+    if isinstance(files, CheckpointFiles) and files.is_of_evaluation:
+        return f"the observation filter's statistics are of {seen} in evaluation, and of none in training"
+    if frozen.count > 1:
+        return ""
+    clipped = " and clips" if frozen.clip is not None else ""
+    return f"the observation filter's statistics are of {seen}: RLlib divides by 1e-6{clipped}, unlike in training"

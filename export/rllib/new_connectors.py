@@ -136,7 +136,7 @@ def _observation_step(piece: Any, files: CheckpointFiles, slot: AgentSlot) -> Ob
         return _user_step(piece, "env-to-module", "the network would see other numbers")
     space = slot.part(piece.input_observation_space)
     if kind.__name__ == "MeanStdFilter":
-        if not (files.env_to_module / kind.__name__).is_dir():
+        if files.has_pipelines and not (files.env_to_module / kind.__name__).is_dir():
             raise CheckpointError(
                 f"{files.env_to_module / kind.__name__} is missing: the observation filter's statistics"
             )

@@ -29,7 +29,7 @@ from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from torch import Tensor, nn
 
 from rlservo.export.checkpoints.facts import read_config
-from rlservo.export.checkpoints.location import CTOR_FILE, STATE_STEMS, CheckpointFiles
+from rlservo.export.checkpoints.location import CTOR_FILE, ENV_TO_MODULE, MODULE_TO_ENV, STATE_STEMS, CheckpointFiles
 from rlservo.export.checkpoints.unpickle import explain, unpickle
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError, first_line
 from rlservo.export.contract.scores import Q_VALUES
@@ -51,6 +51,7 @@ from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_heads
 from rlservo.export.rllib.new_connectors import read_action_steps, read_observation_steps
 from rlservo.export.rllib.new_pipelines import Pipelines, find_agent_slot, own_copy, pipelines_of
+from rlservo.export.rllib.restore_order import connectors_that_rllib_restores
 from rlservo.export.rllib.restored_policy import RestoredPolicy
 from rlservo.export.rllib.supported_spaces import check_spaces
 
@@ -203,8 +204,7 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     """
     module: Any = _restore(RLModule, files.module)
     if files.has_pipelines:
-        env_to_module: Any = _restore(EnvToModulePipeline, files.env_to_module)
-        module_to_env: Any = _restore(ModuleToEnvPipeline, files.module_to_env)
+        env_to_module, module_to_env = _restore_pipelines(files.runner)
     else:
         env_to_module, module_to_env = _build_pipelines(files, module, notify)
 
@@ -237,7 +237,19 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     rule = _deterministic(module) if Columns.ACTION_DIST_INPUTS in names else None
     network = Network(traced, names, acts=mode == "given", rule=rule)
     module_class = f"{type(module).__module__}.{name}"
+    if files.has_pipelines:
+        # The gate's own copies, read from where RLlib reads them: what the recipe has wrong must not be in both.
+        env_to_module, module_to_env = _restore_pipelines(connectors_that_rllib_restores(files))
+        read_observation_steps(env_to_module, files, slot)  # freezes the filter
+        pipelines = pipelines_of(slot, module, env_to_module, module_to_env, observation_space, action_space)
     return RestoredPolicy(recipe, network, module_class, partial(NewStackLoop, pipelines, recipe, network), slot.agents)
+
+
+def _restore_pipelines(folder: Path) -> tuple[Any, Any]:
+    return (
+        _restore(EnvToModulePipeline, folder / ENV_TO_MODULE),
+        _restore(ModuleToEnvPipeline, folder / MODULE_TO_ENV),
+    )
 
 
 def _second_module(module: Any, files: CheckpointFiles) -> Any:

@@ -185,13 +185,18 @@ def filtered_each() -> Any:
 
 def record_team(algorithm: Any, out: Path, name: str) -> None:
     """Let RLlib roll out by itself and write down what each agent saw and did."""
-    runner = algorithm.env_runner
+    for agent, seen in team_rollout(algorithm.env_runner).items():
+        np.savez(out / f"{name}_{agent}.npz", **seen)
+
+
+def team_rollout(runner: Any) -> dict[str, dict[str, Any]]:
+    """Return what each agent of an environment runner sees and does."""
     for piece in runner._env_to_module.connectors:
         if isinstance(piece, MeanStdFilter):
             piece._update_stats = False
     runner.sample(num_timesteps=1, explore=False, force_reset=True)  # drops observations filtered before the freeze
     env = runner.env.envs[0].unwrapped
-    seen: dict[str, list[dict[str, Any]]] = {agent: [] for agent in zoo_team.OBSERVATIONS}
+    seen: dict[str, list[dict[str, Any]]] = {agent: [] for agent in env.possible_agents}
     last: dict[str, Any] = {}
     real_reset, real_step = env.reset, env.step
 
@@ -211,9 +216,8 @@ def record_team(algorithm: Any, out: Path, name: str) -> None:
 
     env.reset, env.step = reset, step
     runner.sample(num_timesteps=60, explore=False, force_reset=True)
-    for agent, rows in seen.items():
-        assert len(rows) >= 50, len(rows)
-        np.savez(out / f"{name}_{agent}.npz", **{key: np.stack([row[key] for row in rows]) for key in rows[0]})
+    assert all(len(rows) >= 50 for rows in seen.values())
+    return {agent: {key: np.stack([row[key] for row in rows]) for key in rows[0]} for agent, rows in seen.items()}
 
 
 def configurations(out: Path) -> dict[str, Any]:

@@ -96,9 +96,12 @@ def configurations() -> dict[str, Any]:
 
 def record(algorithm: Any, file: Path) -> None:
     """Let RLlib roll out by itself and write down what went in and out of the environment."""
-    runner = algorithm.env_runner
-    if runner is None:  # an algorithm that trains from recorded data acts only when it is evaluated, after training
-        runner = algorithm.eval_env_runner
+    # An algorithm that trains from recorded data acts only when it is evaluated, after training.
+    np.savez(file, **rollout(algorithm.env_runner or algorithm.eval_env_runner))
+
+
+def rollout(runner: Any) -> dict[str, Any]:
+    """Return what goes in and out of an environment runner's environment, exploration off and the filter frozen."""
     for piece in runner._env_to_module.connectors:
         if isinstance(piece, MeanStdFilter):
             piece._update_stats = False
@@ -124,7 +127,7 @@ def record(algorithm: Any, file: Path) -> None:
     env.reset, env.step = reset, step
     runner.sample(num_timesteps=100, explore=False, force_reset=True)
     assert len(seen) >= 90, len(seen)
-    np.savez(file, **{name: np.stack([one[name] for one in seen]) for name in seen[0]})
+    return {name: np.stack([one[name] for one in seen]) for name in seen[0]}
 
 
 def leaves(tree: Any, name: str) -> dict[str, Any]:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from rlservo.export.checkpoints.location import locate_checkpoint, locate_modules
-from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.commands.export import export_checkpoint
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 from rlservo.export.graph.onnx_file import run_onnx
@@ -69,12 +68,12 @@ def test_pipelines_that_were_not_saved_are_built_from_the_configuration(
 
 
 def test_a_filter_whose_statistics_were_not_saved_is_refused(
-    copy_of: Callable[[str], Path], app: Path, notices: list[str]
+    copy_of: Callable[[str], Path], app: Path, tmp_path: Path, notices: list[str]
 ) -> None:
     damaged = copy_of("pendulum")
     shutil.rmtree(damaged / "env_runner")
-    with user_code(app.parent), pytest.raises(CheckpointError, match="the observation filter's statistics"):
-        restore(locate_checkpoint(damaged), Path(), notices.append)
+    with pytest.raises(CheckpointError, match="the observation filter's statistics are of 0 observations"):
+        export_checkpoint(damaged, tmp_path / "out", app_dir=app.parent, notify=notices.append)
     (damaged / "class_and_ctor_args.pkl").unlink()
     with pytest.raises(CheckpointError, match="it has neither env_runner/"):
         locate_checkpoint(damaged)

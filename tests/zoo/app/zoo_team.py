@@ -23,13 +23,18 @@ def module_of(agent: str, *_: Any, **__: Any) -> str:
     return MODULES[agent]
 
 
+def module_of_its_own(agent: str, *_: Any, **__: Any) -> str:
+    return f"{agent}_arm"
+
+
 class Team(MultiAgentEnv):
-    """The arms see other ranges, so that their filters differ; episodes end after seven steps."""
+    """The arms see other ranges, so that their filters differ; episodes end after seven steps. `agents` may be some."""
 
     def __init__(self, config: Any = None) -> None:
         super().__init__()
-        self.observation_spaces, self.action_spaces = OBSERVATIONS, ACTIONS
-        self.agents = self.possible_agents = list(OBSERVATIONS)
+        self.agents = self.possible_agents = list((config or {}).get("agents", OBSERVATIONS))
+        self.observation_spaces = {agent: OBSERVATIONS[agent] for agent in self.agents}
+        self.action_spaces = {agent: ACTIONS[agent] for agent in self.agents}
         self.rng = np.random.default_rng(0)
         self.time = 0
 
@@ -45,7 +50,7 @@ class Team(MultiAgentEnv):
     def _observe(self) -> dict[str, Any]:
         drawn = {agent: self.rng.uniform(space.low, space.high) for agent, space in OBSERVATIONS.items()}
         drawn["right"] = drawn["right"] / 3.0 + 1.0
-        return {agent: values.astype(np.float32) for agent, values in drawn.items()}
+        return {agent: drawn[agent].astype(np.float32) for agent in self.agents}
 
 
 class Committee(MultiRLModule):
