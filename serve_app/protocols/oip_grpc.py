@@ -39,7 +39,7 @@ from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
 from rlservo.serve_app.protocols.http_errors import retry_after_s, status_of
 from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, check_form, check_size, datatype_of, from_bytes
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, as_datatype, check_form, check_size, datatype_of, from_bytes
 from rlservo.serve_app.server.access_checks import StreamKey, authorize, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
@@ -79,6 +79,15 @@ FIELDS = {
     "UINT64": "uint64_contents",
     "FP32": "fp32_contents",
     "FP64": "fp64_contents",
+}
+FIELD_DTYPES = {
+    "bool_contents": "?",
+    "int_contents": "i4",
+    "int64_contents": "i8",
+    "uint_contents": "u4",
+    "uint64_contents": "u8",
+    "fp32_contents": "f4",
+    "fp64_contents": "f8",
 }
 
 
@@ -338,7 +347,7 @@ def _inputs(message: Any) -> dict[str, NDArray[Any]]:
         if raw:
             content = raw[index]
             check_size(label, shape, dtype, len(content), "raw_input_contents are")
-            inputs[name] = from_bytes(memoryview(content), shape, dtype)
+            inputs[name] = from_bytes(label, memoryview(content), shape, dtype)
         else:
             inputs[name] = _typed(label, tensor, shape, dtype)
     return inputs
@@ -357,12 +366,7 @@ def _typed(label: str, tensor: Any, shape: tuple[int, ...], dtype: np.dtype[Any]
             f"input '{label}': '{field}' has {len(values)} numbers, not the {math.prod(shape)} of shape {list(shape)}",
             {"expected_shape": list(shape), "numbers": len(values)},
         )
-    array: NDArray[Any] = np.array(values)
-    if dtype.kind in "iu" and array.size:
-        info = np.iinfo(dtype)
-        if array.min() < info.min or array.max() > info.max:
-            raise ObservationError(f"input '{label}': a number is not in {info.min}..{info.max} ({tensor.datatype})")
-    return array.astype(dtype).reshape(shape)
+    return as_datatype(label, np.array(values, FIELD_DTYPES[field]), dtype).reshape(shape)
 
 
 def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -284,7 +284,7 @@ def _raw_input(contract: Contract, view: memoryview) -> NDArray[Any]:
         raise ObservationError(
             f"input '{tensor.name}' is of {row} bytes per observation, and the body has {len(view)}: not a multiple"
         )
-    return from_bytes(view, (len(view) // row, *tensor.shape[1:]), dtype)
+    return from_bytes(tensor.name, view, (len(view) // row, *tensor.shape[1:]), dtype)
 
 
 def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:

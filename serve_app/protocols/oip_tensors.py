@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError
 from rlservo.serve_app.protocols.json_messages import json_type
+from rlservo.serve_app.runtime.elements import NUMBER_KINDS, find_unfit, to_array
 
 DTYPES: dict[str, np.dtype[Any]] = {
     "BOOL": np.dtype("?"),
@@ -79,7 +80,7 @@ def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDAr
         raise RequestError(
             f"input '{label}' needs {size} bytes after the JSON and {max(0, len(raw) - offset)} are left of the body"
         )
-    return name, from_bytes(raw[offset : offset + size], tuple(shape), dtype), offset + size
+    return name, from_bytes(label, raw[offset : offset + size], tuple(shape), dtype), offset + size
 
 
 def check_form(label: str, shape: Sequence[Any] | None, datatype: Any, parameters: Mapping[str, Any]) -> np.dtype[Any]:
@@ -107,11 +108,13 @@ def check_size(label: str, shape: Sequence[int], dtype: np.dtype[Any], size: int
         )
 
 
-def from_bytes(raw: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return the array that `raw` holds; its length has been checked. Not writable: it is the request's own memory."""
-    if dtype.kind == "b":  # any non-zero byte is true; numpy's own view of such a byte is undefined
-        flags: NDArray[Any] = np.frombuffer(raw, np.uint8) != 0
-        return flags.reshape(shape)
+def from_bytes(label: str, raw: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return the array that `raw` holds; its length has been checked. Not writable: it is the request's own memory.
+
+    Raises ObservationError for a BOOL that is neither 0 nor 1.
+    """
+    if dtype.kind == "b":  # numpy's own view of another byte is undefined
+        return as_datatype(label, np.frombuffer(raw, np.uint8), dtype).reshape(shape)
     array: NDArray[Any] = np.frombuffer(raw, dtype)
     if not array.flags.aligned:  # it begins wherever the JSON ended
         array = array.copy()
@@ -123,28 +126,35 @@ def _from_json(label: str, data: Any, shape: tuple[int, ...], dtype: np.dtype[An
     if type(data) is not list:
         raise RequestError(f"input '{label}': 'data' must be a list of numbers, got {json_type(data)}")
     try:
-        array: NDArray[Any] = np.asarray(data)
+        array = to_array(data)
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ObservationError(f"input '{label}': its lists are not of equal length: {error}") from None
     if array.size == 0:
         array = array.astype(dtype)
-    if array.dtype.kind not in "fiub":
+    if array.dtype.kind not in NUMBER_KINDS:
         raise ObservationError(f"input '{label}': 'data' holds {_first_other(data)}, not only numbers")
     if array.shape != shape and not (array.ndim == 1 and array.size == math.prod(shape)):
         raise ObservationError(
             f"input '{label}': 'data' has the shape {list(array.shape)}, and 'shape' says {list(shape)}",
             {"expected_shape": list(shape), "shape": list(array.shape)},
         )
-    if dtype.kind in "iu":
-        info = np.iinfo(dtype)
-        bad = ~((array == np.floor(array)) & (array >= info.min) & (array <= info.max))
-        if array.dtype.kind == "b" or bad.any():
-            value = array[bad][0] if bad.any() else array.flat[0]
-            raise ObservationError(f"input '{label}': {value} is not an integer in {info.min}..{info.max}")
-    elif dtype.kind == "b" and not ((array == 0) | (array == 1)).all():
-        raise ObservationError(f"input '{label}': BOOL data must be true or false")
+    if dtype.kind in "iu" and bool in _leaf_types(data):
+        raise ObservationError(f"input '{label}': 'data' holds true or false, which is not an integer")
+    return as_datatype(label, array, dtype).reshape(shape)
+
+
+def _leaf_types(data: list[Any]) -> set[type]:
+    types = set(map(type, data))
+    return types if list not in types else set().union(*map(_leaf_types, data))
+
+
+def as_datatype(label: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return an input's numbers in its datatype. Raises ObservationError where that has no such number."""
+    unfit = find_unfit(array, dtype) if dtype.kind in "iub" else None
+    if unfit is not None:
+        raise ObservationError(f"input '{label}': {array[unfit[0]].flat[0]} is {unfit[1]}")
     with np.errstate(over="ignore"):  # what becomes an infinity is refused with the observation, element and all
-        return array.astype(dtype).reshape(shape)
+        return array.astype(dtype)
 
 
 def _first_other(data: Any) -> str:

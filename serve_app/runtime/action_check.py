@@ -44,7 +44,9 @@ class ActionCheck:
         self._clip_or_refuse(action)
 
     def _clip_or_refuse(self, action: NDArray[Any]) -> None:
-        slack = rounding_slack(self._low, self._high)  # what unsquash may leave outside the space is clipped
+        slack = rounding_slack(
+            self._low, self._high, self._dtype
+        )  # what unsquash may leave outside the space is clipped
         bad = ~((action >= self._low - slack) & (action <= self._high + slack))
         if bad.any():
             label, index = first_element(self._space, bad)

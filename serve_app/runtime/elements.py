@@ -7,14 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import RequestError
+from rlservo.export.contract.errors import RequestError, first_line
 from rlservo.export.contract.spaces import LeafSpec, iter_elements
+from rlservo.serve_app.runtime.observation_error_text import describe, first_non_number
 
+NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
 RELATIVE_SLACK = 1e-5  # of the bound, or of 1 where that is larger
 
 
-def rounding_slack(low: NDArray[Any], high: NDArray[Any]) -> NDArray[np.float64]:
-    """Return by how much a value in [low, high] may lie outside after rounding to float32."""
+def rounding_slack(low: NDArray[Any], high: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[np.float64]:
+    """Return by how much a value in [low, high] may lie outside after rounding to float32; integers round nothing."""
+    if dtype.kind != "f":
+        return np.zeros(low.shape)
     slack: NDArray[np.float64] = RELATIVE_SLACK * np.maximum(1.0, np.minimum(np.abs(low), np.abs(high)))
     return slack
 
@@ -26,10 +30,59 @@ def first_element(space: LeafSpec, bad: NDArray[np.bool_]) -> tuple[str, tuple[i
     return dict(iter_elements(space))[flat], index
 
 
+def to_array(given: Any) -> NDArray[Any]:
+    """Return numbers out of nested lists as an array, integers exactly where one dtype holds all of them.
+
+    Beside smaller ones, numpy makes a float of an integer of 2**63 and more. Raises what numpy raises for lists of
+    unequal length.
+    """
+    array = np.asarray(given)
+    if (
+        array.dtype == np.float64
+        and array.size
+        and not isinstance(given, np.ndarray)
+        and np.max(np.abs(array)) >= 2**53
+    ):
+        leaves = np.asarray(given, object)
+        if all(isinstance(leaf, int) and leaf >= 0 for leaf in leaves.flat):
+            return leaves.astype(np.uint64)
+    return array
+
+
+def find_unfit(array: NDArray[Any], dtype: np.dtype[Any]) -> tuple[NDArray[np.bool_], str] | None:
+    """Return (which numbers an integer or bool `dtype` does not have, why); None where it has all of them.
+
+    A float so large that it stands for several integers fits none: the sender may have meant another one.
+    """
+    info = np.iinfo(dtype) if dtype.kind in "iu" else None
+    low, high = (int(info.min), int(info.max)) if info is not None else (0, 1)
+    is_float, name = array.dtype.kind == "f", array.dtype.name
+    digits = np.finfo(array.dtype).nmant + 1 if is_float else 0
+    if is_float:
+        array = array.astype(np.float64)  # float16 has no numbers as large as the bounds
+    unfit = np.asarray((array < low) | (array > high))  # exact for integers; large floats are looked at below
+    if is_float:
+        unfit |= ~np.isfinite(array) | (array != np.floor(array))
+    if unfit.any():
+        return unfit, f"not an integer in {low}..{high} ({dtype})"
+    if is_float and (unfit := np.asarray(np.abs(array) >= 2.0**digits)).any():
+        return unfit, f"a {name} of 2**{digits} or more, which stands for several integers"
+    return None
+
+
 def parse_array(given: Any, dtype: str, what: str) -> NDArray[Any]:
     """Return a caller's numbers as an array, infinite where they are too large for it. Raises RequestError."""
     try:
-        with np.errstate(over="ignore"):
-            return np.asarray(given, dtype)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise RequestError(f"{what} cannot be read: {error}") from error
+        array = to_array(given)
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise RequestError(f"{what} cannot be read: {first_line(error)}") from error
+    if array.dtype.kind not in NUMBER_KINDS:
+        found = first_non_number(given, ())
+        value = describe(found[1]) if found is not None else f"of dtype {array.dtype}"
+        raise RequestError(f"{what} cannot be read: it holds {value}, not numbers")
+    target = np.dtype(dtype)
+    unfit = find_unfit(array, target) if target.kind in "iub" else None
+    if unfit is not None:
+        raise RequestError(f"{what} cannot be read: {array[unfit[0]].flat[0]} is {unfit[1]}")
+    with np.errstate(over="ignore"):
+        return array.astype(target, copy=False)

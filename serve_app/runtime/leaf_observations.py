@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from rlservo.export.contract.errors import ObservationError, first_line
 from rlservo.export.contract.spaces import BoxSpec, LeafSpec
 from rlservo.serve_app.runtime.drift import EVERY, Drift
-from rlservo.serve_app.runtime.elements import first_element, rounding_slack
+from rlservo.serve_app.runtime.elements import NUMBER_KINDS, find_unfit, first_element, rounding_slack, to_array
 from rlservo.serve_app.runtime.observation_error_text import describe, describe_unequal, first_non_number, list_names
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 
-NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
 SMALL = 128  # elements up to which Python's own sum is faster than numpy's isfinite(...).all()
 NUMBERS = frozenset({float, int, bool})  # what `struct` reads as the number that it is
 LARGE = 2.0**53  # beyond it an integer is none that a float has, and numpy says which it takes
@@ -129,13 +128,12 @@ class LeafParser:
     def _set_bounds(self, space: BoxSpec) -> bool:
         """Set the bounds with their slack; return whether there is anything to check."""
         low, high = space.bounds()
-        if self._dtype.kind in "iu":  # integers round nothing, and an image's 0..255 is its dtype's own range
+        if self._dtype.kind in "iu":  # an image's 0..255 is its dtype's own range
             info = np.iinfo(self._dtype)
             checked = bool((low > info.min).any() or (high < info.max).any())
-            slack: Any = 0.0
         else:
             checked = bool(np.isfinite(low).any() or np.isfinite(high).any())
-            slack = rounding_slack(low, high)
+        slack = rounding_slack(low, high, self._dtype)
         self._low, self._high = low, high
         self._loosest = (low - slack, high + slack)
         # The elements that have a bound, for the one observation that a control loop sends at a time.
@@ -160,12 +158,13 @@ class LeafParser:
         of = "" if self._name == "obs" else f" of {self._name}"
         notice = f"element {label}{of}{more} outside the observation space's [{low:g}, {high:g}]"
         if self._out_of_bounds == "clip":
-            return np.clip(array, self._low, self._high).astype(self._dtype), f"{notice}: clipped"
+            clipped = np.clip(array, self._low, self._high).astype(self._dtype)
+            return np.where(outside, clipped, array), f"{notice}: clipped"  # the others keep all their digits
         return array, notice
 
     def _from_nested(self, obs: Any) -> NDArray[Any]:
         try:
-            array = np.asarray(obs)
+            array = to_array(obs)
         except (ValueError, TypeError, OverflowError, RecursionError) as error:
             self._refuse(describe_unequal(obs) if isinstance(obs, list | tuple) else first_line(error))
         if array.dtype.kind not in NUMBER_KINDS:
@@ -185,7 +184,7 @@ class LeafParser:
             if isinstance(value, str | bytes | Mapping) or value is None:
                 self._refuse(f"element '{name}' is {describe(value)}, not a number")
         try:
-            array = np.asarray(values)
+            array = to_array(values)
         except (ValueError, TypeError, OverflowError, RecursionError):
             self._refuse("its named values are not all single numbers, or all lists of one length (a batch)")
         if array.dtype.kind not in NUMBER_KINDS:
@@ -206,17 +205,9 @@ class LeafParser:
             if array.size > SMALL or not math.isfinite(sum(cast.ravel().tolist())):
                 self._check_finite(cast, sent=array)
             return cast
-        if array.dtype.kind == "f":
-            with np.errstate(invalid="ignore"):
-                whole = np.asarray(np.isfinite(array) & (array == np.floor(array)))
-            if not whole.all():
-                self._refuse_element(array, ~whole, f"not a whole number (the space is {self._dtype})")
-        info = np.iinfo(self._dtype) if self._dtype.kind in "iu" else None
-        low, high = (int(info.min), int(info.max)) if info is not None else (0, 1)
-        # Compared as float64 or int64: numpy would otherwise wrap 300 to 44 in uint8 without a word.
-        outside = (array < low) | (array > high)
-        if outside.any():
-            self._refuse_element(array, outside, f"outside {low}..{high}, the range of {self._dtype}")
+        unfit = find_unfit(array, self._dtype)
+        if unfit is not None:
+            self._refuse_element(array, *unfit)
         return array.astype(self._dtype)
 
     def _check_finite(self, array: NDArray[Any], *, sent: NDArray[Any] | None = None) -> None:

@@ -47,14 +47,16 @@ class StepLimit:
             if not space.shape and array.shape == (*expected, 1):  # as RLlib, and so the graph, gives such an action
                 array = array.reshape(expected)
             low, high = space.bounds()
-            slack = rounding_slack(low, high)
+            slack = rounding_slack(low, high, array.dtype)
             if array.shape != expected:
                 raise RequestError(
                     f"policy '{self._policy}' expects {name} of last_action of shape {expected}, got {array.shape}"
                 )
             if not (np.isfinite(array) & (array >= low - slack) & (array <= high + slack)).all():
                 raise RequestError(f"last_action of policy '{self._policy}': {name} is not in the action space")
-            found[name] = np.clip(array, low, high).astype(space.dtype).reshape(rows, *space.shape)
+            if array.dtype.kind == "f":
+                array = np.clip(array, low, high).astype(space.dtype)
+            found[name] = array.reshape(rows, *space.shape)
         return found
 
     def apply(

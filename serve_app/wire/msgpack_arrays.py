@@ -87,7 +87,7 @@ def _array(document: Mapping[Any, Any]) -> NDArray[Any]:
             f"an array in the message of shape {shape} and dtype {name} needs "
             f"{math.prod(shape) * dtype.itemsize} bytes, got {got}"
         )
-    if dtype.kind == "b":  # any non-zero byte is true; numpy's own view of such a byte is undefined
-        return (np.frombuffer(data, np.uint8) != 0).reshape(shape)  # type: ignore[no-any-return]
+    if dtype.kind == "b" and data.translate(None, b"\0\1"):  # numpy's own view of another byte is undefined
+        raise ObservationError(f"an array in the message of dtype {name} holds a byte that is neither 0 nor 1")
     array: NDArray[Any] = np.frombuffer(data, dtype).reshape(shape)
     return array

@@ -1,0 +1,252 @@
+"""Integers over every protocol: the observation that was sent is acted on to its last digit, or refused."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import msgpack
+import numpy as np
+import pytest
+import websockets.sync.client
+from fastapi import FastAPI
+from onnx import TensorProto, helper
+
+from bundles import PARITY, PROVENANCE, save_graph, write_bundle
+from rlservo.export.contract import bundle as bundle_files
+from rlservo.export.contract.contract import BakedStep, Contract, TensorSpec
+from rlservo.export.contract.errors import ObservationError, RequestError
+from rlservo.export.contract.spaces import BoxSpec
+from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.protocols.oip_grpc import FIELDS, OipGrpcCodec
+from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.runtime.options import PolicyOptions
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.settings import ServerSettings
+from stores import load_store
+
+pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+
+TYPES = {"int64": TensorProto.INT64, "uint64": TensorProto.UINT64, "uint8": TensorProto.UINT8}
+# As JSON has them, for a policy that observes two int64, two uint64 or two uint8.
+KEPT = [
+    ("int64", "9007199254740993", "INT64"),
+    ("int64", "9223372036854775807", "INT64"),
+    ("int64", "-9223372036854775808", "INT64"),
+    ("int64", "9223372036854775807", "UINT64"),
+    ("int64", "9007199254740991.0", "FP64"),
+    ("int64", "16777215", "FP32"),
+    ("uint64", "18446744073709551615", "UINT64"),
+    ("uint64", "9223372036854775809", "UINT64"),
+    ("uint8", "255", "UINT8"),
+    ("uint8", "255", "FP16"),
+    ("uint8", "true", "BOOL"),
+]
+REFUSED = [
+    ("int64", "9223372036854775808", "INT64"),
+    ("int64", "9223372036854775808", "UINT64"),
+    ("int64", "-9223372036854775809", "INT64"),
+    ("int64", "9223372036854775808.0", "FP64"),
+    ("int64", "9007199254740993.0", "FP64"),
+    ("int64", "16777217", "FP32"),
+    ("int64", "2049", "FP16"),
+    ("int64", "1.5", "INT64"),
+    ("int64", "true", "INT64"),
+    ("int64", "2", "BOOL"),
+    ("int64", '"7"', "INT64"),
+    ("uint64", "18446744073709551616", "UINT64"),
+    ("uint64", "-1", "UINT64"),
+    ("uint64", "-1", "INT64"),
+    ("uint8", "256", "UINT8"),
+    ("uint8", "256", "INT64"),
+    ("uint8", "-1", "INT8"),
+    ("uint8", "254.9999", "FP32"),
+]
+
+
+def write_counter(root: Path, dtype: str) -> Path:
+    """A policy that answers with its observation's last three digits, which tell a number from its neighbours."""
+    folder = root / dtype / "1"
+    folder.mkdir(parents=True)
+    nodes = [
+        helper.make_node("Div", ["obs", "thousand"], ["whole"]),
+        helper.make_node("Mul", ["whole", "thousand"], ["thousands"]),
+        helper.make_node("Sub", ["obs", "thousands"], ["digits"]),
+        helper.make_node("Cast", ["digits"], ["action"], to=TensorProto.FLOAT),
+    ]
+    save_graph(
+        folder / bundle_files.ONNX_FILE,
+        nodes,
+        {"thousand": np.array(100 if dtype == "uint8" else 1000, dtype)},
+        [("obs", TYPES[dtype], ["batch", 2])],
+        [("action", TensorProto.FLOAT, ["batch", 2])],
+    )
+    contract = Contract(
+        name=dtype,
+        version="1",
+        observation_space=BoxSpec(shape=(2,), dtype=dtype, low=None, high=None),
+        action_space=BoxSpec(shape=(2,), dtype="float32", low=None, high=None),
+        inputs=(TensorSpec(name="obs", dtype=dtype, shape=(-1, 2)),),
+        outputs=(TensorSpec(name="action", dtype="float32", shape=(-1, 2)),),
+        distribution=None,
+        baked_in=(BakedStep(step="network"),),
+        control_rate_hz=None,
+        provenance=PROVENANCE,
+        parity=PARITY,
+    )
+    return write_bundle(folder, contract, np.arange(8, dtype=dtype).reshape(4, 2))
+
+
+@pytest.fixture(scope="module")
+def app(tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
+    root = tmp_path_factory.mktemp("integers")
+    for dtype in TYPES:
+        write_counter(root, dtype)
+    store = load_store(root)
+    return create_app(lambda: store, ServerSettings())
+
+
+@pytest.fixture(scope="module")
+def http(app: FastAPI, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[httpx.Client]:
+    with served(app) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as client:
+        yield client
+
+
+def digits(number: str) -> list[float]:
+    """Return the action for [number, 1]."""
+    value = int(json.loads(number))
+    size = 100 if value in (1, 255) else 1000
+    return [float(abs(value) % size * (-1 if value < 0 else 1)), 1.0]
+
+
+def tensor(number: str, datatype: str) -> str:
+    beside = "true" if datatype == "BOOL" else "1"
+    return f'{{"name": "obs", "shape": [1, 2], "datatype": "{datatype}", "data": [{number}, {beside}]}}'
+
+
+def post(http: httpx.Client, path: str, body: str) -> tuple[int, Any]:
+    reply = http.post(path, content=body, headers={"content-type": "application/json"})
+    return reply.status_code, reply.json()
+
+
+@pytest.mark.parametrize(("policy", "number", "datatype"), KEPT)
+def test_an_integer_that_fits_is_acted_on_exactly(http: httpx.Client, policy: str, number: str, datatype: str) -> None:
+    status, reply = post(http, f"/v2/models/{policy}/infer", f'{{"inputs": [{tensor(number, datatype)}]}}')
+    assert status == 200 and reply["outputs"][0]["data"] == digits(number), reply
+    status, reply = post(http, f"/v1/policies/{policy}/act", f'{{"obs": [{number}, 1]}}')
+    assert status == 200 and reply["action"] == digits(number), reply
+
+
+@pytest.mark.parametrize(("policy", "number", "datatype"), REFUSED)
+def test_an_integer_that_does_not_fit_is_refused(http: httpx.Client, policy: str, number: str, datatype: str) -> None:
+    flat = tensor(number, datatype)
+    nested = tensor(f"[{number}", datatype).replace("]}", "]]}")
+    for given in (flat, nested):
+        status, reply = post(http, f"/v2/models/{policy}/infer", f'{{"inputs": [{given}]}}')
+        assert status == 422 and len(reply["error"]) < 300, reply
+
+
+@pytest.mark.parametrize("number", ["9223372036854775808", "-9223372036854775809", "9007199254740993.0", "1.5"])
+def test_json_observations_are_held_to_the_same(http: httpx.Client, number: str) -> None:
+    for obs in (f"[{number}, 1]", f"[[{number}, 1], [1, 1]]", f"[1, {number}]"):
+        status, reply = post(http, "/v1/policies/int64/act", f'{{"obs": {obs}}}')
+        assert status == 422 and "integer" in reply["error"], reply
+
+
+@pytest.mark.parametrize(
+    ("policy", "array"),
+    [
+        ("int64", np.array([2**63, 1], np.float64)),
+        ("int64", np.array([2**53, 1], np.float64)),
+        ("int64", np.array([2**24, 1], np.float32)),
+        ("int64", np.array([2**63, 1], np.uint64)),
+        ("uint64", np.array([-1, 1], np.int64)),
+        ("uint64", np.array([2**64, 1], np.float64)),
+        ("uint8", np.array([256, 1], np.int16)),
+        ("uint8", np.array([0.5, 1], np.float16)),
+    ],
+)
+def test_so_are_bytes(http: httpx.Client, app: FastAPI, policy: str, array: Any) -> None:
+    datatype = {"float64": "FP64", "float32": "FP32", "float16": "FP16"}.get(array.dtype.name, array.dtype.name.upper())
+    head = json.dumps(
+        {"inputs": [{"name": "obs", "shape": [1, 2], "datatype": datatype,
+                     "parameters": {"binary_data_size": array.nbytes}}]}
+    ).encode()  # fmt: skip
+    reply = http.post(
+        f"/v2/models/{policy}/infer",
+        content=head + array.tobytes(),
+        headers={"Inference-Header-Content-Length": str(len(head))},
+    )
+    assert reply.status_code == 422 and "integer" in reply.json()["error"]
+    with pytest.raises(ObservationError, match="integer"):
+        over_grpc(app, policy, datatype, array, raw=True)
+    if datatype in FIELDS:
+        with pytest.raises(ObservationError, match="integer"):
+            over_grpc(app, policy, datatype, array, raw=False)
+    packed = {b"__ndarray__": True, b"data": array.tobytes(), b"dtype": array.dtype.str, b"shape": array.shape}
+    url = f"ws://127.0.0.1:{http.base_url.port}/v1/policies/{policy}/stream"
+    with websockets.sync.client.connect(url) as stream:
+        stream.recv()
+        stream.send(msgpack.packb({"obs": packed}))
+        assert "integer" in json.loads(stream.recv())["error"]
+
+
+def over_grpc(app: FastAPI, policy: str, datatype: str, array: Any, *, raw: bool) -> Any:
+    core = app.state.core
+    asked = messages.ModelInferRequest(model_name=policy)
+    given = asked.inputs.add(name="obs", datatype=datatype, shape=[1, 2])
+    if raw:
+        asked.raw_input_contents.append(array.tobytes())
+    else:
+        getattr(given.contents, FIELDS[datatype]).extend(array.tolist())
+    request = Request("grpc", "", None, time.perf_counter())
+    return asyncio.run(core.answer(OipGrpcCodec(core), request, (asked.SerializeToString(), None)))
+
+
+def test_typed_contents_of_64_bits_are_kept_exactly(app: FastAPI) -> None:
+    for policy, values in (("uint64", [2**63 + 1, 1]), ("int64", [2**53 + 1, 1])):
+        reply = over_grpc(app, policy, policy.upper(), np.array(values, policy), raw=False)
+        assert list(reply.outputs[0].contents.fp32_contents) == [values[0] % 1000, 1.0]
+
+
+def test_a_bool_is_a_byte_of_0_or_1(http: httpx.Client, app: FastAPI) -> None:
+    array = np.array([2, 1], np.uint8)
+    head = json.dumps(
+        {"inputs": [{"name": "obs", "shape": [1, 2], "datatype": "BOOL", "parameters": {"binary_data_size": 2}}]}
+    ).encode()
+    headers = {"Inference-Header-Content-Length": str(len(head))}
+    reply = http.post("/v2/models/uint8/infer", content=head + array.tobytes(), headers=headers)
+    assert reply.status_code == 422 and "2 is not an integer in 0..1" in reply.json()["error"]
+    with pytest.raises(ObservationError, match=r"0\.\.1"):
+        over_grpc(app, "uint8", "BOOL", array, raw=True)
+
+
+@pytest.mark.parametrize("given", [[1.7, 1], [2**63, 1], [np.float32(2**24), 1], np.array([300, 1]), ["1", "1"]])
+def test_in_process_too(app: FastAPI, given: Any) -> None:
+    policy: Policy = app.state.core.store().get("uint8")
+    with pytest.raises(ObservationError, match=r"integer|number"):
+        policy.act(given)
+
+
+@pytest.mark.parametrize("value", [1.7, 2.0**63, 10**6 + 9, "1", [None], True])
+def test_a_last_action_is_read_as_an_observation_is(tmp_path: Path, discrete_policy: Any, value: Any) -> None:
+    policy = Policy.load(discrete_policy(tmp_path, start=10**6))
+    if value is True:
+        value = np.array(2**40 + 10**6, np.int64)
+    with pytest.raises(RequestError, match="last_action"):
+        policy.step(2, last_action=value)
+
+
+def test_clipping_one_element_leaves_the_others_as_they_are(tmp_path: Path, rewrite_contract: Any) -> None:
+    folder = write_counter(tmp_path, "int64")
+    low, high = (None, 0), (None, 10)
+    rewrite_contract(folder, observation_space=BoxSpec(shape=(2,), dtype="int64", low=low, high=high))
+    policy = Policy.load(folder, options=PolicyOptions(out_of_bounds="clip"), check_golden=False)
+    assert policy.act([2**53 + 1, 99]).tolist() == [993.0, 10.0]
