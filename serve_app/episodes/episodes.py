@@ -10,7 +10,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
+from rlservo.export.contract.errors import (
+    RequestError,
+    SessionError,
+    SessionLostError,
+    StateNeededError,
+    UnavailableError,
+)
 from rlservo.serve_app.episodes.carried_state import NO_STATE, CarriedState, carry, split_identity
 from rlservo.serve_app.episodes.request import Episode, Request, new_episode_id
 from rlservo.serve_app.episodes.sessions import Session, SessionId, Sessions, shorten
@@ -143,6 +149,12 @@ class Episodes:
             raise RequestError("the request has a 'state' and a 'session_id': either you carry the state, or we do")
         if episode.reset:
             policy = _choose(store, request)
+            before = self.sessions.peek(name, session_id)
+            if before is not None and _is_late(request, before):
+                raise UnavailableError(
+                    f"another request began session '{shorten(session_id)}' of policy '{name[:64]}' at the same time: "
+                    "try again"
+                )
             if policy.is_stateful and not episode.end:
                 self.sessions.check_room(name, session_id)
             session = Session(policy)
@@ -152,6 +164,11 @@ class Episodes:
             repeated = session.answer_again(seq, request.obs)
             if repeated is not None:
                 return repeated
+            if _is_late(request, session):
+                raise SessionError(
+                    f"the request was under way when another one began session '{shorten(session_id)}' again: it is of "
+                    "the episode before"
+                )
         decision, step = _take_step(session.policy, request, episode, session=session)
         if episode.end:
             self.sessions.end(name, session_id)
@@ -159,6 +176,7 @@ class Episodes:
             self.sessions.put(name, session_id, session, step.rows if session.policy.is_stateful else 0)
         session.keep(step)
         decision.episode = EpisodeNote(session_id=session_id, step=session.steps)
+        session.connection = request.connection
         session.seq, session.answer, session.inputs_hash = seq, None, b""
         if seq is not None:  # without the inputs: they may be views of a whole request's body
             session.answer = replace(decision, inputs={}, is_repeat=True)
@@ -191,6 +209,11 @@ NO_EPISODE = Episode()
 def _choose(store: PolicyStore, request: Request) -> Policy:
     """Return the policy for a request that is with none yet."""
     return store.choose(request.policy, request.version, request.label)
+
+
+def _is_late(request: Request, session: Session) -> bool:
+    """Whether a request was on its way when a session began: its client has given it up, or did not wait."""
+    return session.policy.is_stateful and request.arrived < session.begun
 
 
 def _owner(store: PolicyStore, name: str, version: str | None, identity: str) -> Policy:

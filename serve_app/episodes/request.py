@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import secrets
 import time
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -70,6 +70,12 @@ class Request:
     received: float
     """When its first byte was here, by `time.perf_counter`."""
 
+    arrived: float = field(default_factory=time.perf_counter)
+    """When this process saw it, which `received` may be set back from."""
+    connection: Any = None
+    """The address of the client's own connection, on which requests come in order; None where that is not known."""
+    has_hung_up: Callable[[], Awaitable[bool]] | None = None
+    """Whether its client has gone, as far as is known; None where nobody could tell."""
     label: str | None = None
     """Whose request it is, in the client's words: where a canary runs, all of a label get the same version."""
     request_id: str | None = None

@@ -38,6 +38,8 @@ class Session:
     steps: int = 0
     rows: int = 0  # episodes that it takes the place of
     used: float = field(default_factory=time.monotonic)
+    begun: float = field(default_factory=time.perf_counter)
+    connection: Any = None  # of the last request
     seq: int | None = None  # of the last request that was answered
     inputs_hash: bytes = b""  # of its observation
     answer: Decision | None = None  # to the last request, for the same request sent again

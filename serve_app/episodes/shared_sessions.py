@@ -152,7 +152,7 @@ class SharedSessions:
                 sessions.end(name, session_id)
             raise
         if session is not None:
-            session.token = record.token  # from now on there are steps
+            session.token, session.begun = record.token, time.perf_counter()  # from now on there are steps
         if before is not None:
             with contextlib.suppress(UnavailableError):  # the link leads here, too
                 await self._put(key, record)
@@ -215,12 +215,14 @@ class SharedSessions:
         if policy is None:  # its action could not be written down
             raise self._lost(request)
         headers = {STAMP_HEADER: stamp} if (stamp := request.headers.get(STAMP_HEADER)) is not None else {}
-        sent = replace(request, headers=headers, reply_options=None, stream=None)
+        now = time.perf_counter()
+        sent = replace(request, headers=headers, reply_options=None, stream=None, connection=None, has_hung_up=None)
         if request.deadline_ms is not None:  # from when the owner has it
-            sent.deadline_ms = request.deadline_ms - (time.perf_counter() - request.received) * 1e3
+            sent.deadline_ms = request.deadline_ms - (now - request.received) * 1e3
         self.hops += 1
         try:
-            found = await asyncio.wait_for(self._peers.call(record.replica, "act", sent, record.token), HOP_TIMEOUT_S)
+            call = self._peers.call(record.replica, "act", sent, record.token, now - request.arrived)
+            found = await asyncio.wait_for(call, HOP_TIMEOUT_S)
         except Exception as error:
             if isinstance(error, ProcessLookupError) and (headers or request.seq is not None):
                 return None  # if it took the step and handed the episode over, the next owner knows this request
@@ -408,7 +410,7 @@ def without_policy(decision: Decision) -> Decision:
 def _bare(session: Session) -> Session:
     """Return a session as it goes to another replica."""
     answer, stamped = (each and without_policy(each) for each in (session.answer, session.stamped))
-    return replace(session, policy=None, answer=answer, stamped=stamped)  # type: ignore[arg-type]  # likewise
+    return replace(session, policy=None, answer=answer, stamped=stamped, begun=0.0)  # type: ignore[arg-type]  # likewise
 
 
 def key_of(name: str, session_id: SessionId) -> str:

@@ -14,6 +14,7 @@ import secrets
 import sys
 import time
 from collections.abc import Awaitable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 from fastapi import FastAPI
@@ -52,6 +53,7 @@ from rlservo.serve_app.wire.request_stamp import STAMP
 logger = logging.getLogger(__name__)
 
 PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
+HANG_UP_TURNS = 4
 TURNS, TURN_S = 4, 0.005  # of the event loop, for what has arrived and not been read
 STAMP_HEADER = STAMP.encode()
 ROOT = "/"  # a page for browsers (`status_page.py`), nothing for programs
@@ -248,6 +250,8 @@ class HttpEndpoint:
             request_id=header_text(headers, REQUEST_ID),
             headers=headers,
             waited=self._core.admission.waited(headers.get(STAMP_HEADER)),
+            connection=client if (client := scope.get("client")) is not None and client[1] else None,  # a proxy's has 0
+            has_hung_up=partial(has_hung_up, receive),
         )
         status = 200
         try:
@@ -263,6 +267,21 @@ class HttpEndpoint:
             return
         await send({"type": "http.response.start", "status": status, "headers": every})
         await send({"type": "http.response.body", "body": content})
+
+
+async def has_hung_up(receive: Receive) -> bool:
+    """Return whether the client of a request that was read to its end has closed its connection.
+
+    What has arrived of that takes a turn of the event loop to be read, one to close the connection, and two to be heard
+    of here.
+    """
+    message = asyncio.ensure_future(receive())
+    for _ in range(HANG_UP_TURNS):
+        await asyncio.sleep(0)
+    if not message.done():
+        message.cancel()
+        return False
+    return bool(message.result()["type"] == "http.disconnect")
 
 
 class WholeBody:

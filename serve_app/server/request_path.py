@@ -256,6 +256,8 @@ class RequestPath:
         single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
         if (len(obs) if single else most_rows(obs)) > self._max_batch:
             self._check_batch(store, request)
+        if request.episode is not None and request.episode.session_id is not None:
+            await self._check_client(store, request)
         began, version = time.perf_counter(), request.version
         while True:
             try:
@@ -289,8 +291,9 @@ class RequestPath:
         assert shared is not None
         if method != "act":
             return shared.adopt(self.store(), *arguments) if method == "adopt" else shared.forget(*arguments)
-        request, token = arguments
+        request, token, under_way_s = arguments
         request.received = time.perf_counter()
+        request.arrived = request.received - under_way_s  # by this machine's clock
         try:
             self.admission.enter()
             while True:
@@ -330,6 +333,16 @@ class RequestPath:
                 "while this request waited for its network, another one of its session was answered: wait for each "
                 "answer, or number the requests ('seq')"
             )
+
+    async def _check_client(self, store: PolicyStore, request: Request) -> None:
+        """Raise ClientGoneError where a session's client gave its request up: its next episode may have begun."""
+        if request.has_hung_up is None or not store.get(request.policy, request.version).is_stateful:
+            return
+        session = self._session_of(request)
+        if session is not None and request.connection is not None and request.connection == session.connection:
+            return
+        if await request.has_hung_up():
+            raise ClientGoneError
 
     def _session_of(self, request: Request) -> Session | None:
         """Return the memory that a request goes on from, of those under ids here."""

@@ -430,6 +430,22 @@ def test_a_reset_that_was_given_up_does_not_come_back(
     asyncio.run(run())
 
 
+@pytest.mark.parametrize("by", [0, 1, 2])
+def test_a_step_under_way_when_its_session_began_again_is_refused_by_every_replica(
+    world: World, obs: Any, by: int
+) -> None:
+    async def run() -> None:
+        replicas = [world.add(), world.add(), world.add()]
+        await replicas[0].act(request("s", obs, reset=True))
+        late = request("s", obs + 0.9)
+        first = await replicas[1].act(request("s", obs - 0.9, reset=True))
+        with pytest.raises(SessionError, match="of the episode before"):
+            await replicas[by].act(late)
+        await steps_are_of(replicas, obs + 0.3, first, obs - 0.9)
+
+    asyncio.run(run())
+
+
 def test_a_reset_held_up_while_its_record_is_swept_begins_nothing(world: World, obs: Any) -> None:
     async def run() -> None:
         slow, quick, ended = world.add(), world.add(), world.add()

@@ -218,7 +218,7 @@ def test_of_requests_of_a_session_that_wait_for_a_network_one_moves_its_memory(
         session = core.episodes.sessions.peek(LIMITED, "arm")
         if not shared or session is None or step.episode is None or step.episode.reset:
             return await core.decide(step)
-        answer = await core.answer_peer("act", step, session.token)
+        answer = await core.answer_peer("act", step, session.token, 0.0)
         if isinstance(answer, Exception):
             raise answer
         return answer
@@ -282,7 +282,7 @@ def test_a_step_that_another_replica_asks_for_waits_for_the_network(core: Core, 
         assert session is not None
         drop(core, LIMITED)
         step = request(LIMITED, OBS[1], episode=Episode(session_id="arm"))
-        return await core.answer_peer("act", step, session.token)
+        return await core.answer_peer("act", step, session.token, 0.0)
 
     with Policy.load(folder / LIMITED / "1", options=OPTIONS[LIMITED]) as alone:
         alone.act(OBS[0])
