@@ -19,6 +19,7 @@ from typing import Any, cast
 
 import shared.ray_settings as ray_settings  # before Ray  # isort: skip
 import numpy as np
+import shared.failures as failures
 import shared.recorded_episodes as recorded_episodes
 import shared.search_space as search_space
 import shared.training_run as training_run
@@ -228,7 +229,10 @@ def learn(config: AlgorithmConfig, episodes: list[SingleAgentEpisode], epochs: i
     with training_run.stopping(training_run.build(config)) as algorithm:
         algorithm.offline_data.episodes = episodes
         for epoch in range(epochs):
-            results = algorithm.train()["learners"]["default_policy"]
+            result = training_run.iterate(algorithm)
+            if not failures.metric(result, failures.TRAINED) > 0:
+                raise errors.RlservoError("nothing was learned: the learner took no step of the recordings")
+            results = result["learners"]["default_policy"]
             losses = "  ".join(f"{name} {float(results[name]):.6g}" for name in sorted(results) if "loss" in name)
             print(f"pass {epoch + 1:>3} of {epochs}  {losses}", flush=True)
         algorithm.save_to_path(str(folder.resolve()))

@@ -283,7 +283,7 @@ def frozen_lake(settings: Settings) -> None:
     with training_run.ray_session(num_cpus=1), training_run.stopping(training_run.build(config)) as algorithm:
         steps, is_solved = 0, False  # one episode tells: without slipping, every episode of a policy is the same
         while not (is_solved and (settings.quick or steps >= EXPLORATION_STEPS)) and steps < 4 * EXPLORATION_STEPS:
-            result = algorithm.train()
+            result = training_run.iterate(algorithm)
             steps = result[STEPS]
             is_solved = result["evaluation"]["env_runners"]["episode_return_mean"] == 1.0
             mean = result["env_runners"].get("episode_return_mean", float("nan"))

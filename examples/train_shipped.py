@@ -31,6 +31,7 @@ import shared.ray_settings as ray_settings  # before Ray  # isort: skip
 import evaluate_shipped
 import gymnasium
 import numpy as np
+import shared.failures as failures
 import shared.resources as resources
 import torch
 import yaml
@@ -45,7 +46,7 @@ from ray.rllib.utils.filter import RunningStat
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from ray.rllib.utils.schedules.scheduler import Scheduler
 from ray.tune.registry import ENV_CREATOR, _global_registry, get_trainable_cls, register_env
-from shared.training_run import main_with_sentences, ray_session
+from shared.training_run import iterate, main_with_sentences, ray_session
 
 from rlservo import Policy, errors, export_checkpoint
 from rlservo.envs.disturbances import HasExtremes
@@ -60,6 +61,7 @@ GAINS = {"encoder": 2**0.5, "pi": 0.01, "vf": 1.0}  # of orthogonal weights, by 
 NEEDED = ("env", "algorithm", "seed", "envs", "filter", "stop")  # of training.yaml
 SHAPING = ("bounds_loss_coeff", "smoothness_loss_coeff", "largest_std")  # what ActionPenaltyLearner knows
 FAILED_KEPT = 16  # episodes, by each environment
+CURVE = ("env_steps", "episodes", "mean_return", "mean_length", "success", "wall_s", "cpu_s")  # a Row's, in the file
 SUMS = ("episodes", "judged", "return", "length", "success")
 
 
@@ -74,6 +76,7 @@ class Row:
     success: float
     wall_s: float
     cpu_s: float
+    trained_steps: float  # what the learner has seen of them, each as often as it was seen
 
 
 def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
@@ -343,7 +346,7 @@ def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
     began, cpu_before, episodes = time.monotonic(), cpu_seconds(), 0
     recent: deque[dict[str, float]] = deque()
     while True:
-        result = cast(dict[str, Any], algorithm.train())
+        result = iterate(algorithm)
         sums = {key: float(value) for key, value in result["env_runners"].get("shipped", {}).items()}
         if sums.get("episodes", 0.0) > 0.0:  # RLlib gives NaN where no episode ended
             episodes += int(sums["episodes"])
@@ -359,6 +362,7 @@ def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
             success=successes / judgements if judgements else float("nan"),
             wall_s=time.monotonic() - began,
             cpu_s=cpu_seconds() - cpu_before,
+            trained_steps=failures.metric(result, failures.TRAINED),
         )
 
 
@@ -434,7 +438,7 @@ def train(
     try:
         with (folder / "curve.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(Row.__dataclass_fields__)
+            writer.writerow(CURVE)
             for row in iterations(algorithm, stop["episodes"]):
                 rows.append(row)
                 writer.writerow(
@@ -461,7 +465,7 @@ def train(
                         value = float("-inf")
                     else:
                         value = validation.success(algorithm, settings)
-                if is_full and value > best:
+                if is_full and value > best and row.trained_steps > 0:
                     best = value
                     algorithm.save_to_path(str(checkpoint.resolve()))
                 if (is_full and value >= stop["value"]) or row.env_steps >= stop["env_steps"]:
@@ -469,9 +473,13 @@ def train(
     except KeyboardInterrupt:
         print("interrupted: what has been reached is kept")
     finally:
-        if best == float("-inf"):  # too short for a first mean: a checkpoint all the same
+        has_learned = bool(rows) and rows[-1].trained_steps > 0
+        if best == float("-inf") and has_learned:  # too short for a first mean: a checkpoint all the same
             algorithm.save_to_path(str(checkpoint.resolve()))
         algorithm.stop()
+    if not has_learned:
+        steps = rows[-1].env_steps if rows else 0
+        raise errors.RlservoError(f"nothing was learned: {failures.nothing_learned(steps)}")
     return rows
 
 

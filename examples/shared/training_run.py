@@ -39,12 +39,14 @@ from ray.tune.registry import get_trainable_cls
 from rich.console import Console
 from rich.table import Table
 
+import shared.failures as failures
 import shared.resources as resources
 from rlservo import errors
+from shared.failures import metric
 
 assert ray_settings
 RETURN = "env_runners/episode_return_mean"
-STEPS = "num_env_steps_sampled_lifetime"
+STEPS = failures.SAMPLED
 RUN_FILE = "run.json"
 INTERRUPTED = 130  # the shell's exit code for Ctrl-C
 
@@ -85,6 +87,7 @@ class Trial:
     settings: dict[str, Any]  # the swept ones
     iterations: int
     env_steps: int
+    trained_steps: float  # what the learner has seen of them, each as often as it was seen
     score: float  # the last one reported
     best_score: float
     best_checkpoint: Path | None
@@ -130,7 +133,8 @@ def default_config(algorithm: str, log_level: str = "ERROR") -> AlgorithmConfig:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         config: AlgorithmConfig = get_trainable_cls(algorithm).get_default_config()
-    return config
+    # RLlib's 60 s before a failed env runner is started again are as long as it waits for a sample.
+    return config.fault_tolerance(delay_between_env_runner_restarts_s=1.0)
 
 
 @contextlib.contextmanager
@@ -262,6 +266,15 @@ def build(config: AlgorithmConfig) -> Any:
     return config.build_algo()
 
 
+def iterate(algorithm: Any) -> dict[str, Any]:
+    """Train an algorithm that was built without Tune for an iteration. Raises RlservoError with the cause."""
+    try:
+        result: dict[str, Any] = algorithm.train()
+    except Exception as error:  # an environment is anyone's code
+        raise errors.RlservoError(f"training failed: {failures.in_a_line(error)}") from error
+    return result
+
+
 @contextlib.contextmanager
 def stopping(algorithm: Any) -> Iterator[Any]:
     """Stop an algorithm that was built without Tune, and remove the folder it makes in ~/ray_results (ray 2.60)."""
@@ -277,7 +290,7 @@ def stopping(algorithm: Any) -> Iterator[Any]:
 
 def pickle_by_value(*modules: ModuleType) -> None:
     """Let checkpoints load, and other nodes run, where the scripts' own files do not exist."""
-    for module in (sys.modules[__name__], *modules):
+    for module in (sys.modules[__name__], failures, *modules):
         cloudpickle.register_pickle_by_value(module)
 
 
@@ -308,15 +321,26 @@ def fill_return(metric: str, mode: str) -> Callable[..., None]:
 
 
 class ProgressTable(tune.Callback):
-    """Prints a row per training iteration, under a header that comes again now and then."""
+    """Prints a row per training iteration, under a header that comes again now and then, and failures as they come."""
 
     HEADER = "{:>8} {:>5} {:>12} {:>10} {:>8} {:>8} {:>10} {:>8} {:>8}".format(
         "trial", "iter", "steps", "return", "length", "success", "eval", "steps/s", "time"
     )
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
         self._rows = 0
         self._reached: set[str] = set()  # trials
+        self._failures = folder / failures.FILE
+        self._failed, _ = failures.read(self._failures)
+        self._told_at = -math.inf
+
+    def on_step_end(self, iteration: int, trials: Any, **info: Any) -> None:
+        if time.monotonic() - self._told_at < failures.PRINT_EVERY_S:
+            return
+        count, last = failures.read(self._failures)
+        if count > self._failed:
+            self._failed, self._told_at = count, time.monotonic()
+            print(f"failed in sampling, {count} so far: {last} (all of them: {self._failures})", flush=True)
 
     def on_trial_result(self, iteration: int, trials: Any, trial: Any, result: dict[str, Any], **info: Any) -> None:
         if self._rows % 25 == 0:
@@ -369,6 +393,7 @@ def train(
     name = f"{run.algorithm}-{run.env_id.split('/')[-1].split(':')[-1]}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder = _new_folder(storage, name)
     (folder / RUN_FILE).write_text(json.dumps(asdict(run) | {"swept": list(swept)}, indent=2) + "\n")
+    failures.watch(config, folder)
     print(f"run: {folder}\ncurves: tensorboard --logdir {folder}", flush=True)
     print("Ctrl-C stops" + (f"; --resume {folder} goes on" if resumable else ""), flush=True)
     tuner = tune.Tuner(
@@ -395,7 +420,7 @@ def train(
                 checkpoint_frequency=checkpoint_frequency,
                 checkpoint_at_end=True,
             ),
-            callbacks=[ProgressTable()],
+            callbacks=[ProgressTable(folder)],
             verbose=0,
         ),
     )
@@ -491,6 +516,8 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
             f"training failed: {_cause(failed[0].error)}; all of it is in {failed[0].path}/error.txt, and "
             f"--resume {folder} goes on from the last checkpoint"
         )
+    if not any(trial.trained_steps for trial in trials):
+        raise errors.RlservoError(f"nothing was learned: {failures.nothing_learned(trials[0].env_steps, folder)}")
     sign = -1.0 if run.mode == "max" else 1.0
     # A trial without a score comes last.
     trials.sort(key=lambda one: sign * one.best_score if math.isfinite(one.best_score) else math.inf)
@@ -502,9 +529,11 @@ def _trial(result: Any, run: Run, swept: Sequence[str]) -> Trial:
     scores = [
         (score, Path(checkpoint.path))
         for checkpoint, at in result.best_checkpoints
-        if math.isfinite(score := _metric(at, run.metric))
+        if math.isfinite(score := metric(at, run.metric))
     ]
-    newest = Path(result.checkpoint.path) if result.checkpoint else None
+    trained_steps = metric(metrics, failures.TRAINED)
+    is_judged = scores or not run.metric.startswith("evaluation/")
+    newest = Path(result.checkpoint.path) if result.checkpoint and trained_steps > 0 and is_judged else None
     best = (max if run.mode == "max" else min)(scores, default=(math.nan, newest), key=lambda pair: pair[0])
     config = result.config or {}
     return Trial(
@@ -512,22 +541,13 @@ def _trial(result: Any, run: Run, swept: Sequence[str]) -> Trial:
         settings={name: config.get(name, config.get(f"_{name}")) for name in swept},  # RLlib keeps some as properties
         iterations=int(metrics.get("training_iteration", 0)),
         env_steps=int(metrics.get(STEPS, 0)),
-        score=_metric(metrics, run.metric),
+        trained_steps=trained_steps if trained_steps > 0 else 0.0,
+        score=metric(metrics, run.metric),
         best_score=best[0],
         best_checkpoint=best[1],
         seconds=float(metrics.get("time_total_s", 0.0)),
         folder=Path(result.path),
     )
-
-
-def _metric(result: Mapping[str, Any], metric: str) -> float:
-    if metric in result:
-        value: Any = result[metric]
-    else:
-        value = result
-        for key in metric.split("/"):
-            value = value.get(key) if isinstance(value, Mapping) else None
-    return float(value) if isinstance(value, int | float) else math.nan
 
 
 def _first_line(error: BaseException) -> str:
@@ -549,7 +569,7 @@ def best_checkpoint_of(outcome: Outcome) -> Path:
     for trial in outcome.trials:
         if trial.best_checkpoint is not None:
             return trial.best_checkpoint
-    raise errors.RlservoError(f"{outcome.folder} holds no checkpoint: the training ended before the first one")
+    raise errors.RlservoError(f"{outcome.folder} holds no checkpoint that learned and has a score")
 
 
 def report(outcome: Outcome, run: Run) -> None:
@@ -599,7 +619,7 @@ def plot_curves(outcome: Outcome, run: Run) -> Path | None:
         for line in (trial.folder / "result.json").read_text().splitlines():
             with contextlib.suppress(ValueError):  # a line cut off by a crash
                 result = json.loads(line)
-                points.append((result.get(STEPS, 0), _metric(result, run.metric)))
+                points.append((result.get(STEPS, 0), metric(result, run.metric)))
         points = [(steps, score) for steps, score in points if math.isfinite(score)]
         if points:
             settings = ", ".join(f"{name}={_plain(value)}" for name, value in trial.settings.items())

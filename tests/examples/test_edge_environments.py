@@ -56,3 +56,23 @@ def test_crashes_are_survived_by_remaking_the_environment_or_the_runner(name: st
 def test_crash_in_the_driver_without_the_flag_ends_the_training_with_its_cause(edges: Any) -> None:
     found = edges[1]["Crashing for good"]
     assert re.search(r"training failed: .*error.txt, and --resume .* goes on", found["error"])
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("Failing", "no step was sampled: RuntimeError: the gripper is not calibrated .*failures.txt"),
+        ("Failing remade", "crashed 100 times without a sample: RuntimeError: the gripper is not calibrated"),
+        ("Failing evaluation", "no step was evaluated: RuntimeError: the gripper is not calibrated"),
+        ("Float64 unlearned", "nothing was learned: .* the training stopped before the learner took any"),
+    ],
+)
+def test_what_learned_nothing_is_not_exported_and_the_cause_is_told(name: str, sentence: str, edges: Any) -> None:
+    folder, found = edges
+    assert re.search(sentence, found[name].get("error", "")), found[name]
+    assert not list((folder / "policies").glob(f"{name.replace(' ', '-')}*"))
+
+
+def test_failure_is_printed_when_it_happens(edges: Any) -> None:
+    said = edges[1]["Failing"]["said"]
+    assert re.search(r"^failed in sampling, 1 so far: RuntimeError: the gripper is not calibrated", said, re.MULTILINE)

@@ -31,10 +31,19 @@ RUNS = {
         "--stop-iters", "100000", "--stop-timesteps", "300",
     ],
     "Crashing for good": ["--stop-iters", "50"],
+    "Failing": ["--num-cpus", "1", *ON_ONE_CORE],
+    "Failing remade": ["--restart-failed-sub-environments"],
+    "Failing evaluation": [
+        "--env-arg", "fails=false", "--evaluation-interval", "1", "--evaluation-num-env-runners", "1", *ON_ONE_CORE,
+    ],
+    "Float64 unlearned": ["--run", "SAC", "--stop-timesteps", "300"],
 }  # fmt: skip
 
 
-TUNED = ("Endless", "Crashing for good")  # what Tune makes of no return, and of a trial that fails
+# What Tune makes of no return, of a trial that fails, and of nothing learned.
+TUNED = (
+    "Endless", "Crashing for good", "Failing", "Failing remade", "Failing evaluation", "Float64 unlearned",
+)  # fmt: skip
 
 
 def main() -> None:
@@ -46,7 +55,7 @@ def main() -> None:
         common = ["--num-cpus", "0", "--name-env", env, "--stop-iters", "2", "--hidden", "16"]
         if name.startswith("Crashing"):
             common += ["--env-arg", f"log={folder / name.replace(' ', '_')}.txt"]
-        own = more if "DQN" in more else [*more, "--set", "train_batch_size_per_learner=300", "--set", "num_epochs=2"]
+        own = more if "--run" in more else [*more, "--set", "train_batch_size_per_learner=300", "--set", "num_epochs=2"]
         parser = simple_trainer.argument_parser()
         args = parser.parse_args([*common, *own])
         simple_trainer.check_arguments(parser, args)
@@ -54,6 +63,8 @@ def main() -> None:
         with contextlib.redirect_stdout(said):
             try:
                 config, run, _ = simple_trainer.set_up(args)
+                if name == "Failing evaluation":
+                    config.evaluation(evaluation_config={"env_config": {"fails": True}})
                 stop = {"training_iteration": args.stop_iters, training_run.STEPS: args.stop_timesteps}
                 train = train_with_tune if name in TUNED else train_here
                 checkpoint, steps = train(config, run, folder / "runs" / name, stop)

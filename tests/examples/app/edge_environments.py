@@ -67,6 +67,18 @@ class Endless(Float64):
     length = 1_000_000
 
 
+class Failing(Promises32):
+    """Fails in every sample, or only where the policy is evaluated."""
+
+    def __init__(self, fails: bool = True) -> None:
+        self._fails = fails
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self._fails:
+            raise RuntimeError("the gripper is not calibrated")
+        return super().step(action)
+
+
 class Crashing(Promises32):
     """Fails after 60 steps of its life, as a simulator does now and then, until `log` has seen it `crashes` times."""
 
@@ -84,5 +96,5 @@ class Crashing(Promises32):
         return super().step(action)
 
 
-for kind in (Float64, Promises32, Camera, Endless, Crashing):
+for kind in (Float64, Promises32, Camera, Endless, Failing, Crashing):
     gym.register(f"edge/{kind.__name__}-v0", f"{__name__}:{kind.__name__}")

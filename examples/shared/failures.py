@@ -1,0 +1,168 @@
+"""Failures in RLlib's env runners: written beside the run, printed at once, and the end of a run that samples nothing.
+
+Where a sample fails, RLlib (2.60) logs the error in the env runner's process, ends that process and starts another. The
+process that trains sees an iteration without a step; the user sees nothing, and is left with an untrained policy.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import socket
+import time
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+
+FILE = "failures.txt"
+SAMPLED = "num_env_steps_sampled_lifetime"
+EVALUATED = f"evaluation/env_runners/{SAMPLED}"
+TRAINED = "learners/__all_modules__/num_env_steps_trained_lifetime"
+PATIENCE_S, PATIENCE = 180.0, 3  # no step for so long and in so many iterations: the training fails
+MADE_AT_MOST = 100  # environments for one sample, where those that crash are made again
+PRINT_EVERY_S = 10.0  # while more of them fail
+HEAD = "--- "  # begins the line that names a failure; its traceback follows
+
+
+def watch(config: AlgorithmConfig, folder: Path) -> None:
+    """Let env runners write their failures into `folder`, and the training fail when nothing is sampled any more."""
+    file = folder / FILE
+    sampling, evaluating = Drought("sampled", file), Drought("evaluated", file)
+    made = {"environments": 0}  # of each process: callbacks are pickled into it
+
+    def on_environment_created(**_: Any) -> None:
+        _write_errors(file)
+        made["environments"] += 1
+        if made["environments"] > MADE_AT_MOST:
+            raise RuntimeError(f"an environment crashed {MADE_AT_MOST} times without a sample{_last_words(file)}")
+
+    def on_sample_end(**_: Any) -> None:
+        made["environments"] = 0
+
+    def on_evaluate_end(**_: Any) -> None:
+        evaluating.is_due = True
+
+    def on_train_result(*, result: dict[str, Any], **_: Any) -> None:
+        sampling.is_due = True
+        sampling.check(metric(result, SAMPLED))
+        evaluating.check(metric(result, EVALUATED))
+        if evaluating.empty:  # RLlib repeats the results of the evaluation before
+            result["evaluation"]["env_runners"] = {}
+
+    for name, callback in (
+        ("on_environment_created", on_environment_created),
+        ("on_sample_end", on_sample_end),
+        ("on_evaluate_end", on_evaluate_end),
+        ("on_train_result", on_train_result),
+    ):
+        others = getattr(config, f"callbacks_{name}") or []
+        config.callbacks(**{name: [callback, *(others if isinstance(others, list) else [others])]})
+
+
+def metric(result: Mapping[str, Any], name: str) -> float:
+    """Return a number of a result by its path (`env_runners/num_episodes`), nested or flat; NaN where it is none."""
+    value: Any = result.get(name)
+    if value is None:
+        value = result
+        for key in name.split("/"):
+            value = value.get(key) if isinstance(value, Mapping) else None
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+@dataclass
+class Drought:
+    """Consecutive iterations without a step, of training or of evaluation."""
+
+    what: str
+    file: Path
+    is_due: bool = False
+    steps: float = 0.0
+    empty: int = 0
+    since: float = field(default_factory=time.monotonic)
+
+    def check(self, steps: float) -> None:
+        """Raise RuntimeError when there was no step for too long, or never one and the environment failed."""
+        if not self.is_due:
+            return
+        self.is_due = False
+        now = time.monotonic()
+        if steps > self.steps:
+            self.steps, self.empty, self.since = steps, 0, now
+            return
+        self.empty += 1
+        has_failed = self.steps == 0 and self.file.exists()
+        if has_failed or (self.empty >= PATIENCE and now - self.since >= PATIENCE_S):
+            iterations = f" in {self.empty} iterations" if self.empty > 1 else ""
+            raise RuntimeError(f"no step was {self.what}{iterations}{_last_words(self.file)}")
+
+
+def _last_words(file: Path) -> str:
+    count, last = read(file)
+    if count:
+        return f": {last} (the traceback is in {file})"
+    return (
+        ", and no environment has failed: env runners were killed (is memory short?), or a sample takes longer than "
+        "sample_timeout_s (60 s by default)"
+    )
+
+
+def nothing_learned(steps: float, folder: Path | None = None) -> str:
+    """Return in words why a learner has seen no step of those that were sampled."""
+    if steps == 0:
+        return "no step was sampled" + (_last_words(folder / FILE) if folder else "")
+    return (
+        f"{steps:,.0f} steps were sampled, and the training stopped before the learner took any (DQN and SAC begin "
+        "after num_steps_sampled_before_learning_starts): train for longer"
+    )
+
+
+def read(file: Path) -> tuple[int, str]:
+    """Return how many failures were written, and the last one's exception in a line."""
+    try:
+        heads = [line for line in file.read_text(encoding="utf-8").splitlines() if line.startswith(HEAD)]
+    except FileNotFoundError:
+        return 0, ""
+    return len(heads), heads[-1].split(": ", 1)[1] if heads else ""
+
+
+def in_a_line(error: BaseException) -> str:
+    """Return the exception at the root, an environment's own."""
+    root = _root(error)
+    return " ".join(f"{type(root).__name__}: {root}".split())
+
+
+def _root(error: BaseException) -> BaseException:
+    while error.__cause__ is not None:  # RLlib raises a RuntimeError without words from it
+        error = error.__cause__
+    return error
+
+
+def _write_errors(file: Path) -> None:
+    loggers = [logging.getLogger(name) for name in ("ray.rllib", "rlservo")]  # ours: that of the batched env runner
+    if not any(handler.get_name() == str(file) for handler in loggers[0].handlers):
+        handler = _ErrorWriter(file)
+        for logger in loggers:
+            logger.addHandler(handler)
+
+
+class _ErrorWriter(logging.Handler):
+    """Appends each exception that RLlib logs in this process to the file."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__(logging.ERROR)
+        self.set_name(str(file))
+        self._file = file
+        self._last: BaseException | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        cause = _root(record.exc_info[1]) if record.exc_info and record.exc_info[1] else None
+        if cause is None or cause is self._last:  # it is logged where it is caught, and where the process ends
+            return
+        self._last = cause
+        place = f"{time.strftime('%Y-%m-%d %H.%M.%S')}, process {record.process} on {socket.gethostname()}"
+        with self._file.open("a", encoding="utf-8") as out:
+            out.write(f"{HEAD}{place}: {in_a_line(cause)}\n{''.join(traceback.format_exception(cause))}\n")
