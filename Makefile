@@ -8,11 +8,10 @@ STAMP := $(VENV)/.installed
 # wait for time to pass.
 UNITS := tests/serve_app tests/envs/test_registration.py tests/export/checkpoints/test_experiment.py \
 	tests/test_layout.py tests/test_package.py
-NOT_UNITS := $(addprefix --ignore=tests/serve_app/, ray_serve/test_haproxy_wrapper.py \
-	ray_serve/test_http_connections.py client/test_bad_line.py client/test_client_faults.py replay \
+NOT_UNITS := $(addprefix --ignore=tests/serve_app/, engines client/test_bad_line.py client/test_client_faults.py replay \
 	versions/test_remote_repository.py)
 
-.PHONY: demo test quick check bench soak faults wheel setup clean
+.PHONY: demo test quick check bench wheel setup clean
 
 demo: setup  ## Export the two shipped checkpoints, serve them, drive both simulators; a table and a picture in demo/
 	$(BIN)/rlservo demo --out demo
@@ -30,20 +29,12 @@ check: setup  ## Lint, format and types, as CI runs them
 	$(BIN)/mypy
 	$(BIN)/pyright
 
-bench: setup  ## Simulator, training, export and serving speed, printed and written to bench/
+bench: setup  ## Simulator, training, and export speed, printed and written to bench/
 	$(BIN)/python benchmarks/simulators.py
 	$(BIN)/python benchmarks/robot_server.py
 	$(BIN)/python benchmarks/vectorisation.py --quick
 	$(BIN)/python benchmarks/training.py --quick
 	$(BIN)/python benchmarks/export_policy.py
-	$(BIN)/python benchmarks/serving.py
-
-soak: setup  ## Ten minutes of mixed load over every protocol: wrong answers, and whether memory stays flat
-	$(BIN)/python benchmarks/soak.py
-
-faults: setup  ## What clients see when replicas, proxy and controller are killed, and when deployments change
-	$(BIN)/python benchmarks/faults.py
-	$(BIN)/python benchmarks/faults.py --on cluster
 
 wheel: setup  ## Build the wheel into dist/
 	$(BIN)/python -m build --wheel --outdir dist .

@@ -16,6 +16,7 @@ import itertools
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -31,8 +32,6 @@ import psutil
 from playwright.sync_api import sync_playwright
 from rich.console import Console
 from rich.table import Table
-
-from rlservo.serve_app.ray_serve.ports import free_ports
 
 SETTLE_S = 4.0  # shaders are compiled, viser has settled on a resolution
 PATIENCE_S = 120.0
@@ -129,6 +128,12 @@ def look(browser: Any, address: str, window: str, arguments: Any, pids: dict[str
     return (window, *result), graphics
 
 
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port: int = free.getsockname()[1]
+    return port
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Measure the cockpit in a browser.")
     parser.add_argument("policies", type=Path, help="folder of bundles")
@@ -142,7 +147,7 @@ def main() -> None:
     path = shutil.which(arguments.browser)
     if path is None:
         parser.error(f"--browser {arguments.browser}: there is no such program")
-    server_port, page_port = free_ports(2)
+    server_port, page_port = free_port(), free_port()
     url = f"http://127.0.0.1:{server_port}"
     table = Table(title="Cockpit")
     for column in ("window", "canvas", "drawn /s", "published /s", "ms of processor time for a frame"):

@@ -15,7 +15,6 @@ import typer
 
 import rlservo
 from rlservo.deploy import (
-    cluster_commands,
     cockpit_commands,
     export_commands,
     log_commands,
@@ -85,7 +84,6 @@ for command in (
 app.add_typer(robot_commands.robot_server, name="robot-server")
 policy_commands.policy.command()(promote_command.promote)
 app.add_typer(policy_commands.policy, name="policy")
-app.add_typer(cluster_commands.cluster, name="cluster")
 app.add_typer(log_commands.log, name="log")
 
 

@@ -28,15 +28,11 @@ def serve(
         ),
     ],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 is any free one.")] = 8000,
     grpc_port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC, here.")
     ] = None,
-    direct_port: Annotated[
-        int | None,
-        typer.Option(min=1, max=65535, help="The replicas listen here themselves, too: a shorter way."),
-    ] = None,
-    replicas: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
     default_policy: Annotated[
         str | None,
         typer.Option(
@@ -57,14 +53,17 @@ def serve(
     canary: policy_commands.CanaryOption = None,
     shadow: policy_commands.ShadowOption = None,
 ) -> None:
-    """Serve policies with Ray Serve until Ctrl-C. Nothing is left running afterwards.
+    """Serve policies on this machine until Ctrl-C. On a cluster, Ray's `serve deploy` does it (docs/cluster.md).
 
     Example: `rlservo serve policies`, then
     `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`
     """
     with needs_extra("serve"):
-        from rlservo.serve_app.ray_serve.launcher import RunningServer, serve_policies
+        from rlservo.serve_app.engines.local import RunningServer, serve_policies
         from rlservo.serve_app.wire.admin_key_file import key_file
+    if record is not None:
+        with needs_extra("record"):
+            import rlservo.serve_app.recording.log_file  # noqa: F401
 
     def ready(served: RunningServer) -> None:
         for name, default in served.policies:
@@ -73,18 +72,10 @@ def serve(
             )
         if served.grpc is not None:
             terminal.output().print(f"{served.grpc}  gRPC, Open Inference Protocol", highlight=False, soft_wrap=True)
-        if served.direct is not None:
-            terminal.output().print(f"{served.direct}  without the proxy", highlight=False, soft_wrap=True)
-        if not served.haproxy:
-            terminal.errors().print(
-                "HAProxy is not installed here: Ray's own proxy answers, at several times the latency"
-            )
         if served.admin_key_file is not None:
             note(f"administration: rlservo policy --help; its key is in {served.admin_key_file}")
         terminal.output().print(
-            f"ready; what runs: {served.url} in a browser (API: {served.url}/docs); Ctrl-C stops",
-            highlight=False,
-            soft_wrap=True,
+            f"ready; status page: {served.url} (API: {served.url}/docs); Ctrl-C stops", highlight=False, soft_wrap=True
         )
 
     serve_policies(
@@ -92,12 +83,11 @@ def serve(
         host=host,
         port=port,
         grpc_port=grpc_port,
-        replicas=replicas,
+        workers=workers,
         settings={
             name: value
             for name, value in (
                 ("default_policy", default_policy),
-                ("direct_port", direct_port),
                 ("record", record and str(record)),
                 ("poll_s", poll),
             )
@@ -105,8 +95,8 @@ def serve(
         },
         served=policy_commands.served_config(config, versions, alias, canary, shadow),
         admin_key_file=key_file(port),
-        on_start=lambda: terminal.errors().print("starting Ray Serve ...", style="dim"),
         on_ready=ready,
+        on_stop=lambda: note("stopping: requests in progress are answered first"),
     )
 
 

@@ -24,7 +24,7 @@ from PIL import Image
 from browser import browser_program
 from bundles import write_bundle
 from rlservo.export.contract import bundle as bundle_files
-from rlservo.serve_app.ray_serve.ports import free_ports
+from servers import free_ports
 
 FLAGS = (
     "--no-sandbox",

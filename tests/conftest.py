@@ -20,6 +20,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 pytest_plugins = [
+    "servers",  # which others import
     "quick_rllib",  # its settings, for the tests that import RLlib
     "browser",
     "checkpoints",
@@ -27,7 +28,6 @@ pytest_plugins = [
     "clusters",
     "cockpits",
     "environments",
-    "servers",
     "storages",
     "trainings",
 ]
@@ -40,15 +40,13 @@ TOGETHER = {
     "tests/system/test_serving.py": "live server",
     "tests/system/test_serving_fuzz.py": "live server",
     "tests/system/test_serving_grpc.py": "live server",
-    "tests/system/test_serving_network.py": "live server",
     "tests/system/test_serving_protocols.py": "live server",
     "tests/system/test_serving_sessions.py": "live server",
-    "tests/serve_app/protocols/test_access.py::test_on_ray_serve": "live server",
-    "tests/serve_app/protocols/test_status_page.py::test_on_ray_serve": "live server",
-    "tests/serve_app/protocols/test_web_pages.py::test_on_ray_serve": "live server",
+    "tests/serve_app/protocols/test_access.py::test_live": "live server",
+    "tests/serve_app/protocols/test_status_page.py::test_live": "live server",
+    "tests/serve_app/protocols/test_web_pages.py::test_live": "live server",
     "tests/system/test_robo_gym_client.py": "shipped server",
     "tests/system/test_served_policies.py": "shipped server",
-    "tests/system/test_cluster_check.py": "cluster",
     "tests/system/test_policies_under_load.py": "cluster",
     "tests/benchmarks/test_training_benchmark.py": "one Ray",
     "tests/examples/test_edge_environments.py": "one Ray",
@@ -69,11 +67,10 @@ LONGEST = (
     "live server", "one Ray", "cluster", "shipped server", "tests/test_python_versions.py",
     "tests/serve_app/versions/test_remote_repository.py", "ports of server managers",
     "tests/deploy/cockpit/test_page.py", "tests/examples/test_on_a_cluster.py", "tests/system/test_demo.py",
-    "tests/system/test_serving_starts.py", "tests/serve_app/ray_serve/test_haproxy_wrapper.py", "sweep",
-    "tests/system/test_serving_replicas.py", "tests/export/rllib/test_new_stack.py", "several nodes",
+    "tests/system/test_embedded_server.py", "sweep",
+    "tests/export/rllib/test_new_stack.py", "several nodes",
     "tests/serve_app/client/test_bad_line.py", "tests/deploy/test_compose_server.py",
-    "tests/serve_app/ray_serve/test_http_connections.py", "tests/system/test_faults.py",
-    "tests/system/test_remote_repository.py", "tests/serve_app/ray_serve/test_direct_server.py",
+    "tests/system/test_remote_repository.py",
     # of `make quick`
     "tests/serve_app/protocols/test_access.py", "tests/serve_app/recording/test_recorder.py",
     "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_api_key_file.py",

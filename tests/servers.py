@@ -6,6 +6,7 @@ import contextlib
 import http.client
 import json
 import os
+import random
 import secrets
 import shutil
 import signal
@@ -17,15 +18,15 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 import uvicorn
 
-from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.ports import check_port, free_ports, port_holder
+from rlservo.serve_app.engines.local import serve_policies
+from rlservo.serve_app.engines.ports import listen, port_holder
 from rlservo.serve_app.server.api_keys import new_key
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,16 +37,15 @@ RUN_ID = "RLSERVO_TEST"  # inherited by every process a test starts, however far
 STREAM_IDLE_S = 8.0  # of the live server
 CONNECTIONS_PER_ADDRESS = 300
 
-# Runs the launcher in a process's main thread, as the command line does, and tells when it is ready.
+# Runs the embedded server in a process's main thread, as the command line does, and prints when it is ready.
 LAUNCH = """
 import json, pathlib, sys
 from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.ray_serve import launcher
-launcher.START_TIMEOUT_S = 480  # a busy machine
+from rlservo.serve_app.engines.local import serve_policies
 plan = json.loads(sys.argv[1])
 key_file = plan.pop("admin_key_file")
 try:
-    launcher.serve_policies(
+    serve_policies(
         **plan,
         admin_key_file=key_file and pathlib.Path(key_file),
         on_ready=lambda served: print("READY", served.url, flush=True),
@@ -54,6 +54,31 @@ except RlservoError as error:
     print("FAILED", error.message, flush=True)
     sys.exit(1)
 """
+
+
+PORTS = range(20_000, 30_000)  # below those of outgoing connections (Linux: 32768 and up)
+
+
+def free_ports(count: int) -> list[int]:
+    """Return free ports that no other process of the tests takes while this one lives.
+
+    The system's own choice (port 0) would be one of those it also gives to outgoing connections. A claim is a Unix
+    socket's name, which goes with its process.
+    """
+    found: list[int] = []
+    for port in random.SystemRandom().sample(PORTS, len(PORTS)):
+        if len(found) == count:
+            return found
+        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            claim.bind(f"\0rlservo-test-{port}")
+            socket.create_server(("", port)).close()
+        except OSError:
+            claim.close()
+        else:
+            claim.detach()  # open, and with it the claim, until this process ends
+            found.append(port)
+    raise AssertionError(f"{len(found)} of {count} ports are free")
 
 
 def connected(address: int | Path, timeout_s: float) -> socket.socket:
@@ -126,12 +151,18 @@ class Run:
     run_id: str
     grpc_port: int | None = None
     key_file: Path | None = None
+    output: list[str] = field(default_factory=list)
 
     def wait_until_ready(self) -> None:
-        """Wait for the launcher's own word."""
+        """Wait until the server prints that it is ready; what it prints, its log, is kept in `output`."""
         assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line.startswith("READY"), line + self.process.stdout.read()
+        for line in self.process.stdout:
+            self.output.append(line)
+            if line.startswith("READY"):
+                # Read on, so that the pipe never fills.
+                threading.Thread(target=self.output.extend, args=(self.process.stdout,), daemon=True).start()
+                return
+        raise AssertionError("".join(self.output))
 
     @property
     def folder(self) -> Path:
@@ -165,7 +196,7 @@ class Run:
         assert left == []
         assert self.key_file is None or not self.key_file.exists()
         assert port_holder(self.port) is None
-        check_port("127.0.0.1", self.port)
+        listen("127.0.0.1", self.port).close()
 
 
 def processes_of(run_id: str) -> dict[int, str]:
@@ -214,7 +245,7 @@ def running(arguments: Sequence[str], port: int, **environment: str) -> Iterator
 @contextlib.contextmanager
 def launched(
     *dirs: Path,
-    replicas: int = 1,
+    workers: int = 1,
     with_grpc: bool = False,
     with_admin_key: bool = False,
     settings: Mapping[str, Any] | None = None,
@@ -222,14 +253,14 @@ def launched(
     **environment: str,
 ) -> Iterator[Run]:
     """Start `serve_policies` in processes of its own. Whoever calls ends it, or whatever is left of it is killed."""
-    port, grpc_port, *_ = (one for one in free_ports(3) if one != (settings or {}).get("direct_port"))
+    port, grpc_port = free_ports(2)
     with tempfile.TemporaryDirectory() as keys:
         key_file = Path(keys, "admin.key") if with_admin_key else None
         plan = {
-            "dirs": list(map(str, dirs)),
+            "places": list(map(str, dirs)),
             "port": port,
             "grpc_port": grpc_port if with_grpc else None,
-            "replicas": replicas,
+            "workers": workers,
             "settings": dict(settings or {}),
             "admin_key_file": key_file and str(key_file),
         }
@@ -240,7 +271,7 @@ def launched(
 
 @dataclass(frozen=True)
 class LiveServer:
-    """A policy server on Ray Serve, with a key, gRPC, a log file and a recording."""
+    """An embedded server with a key, gRPC, a log file and a recording."""
 
     run: Run
     port: int
@@ -258,8 +289,8 @@ class LiveServer:
 def live_server(policies: Path, recurrent: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
     """`rlservo serve`, once for all the tests that need nothing special of it; no admin key.
 
-    It is started as a shell script's background job is: with SIGINT ignored. And with a RAY_ADDRESS that leads nowhere.
-    SIGINT ends it, in order, with nothing left.
+    It is started as a shell script's background job is: with SIGINT ignored.
+    SIGINT ends it, with nothing left.
     """
     key, line = new_key("tests")
     log = tmp_path_factory.mktemp("log") / "server.jsonl"
@@ -274,9 +305,7 @@ def live_server(policies: Path, recurrent: Path, tmp_path_factory: pytest.TempPa
         "max_connections_per_address": CONNECTIONS_PER_ADDRESS,
     }
     ignoring = ("sh", "-c", "trap '' INT; exec \"$@\"", "sh")
-    with launched(
-        policies, recurrent, with_grpc=True, settings=settings, prefix=ignoring, RAY_ADDRESS="127.0.0.1:1"
-    ) as run:
+    with launched(policies, recurrent, with_grpc=True, settings=settings, prefix=ignoring) as run:
         run.wait_until_ready()
         assert run.grpc_port is not None
         yield LiveServer(run, run.port, run.grpc_port, key, log, recorded)

@@ -41,8 +41,9 @@ MAY_IMPORT: dict[str, set[str]] = {
         "export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/episodes", "serve_app/server",
         "serve_app/wire",
     },
-    "serve_app/ray_serve": {
-        "export/contract", "serve_app/versions", "serve_app/server", "serve_app/protocols", "serve_app/wire",
+    "serve_app/engines": {
+        "export/contract", "serve_app/versions", "serve_app/episodes", "serve_app/server", "serve_app/protocols",
+        "serve_app/wire",
     },
     "envs": {"serve_app/wire"},
     "deploy": {"envs", "export", "serve_app"},
@@ -52,15 +53,15 @@ MAY_IMPORT: dict[str, set[str]] = {
 
 # The folders (or files) that may import a library, by the library's dotted name. The longest name that fits counts.
 ONLY_IN: dict[str, tuple[str, ...]] = {
-    "ray": ("export/rllib/", "serve_app/ray_serve/"),
-    "ray.serve": ("serve_app/ray_serve/",),
+    "ray": ("export/rllib/", "serve_app/engines/ray_serve.py"),
+    "ray.serve": ("serve_app/engines/ray_serve.py",),
     "ray.rllib": ("export/rllib/",),
     "ray.tune": ("export/rllib/",),
-    "uvicorn": ("serve_app/ray_serve/",),
+    "uvicorn": ("serve_app/engines/local.py", "serve_app/engines/http_bounds.py"),
     "fastapi": ("serve_app/protocols/",),
     "torch": ("export/graph/", "export/proof/", "export/rllib/"),
     "mujoco": ("envs/",),
-    "grpc": ("envs/robot_server/", "serve_app/protocols/", "serve_app/ray_serve/"),
+    "grpc": ("envs/robot_server/", "serve_app/protocols/", "serve_app/engines/"),
     "google.protobuf": (
         "envs/robot_server/", "serve_app/protocols/oip_grpc.py", "serve_app/wire/protobuf_messages.py",
     ),
@@ -72,17 +73,14 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "minari": ("serve_app/recording/minari_export.py",),
     "httpx": (),
     "httpcore": ("serve_app/client/deadline_backend.py", "serve_app/client/http_transport.py"),
-    "websockets": (
-        "deploy/cockpit/page.py", "serve_app/client/websocket_connection.py", "serve_app/ray_serve/uvicorn_parts.py",
-        "serve_app/ray_serve/websocket_connections.py",
-    ),
+    "websockets": ("deploy/cockpit/page.py", "serve_app/client/websocket_connection.py"),
     "viser": ("deploy/cockpit/",),
     "trimesh": ("deploy/cockpit/meshes.py", "deploy/cockpit/scenery.py"),
     "pickle": ("export/checkpoints/unpickle.py",),
     "onnxruntime": ("export/contract/ort_session.py", "serve_app/runtime/"),
     "asyncio": (
         "serve_app/versions/", "serve_app/episodes/", "serve_app/server/", "serve_app/protocols/",
-        "serve_app/ray_serve/",
+        "serve_app/engines/",
     ),
 }  # fmt: skip
 

@@ -10,6 +10,7 @@ import json
 import shlex
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -29,7 +30,6 @@ from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.interface import ActingPolicy, Observation
-from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.rollout.control_loop import rollout
 
 FIRST_SEED = 10_000  # not among the seeds the policies were trained with
@@ -80,7 +80,7 @@ def run_demo(
         for robot in ROBOTS
     )
 
-    console.rule("2  serve: both policies on one Ray Serve endpoint")
+    console.rule("2  serve: both policies on one endpoint")
     runs: list[RobotRun] = []
     counts = ("--episodes", str(episodes), "--seed", str(FIRST_SEED))
     with ends_like_ctrl_c(), _server(console, repository, out / "server.log") as url:
@@ -145,7 +145,8 @@ def _run(commands: Iterable[list[str]]) -> None:
 @contextmanager
 def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
     """Run `rlservo serve` on a free port until the block ends; stop it as Ctrl-C would."""
-    (port,) = free_ports(1)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
     words = ("serve", str(repository), "--port", str(port))
     show(console, words)
     url = f"http://127.0.0.1:{port}"
@@ -159,7 +160,7 @@ def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
             preexec_fn=_end_with_parent,
         )
         try:
-            with console.status("starting Ray Serve (about 10 s) ..."):
+            with console.status("starting the server ..."):
                 _wait_until_ready(server, url, log)
             console.print(f"serving at {url} (its log: {log})", markup=False)
             yield url

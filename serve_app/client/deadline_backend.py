@@ -26,8 +26,6 @@ class DeadlineBackend(httpcore.NetworkBackend):
         self._backend = httpcore.SyncBackend()
         self._local = threading.local()
         self.connections = 0
-        self.offered: dict[tuple[str, int], float] = {}
-        """Addresses that are connected to once, and only until then (`time.monotonic`): nobody knows who is there."""
 
     @property
     def deadline(self) -> float | None:
@@ -56,10 +54,6 @@ class DeadlineBackend(httpcore.NetworkBackend):
         socket_options: Iterable[Any] | None = None,
     ) -> httpcore.NetworkStream:
         """Connect."""
-        if (host, port) in self.offered:
-            if time.monotonic() > self.offered[host, port]:
-                raise httpcore.ConnectError("its offer is too old")
-            self.offered[host, port] = float("-inf")
         remaining_s = self.remaining(timeout, httpcore.ConnectTimeout)
         stream = self._backend.connect_tcp(host, port, remaining_s, local_address, socket_options)
         self.connections += 1

@@ -1,9 +1,5 @@
 """HTTP calls to a policy server: JSON both ways, one time budget, bounded retries, our own errors.
 
-A server may offer a way without its proxy to clients on its own machine (`wire/direct_offer.py`). It is taken from the
-next call on, and left for the proxy's as soon as it fails: a call that did not get through goes on there. A connection
-is made right after an offer alone: where no replica lives any more, the kernel still takes connections, and they wait.
-
 A call takes `timeout_s` at most, retries and waits included, however slowly the server's bytes trickle in, and an
 answer that was not complete by then is never returned.
 """
@@ -32,7 +28,6 @@ except ModuleNotFoundError as missing:
 from rlservo.serve_app.client.deadline_backend import DeadlineBackend
 from rlservo.serve_app.client.error_replies import decode_error, excerpt
 from rlservo.serve_app.client.server_address import host_of, parse_address
-from rlservo.serve_app.wire.direct_offer import OFFER, find_offer
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 try:  # three times faster than the standard library on an image; not a requirement of the client
@@ -44,8 +39,6 @@ FIRST_WAIT_S = 0.05  # before the second attempt; doubles each time
 LONGEST_WAIT_S = 2.0
 MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; keeps a wrong URL from filling the memory
 LABEL = LABEL_HEADER.encode()
-OFFER_HEADER = OFFER.encode()
-OFFER_S = 1.0  # [s] in which a connection may be made to what was offered
 KEEPALIVE_S = 5.0  # that an idle connection is kept
 SCHEMES = {"http": "http", "https": "https"}
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -101,22 +94,14 @@ class Transport:
         self._backend = DeadlineBackend()
         proxy = _proxy_of(self.url)
         self._pool = _connection_pool(self.url, self._backend, proxy)
-        self._takes_offers = parts.scheme == "http" and not parts.path and proxy is None
-        self._direct: tuple[bytes, int] | None = None  # host and port, while the server's offer holds
-        self._directs = 0
         self._is_closed = False
         self.label: str | None = None
         """Whose requests the following are, for the server's recording."""
 
     @property
     def reconnects(self) -> int:
-        """How many connections were made after the first, but for those that took a server's offer."""
-        return max(0, self._backend.connections - self._directs - 1)
-
-    @property
-    def is_direct(self) -> bool:
-        """Whether the next call goes to a replica without the server's proxy in between."""
-        return self._direct is not None
+        """How many connections were made after the first."""
+        return max(0, self._backend.connections - 1)
 
     def get(self, *path: str, timeout_s: float | None = None, retries: int | None = None) -> Any:
         """Return the JSON at `/path[0]/path[1]/...`."""
@@ -148,18 +133,14 @@ class Transport:
         budget = self._timeout_s if timeout_s is None else timeout_s
         deadline = time.monotonic() + budget
         retries = self._retries if retries is None else retries
-        reply = self._exchange_directly(method, target, body, deadline, budget, retries > 0)
         for attempt, wait in enumerate(_waits(retries)):
             try:
-                if reply is None:
-                    reply = self._exchange(method, address, body, deadline, budget)
-                    self._take_offer(reply[1])
+                status, headers, content = self._exchange(method, address, body, deadline, budget)
             except UnavailableError as error:
                 failure = error
                 if attempt == 0 and wait is not None and isinstance(error, DroppedError):
                     wait = 0.0  # a server that closed an idle connection is probably there
             else:
-                (status, headers, content), reply = reply, None
                 if status < 300:
                     return self._parse(content, url, status)
                 refusal = decode_error(url, status, content)
@@ -174,40 +155,6 @@ class Transport:
                 raise failure
             time.sleep(wait)
         raise AssertionError("the last wait is None")
-
-    def _exchange_directly(
-        self, method: str, target: str, body: bytes | None, deadline: float, budget: float, may_repeat: bool
-    ) -> Reply | None:
-        """Return the reply of the replica that was offered, None where the proxy is to be asked instead."""
-        direct = self._direct
-        if direct is None:
-            return None
-        address = httpcore.URL(scheme=b"http", host=direct[0], port=direct[1], target=target)
-        try:
-            reply = self._exchange(method, address, body, deadline, budget)
-        except UnavailableError as error:
-            self._direct = None
-            if isinstance(error, DroppedError) and not may_repeat:  # it may have been asked
-                raise
-            return None
-        except DeadlineError:
-            self._direct = None
-            raise
-        if reply[0] != 503:
-            return reply
-        self._direct = None
-        return None if may_repeat else reply  # the proxy may know a replica that has time
-
-    def _take_offer(self, headers: Headers) -> None:
-        """Go by the way that the server offers in a reply, if it does, from now on."""
-        if not self._takes_offers:
-            return
-        value = next((value for name, value in headers if name.lower() == OFFER_HEADER), None)
-        found = None if value is None else find_offer(value.decode("latin-1"))
-        if found is not None:
-            self._backend.offered[found] = time.monotonic() + OFFER_S
-            self._direct = (found[0].encode(), found[1])
-            self._directs += 1
 
     def _exchange(self, method: str, url: httpcore.URL, body: bytes | None, deadline: float, budget: float) -> Reply:
         """Return the reply to one attempt."""

@@ -87,11 +87,6 @@ class PolicyClient(RemotePolicy):
         """How many connections were made after the first."""
         return self._transport.reconnects
 
-    @property
-    def is_direct(self) -> bool:
-        """Whether the next request goes to a replica without the server's proxy in between."""
-        return self._transport.is_direct
-
     def reset(self) -> None:
         """Start an episode: the next request says so. Sends nothing."""
         super().reset()

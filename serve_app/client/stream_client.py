@@ -11,7 +11,7 @@ import secrets
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,7 +34,6 @@ from rlservo.serve_app.client.replies import decode_action
 from rlservo.serve_app.client.server_address import parse_address
 from rlservo.serve_app.client.websocket_connection import BrokenError, HandshakeError, WebSocket
 from rlservo.serve_app.interface import Observation
-from rlservo.serve_app.wire.direct_offer import OFFER, find_offer
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 
 if TYPE_CHECKING:
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
 
 SCHEMES = {"http": "ws", "https": "wss", "ws": "ws", "wss": "wss"}
 WAIT_S = 0.02  # between two attempts to connect within one call
-DIRECT_S = 1.0  # [s] for a connection that the server offers, before the one there is has to do
 SILENT_FACTOR, SILENT_S = 3.0, 0.5  # a connection that gave no byte for so many deadlines, and so long, is made anew
 
 
@@ -92,8 +90,6 @@ class StreamClient(RemotePolicy):
         self._label = secrets.token_hex(8)
         self._is_closed = False
         self._connections = 0
-        self.is_direct = False
-        """Whether the connection goes to a replica without the server's proxy in between."""
         self.stale = 0
         """Answers that came after their deadline, and were dropped."""
 
@@ -201,17 +197,6 @@ class StreamClient(RemotePolicy):
         if self._contract is not None:
             name, version = self._contract.name, None if version is None else self._contract.version
         connection, contract = self._open(self.url, name, version, deadline)
-        self.is_direct = False
-        if (direct := self._offered(connection)) is not None:
-            # A server's own machine may go without its proxy (`wire/direct_offer.py`).
-            try:
-                shortly = min(deadline, time.monotonic() + DIRECT_S)
-                found = self._open(direct, contract.name, None if version is None else contract.version, shortly)
-            except RlservoError:
-                pass
-            else:
-                connection.close()
-                (connection, contract), self.is_direct = found, True
         self._learn(contract)
         self._socket = connection
         self._connections += 1
@@ -233,16 +218,6 @@ class StreamClient(RemotePolicy):
         except BaseException:
             connection.close()
             raise
-
-    def _offered(self, connection: WebSocket) -> str | None:
-        """Return the address of the server's offer, where this client takes one."""
-        parts = urlsplit(self.url)
-        offers = connection.headers.get_all(OFFER)
-        found = find_offer(offers[0]) if offers and parts.scheme == "ws" and not parts.path else None
-        if found is None:
-            return None
-        host, port = found
-        return f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
 
     def _fetch_contract(self, timeout_s: float | None) -> Contract:
         return self._connect(time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s))

@@ -81,8 +81,8 @@ class Request:
     request_id: str | None = None
     headers: Mapping[bytes, bytes] = field(default_factory=dict)
     """Of an HTTP message, or the metadata of a gRPC call."""
-    waited: float | None = None
-    """[s] How long it had waited before it was received; None where nobody knows."""
+    is_fresh: bool = False
+    """Whether it came after the stream's last reply, and so did not wait while the server was blocked."""
     stream: Session | None = None
     """The episode of the stream that it came on."""
     stream_id: str | None = None

@@ -35,29 +35,38 @@ def create_app(
     replica: str = "",
     control: ReplicaVersions | None = None,
     host: str = "127.0.0.1",
+    is_behind_serve: bool = False,
 ) -> PolicyApp:
     """Return the application; `store_provider` gives None for as long as the policies are being loaded.
 
     With a `control` what is served can be administered. `replica` is the `Core`'s, which is the application's
-    `state.core`; `host` is the address that is listened on. Raises UsageError when the API keys that
-    `settings` name cannot be read.
+    `state.core`; `host` is the address that is listened on; `is_behind_serve` is `PolicyApp`'s. Raises UsageError when
+    the API keys that `settings` name cannot be read.
     """
     core = Core(store_provider, settings, replica=replica, control=control)
     checks = AccessChecks(Hosts(host, settings, keyed=bool(core.keys.accepted.keys)), core.keys)
     # A redirect would be an answer to a path that no route has: there is none.
     app = PolicyApp(
-        core, checks, title="rlservo", description=DESCRIPTION, docs_url=None, redoc_url=None, redirect_slashes=False
+        core,
+        checks,
+        is_behind_serve=is_behind_serve,
+        title="rlservo",
+        description=DESCRIPTION,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
     )
     (document,) = app.routes  # FastAPI's own, /openapi.json: it tells nothing of policies
     grant(Access.open)(document)
+    add = app.router.routes.append
     app.state.core = core  # for gRPC and the replica, which are no part of the application
-    json_routes.add_routes(app, core, app.add_direct)
-    websocket_stream.add_routes(core, app.add_direct)
+    json_routes.add_routes(app, core, add)
+    websocket_stream.add_routes(core, add)
     _add_health(app, core)
     if control is not None:
         add_admin(app, core, control)
     oip_config.add_routes(app, core)
-    oip_models.add_routes(app, core, app.add_direct)
+    oip_models.add_routes(app, core, add)
     if settings.docs:
         add_docs(app)
         add_status_page(app)

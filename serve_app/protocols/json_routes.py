@@ -9,7 +9,7 @@ from fastapi import FastAPI
 from fastapi.responses import Response
 
 from rlservo.export.contract.contract import Contract, contract_json
-from rlservo.serve_app.protocols.direct_routes import PostRoute, post_routes
+from rlservo.serve_app.protocols.action_routes import PostRoute, post_routes
 from rlservo.serve_app.protocols.fastapi_routes import add_route
 from rlservo.serve_app.protocols.http_endpoint import HttpEndpoint
 from rlservo.serve_app.protocols.json_codec import JsonCodec
@@ -19,12 +19,12 @@ from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
 
 
-def add_routes(app: FastAPI, core: Core, add_direct: Callable[[PostRoute], None]) -> None:
-    """Add /v1 to the application; `add_direct` adds what FastAPI only documents."""
+def add_routes(app: FastAPI, core: Core, add: Callable[[PostRoute], None]) -> None:
+    """Add /v1 to the application; `add` adds routes that FastAPI only documents."""
     act = HttpEndpoint("json", JsonCodec(core), core)
     body = {"application/json": {"schema": ActRequest.model_json_schema()}}
     for route in post_routes("/v1/policies", "act", act, tag="act", reply=ActReply, body=body):
-        add_direct(route)
+        add(route)
     _add_policies(app, core)
 
 

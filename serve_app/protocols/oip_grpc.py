@@ -1,4 +1,4 @@
-"""Open Inference Protocol over gRPC: the methods of `GRPCInferenceService`, called by Serve's ingress.
+"""Open Inference Protocol over gRPC: the methods of `GRPCInferenceService`, called by an engine's gRPC server.
 
 The same policies, options and errors as over HTTP (`oip_infer.py`); an error's HTTP status becomes the gRPC status
 here, its code goes into the trailing metadata. Messages are `oip_messages.py`'s; tensors come raw or typed and go as
@@ -14,7 +14,7 @@ import logging
 import math
 import secrets
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any
 from urllib.parse import unquote
 
@@ -46,7 +46,6 @@ from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_path import BUG
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
-from rlservo.serve_app.wire.request_stamp import STAMP
 
 Incoming = tuple[bytes, float | None]
 """A request's bytes, and how many seconds its caller still waits for the answer (None: for ever)."""
@@ -89,20 +88,6 @@ FIELD_DTYPES = {
     "fp32_contents": "f4",
     "fp64_contents": "f8",
 }
-
-
-class InferenceService:
-    """The methods, for Serve to find on the deployment's class; `serve_grpc` gives them their policies."""
-
-    _grpc: Grpc
-
-    def serve_grpc(self, core: Core, *, local_only: bool) -> None:
-        """Answer from `core`; with `local_only`, only callers on this machine."""
-        self._grpc = Grpc(core, local_only=local_only)
-
-    async def ModelStreamInfer(self, requests: AsyncIterator[bytes], grpc_context: Any) -> AsyncIterator[Any]:
-        async for reply in self._grpc.stream(requests, grpc_context):
-            yield reply
 
 
 class Grpc:
@@ -157,7 +142,7 @@ class Grpc:
                 try:
                     key.check()
                 except RlservoError as error:
-                    peer = _peer(context.peer(), context.invocation_metadata())
+                    peer = context.peer()
                     core.record_failure(request, error.code, error.message, peer=peer)
                     if not isinstance(error, RateLimitError):  # the key is no longer accepted
                         _fail(context, error)
@@ -195,12 +180,11 @@ class Grpc:
             label=texts.get(LABEL_HEADER),
             request_id=texts.get(REQUEST_ID),
             headers=headers,
-            waited=self._core.admission.waited(headers.get(STAMP.encode())),
         )
         try:
             authorize(self._core.keys, presented_key(headers), Access.open if method in OPEN else Access.act)
         except RlservoError as error:
-            peer = _peer(context.peer(), metadata)
+            peer = context.peer()
             self._core.record_failure(request, error.code, error.message, peer=peer)
             raise
         return request
@@ -243,17 +227,6 @@ METHODS: dict[str, Callable[[Core, Incoming], Any]] = {
     "ModelStatistics": _model_statistics,
     "RepositoryIndex": _index,
 }
-
-
-def _method(name: str) -> Callable[[InferenceService, Incoming, Any], Awaitable[Any]]:
-    async def answer(self: InferenceService, request: Incoming, grpc_context: Any) -> Any:
-        return await self._grpc.answer(name, request, grpc_context)
-
-    return answer
-
-
-for _name in (*METHODS, "ModelInfer"):
-    setattr(InferenceService, _name, _method(_name))
 
 
 class OipGrpcCodec:
@@ -440,9 +413,3 @@ def is_local(peer: str) -> bool:
         return False
     mapped = getattr(host, "ipv4_mapped", None)
     return host.is_loopback if mapped is None else bool(mapped.is_loopback)
-
-
-def _peer(peer: str, metadata: Any) -> str:
-    """Return where a call came from: what HAProxy says, which is on this machine and adds its word last."""
-    forwarded = [value for name, value in metadata if name == "x-forwarded-for" and type(value) is str]
-    return forwarded[-1].rpartition(",")[2].strip() if forwarded and is_local(peer) else peer

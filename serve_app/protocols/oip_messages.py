@@ -17,6 +17,9 @@ SERVICE = f"{PACKAGE}.GRPCInferenceService"
 _TENSOR = ["string name", "string datatype", "repeated int64 shape"]
 _VALUES = ["map InferParameter parameters", "InferTensorContents contents"]
 _MESSAGES: dict[str, list[str]] = {
+    "ServerLiveRequest": [],
+    "ServerReadyRequest": [],
+    "ServerMetadataRequest": [],
     "ServerLiveResponse": ["bool live"],
     "ServerReadyResponse": ["bool ready"],
     "ModelReadyRequest": ["string name", "string version"],
@@ -125,5 +128,22 @@ _DATA_TYPES = "INVALID BOOL UINT8 UINT16 UINT32 UINT64 INT8 INT16 INT32 INT64 FP
 DATA_TYPES = {f"TYPE_{name}": number for number, name in enumerate(_DATA_TYPES.split())}
 """Triton's numbers of the data types in a ModelConfig."""
 
-messages: Any = SimpleNamespace(**build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice"))
+UNARY = (
+    "ServerLive",
+    "ServerReady",
+    "ServerMetadata",
+    "ModelReady",
+    "ModelMetadata",
+    "ModelConfig",
+    "ModelStatistics",
+    "ModelInfer",
+    "RepositoryIndex",
+)
+STREAM = "ModelStreamInfer"
+_METHODS = {name: f"{name}Request {name}Response" for name in UNARY}
+_METHODS[STREAM] = "stream ModelInferRequest stream ModelStreamInferResponse"
+
+messages: Any = SimpleNamespace(
+    **build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice", services={"GRPCInferenceService": _METHODS})
+)
 """The classes by name; those made at run time have no static type. A nested one is an attribute of its outer one's."""

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 
 import rlservo
 from rlservo.export.contract.contract import TensorSpec
-from rlservo.serve_app.protocols.direct_routes import PostRoute, post_routes
+from rlservo.serve_app.protocols.action_routes import PostRoute, post_routes
 from rlservo.serve_app.protocols.fastapi_routes import add_route
 from rlservo.serve_app.protocols.http_endpoint import HttpEndpoint
 from rlservo.serve_app.protocols.json_messages import parse_json
@@ -73,8 +73,8 @@ class ModelState(BaseModel):
     reason: str
 
 
-def add_routes(app: FastAPI, core: Core, add_direct: Callable[[PostRoute], None]) -> None:
-    """Add /v2 to the application; `add_direct` adds what FastAPI only documents."""
+def add_routes(app: FastAPI, core: Core, add: Callable[[PostRoute], None]) -> None:
+    """Add /v2 to the application; `add` adds routes that FastAPI only documents."""
     infer = HttpEndpoint("oip", OipHttpCodec(core), core)
     _add_health(app, core)
     _add_models(app, core)
@@ -83,7 +83,7 @@ def add_routes(app: FastAPI, core: Core, add_direct: Callable[[PostRoute], None]
         "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
     }
     for route in post_routes("/v2/models", "infer", infer, tag=TAG, reply=InferReply, body=body):
-        add_direct(route)
+        add(route)
 
 
 def _request_schema() -> dict[str, Any]:

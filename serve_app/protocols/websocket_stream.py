@@ -31,8 +31,7 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.episodes.request import Request, new_episode_id
 from rlservo.serve_app.episodes.sessions import Session
-from rlservo.serve_app.protocols.direct_routes import StreamRoute
-from rlservo.serve_app.protocols.http_endpoint import AT_ONCE
+from rlservo.serve_app.protocols.action_routes import StreamRoute
 from rlservo.serve_app.protocols.http_errors import encode_bug, error_answer, fail_stream, refuse_upgrade
 from rlservo.serve_app.protocols.json_messages import encode_json
 from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
@@ -58,11 +57,11 @@ SILENT = "silent for too long"
 REVOKED = (UnauthenticatedError, ForbiddenError)  # what the key of a stream may come to
 
 
-def add_routes(core: Core, add_direct: Callable[[StreamRoute], None]) -> None:
+def add_routes(core: Core, add: Callable[[StreamRoute], None]) -> None:
     """Add the streams to the application."""
     stream = StreamEndpoint(core)
     for path in STREAM_PATHS:
-        add_direct(StreamRoute(path, stream))
+        add(StreamRoute(path, stream))
 
 
 class StreamEndpoint:
@@ -107,8 +106,6 @@ class StreamEndpoint:
         try:
             await send(_binary(encode_metadata(policy.contract)))
             conversation = _Conversation(core, self._codec, opening, scope, idle)
-            if (answer_at_once := scope.get(AT_ONCE)) is not None:
-                answer_at_once(conversation.answer)
             while (message := await receive())["type"] != "websocket.disconnect":
                 await send(await conversation.answer(message))
         except asyncio.CancelledError:
@@ -154,7 +151,7 @@ class _Conversation:
         self._keeps = KEEP in scope.get("query_string", b"").split(b"&")
         self._key = StreamKey(core.keys, presented_key(scope[HEADERS]))
         self._timings: dict[str, float] | None = None
-        self._waited: float | None = None
+        self._is_fresh = False
 
     async def answer(self, message: Message) -> Message:
         """Return the reply. Raises RlservoError, which has been recorded, where it ends the stream."""
@@ -166,13 +163,13 @@ class _Conversation:
             time.perf_counter(),
             label=opening.label,
             request_id=opening.request_id,
-            waited=self._waited,
+            is_fresh=self._is_fresh,
             stream=opening.stream,
             stream_id=opening.stream_id,
             reply_options=self._timings,
         )
         self._idle.touch()
-        self._waited = None
+        self._is_fresh = False
         try:
             try:
                 self._key.check()
@@ -187,7 +184,7 @@ class _Conversation:
         taken_s = time.perf_counter() - request.received
         self._timings = {"prev_total_ms": taken_s * 1e3}
         if taken_s > core.admission.max_wait_s:
-            self._waited = 0.0  # the loop stood still for this answer, and the next request comes after it
+            self._is_fresh = True  # the loop was blocked by this reply, and the next request comes after it
         return _binary(reply)
 
 

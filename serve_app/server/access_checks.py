@@ -33,12 +33,10 @@ if TYPE_CHECKING:
 # routed at all: control characters, encoded and doubled slashes, dot segments, ';', '\'.
 PATH = re.compile(r"(?:/(?!\.\.?(?:/|\Z))[A-Za-z0-9._~-]+)*/?")
 HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+?)\.?(?::[0-9]{1,5})?")
-SECONDS = re.compile(rb"[0-9]{1,9}(\.[0-9]{1,9})?")
 READING = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that change nothing
 OWN_SITES = frozenset({b"same-origin", b"none"})  # 'none' is the user, not a page; 'same-site' is another port or name
 ALL_COUNT = frozenset({b"host", b"origin", b"sec-fetch-site", b"content-type", b"content-encoding"})
-UNREADABLE = b"x-rlservo-unreadable"  # says which header is not UTF-8, where `mend_headers` has made it so
-TIMEOUT = b"x-request-timeout-seconds"  # Ray Serve's; infinity makes its event loop raise
+UNREADABLE = b"x-rlservo-unreadable"  # names the header that is not UTF-8, of several with one name
 PAGE_SCHEMES = (b"http://", b"https://")  # a proxy may have ended TLS
 HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
@@ -201,20 +199,6 @@ def header_text(headers: Mapping[bytes, bytes], name: bytes) -> str | None:
     """Return a header as text, None where it is not there."""
     value = headers.get(name)
     return None if value is None else value.decode("latin-1")
-
-
-def mend_headers(headers: list[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
-    """Return headers that Ray Serve (2.60) can read, which decodes some as UTF-8 and answers what it cannot with 500.
-
-    `AccessChecks` refuses such a request later, when it has seen the key.
-    """
-    mended: list[tuple[bytes, bytes]] = []
-    for name, value in headers:
-        if not value.isascii() and not _is_utf8(value):
-            mended += [(name, value.decode("latin-1").encode()), (UNREADABLE, name)]
-        elif name != TIMEOUT or SECONDS.fullmatch(value):
-            mended.append((name, value))
-    return mended
 
 
 def _is_utf8(value: bytes) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rlservo.export.contract.errors import UnknownPolicyError
-from rlservo.serve_app.episodes.shared_sessions import Peers, RecordStore, SharedSessions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.request_path import RequestPath, StoreProvider
@@ -40,10 +39,6 @@ class Core(RequestPath):
 
             self.recorder = RequestRecorder(settings)
             self.episodes.marks_states = True
-
-    def share_sessions(self, records: RecordStore, peers: Peers) -> None:
-        """Let sessions by id be found by all replicas: requests of one reach any of them."""
-        self.shared_sessions = SharedSessions(self.episodes, records, peers, self.replica)
 
     @property
     def ready(self) -> bool:

@@ -71,11 +71,6 @@ def queue(core: Core, replica: str) -> Iterator[Metric]:
     waited = "Most requests that waited for the processor at once, since the start"
     yield _gauge("rlservo_queue_longest", waited, replica, admission.longest)
     yield _gauge("rlservo_requests_incoming", "Requests whose body is on its way", replica, admission.incoming)
-    turned_away = CounterMetricFamily(
-        "rlservo_turned_away", "Requests answered 503 before anything was read of them", labels=["replica"]
-    )
-    turned_away.add_metric([replica], admission.turned_away)
-    yield turned_away
 
 
 def keys(core: Core, replica: str) -> Iterator[Metric]:
@@ -138,18 +133,6 @@ def sessions(core: Core, replica: str) -> Iterator[Metric]:
         for family, (_, _, count) in zip(families, counted, strict=True):
             family.add_metric([replica, name], count[name])
     yield from (open_now, *families)
-    shared = core.shared_sessions
-    for name, help_text, times in (
-        ("rlservo_session_hops", "Steps of sessions by id that another replica took", shared.hops if shared else 0),
-        (
-            "rlservo_session_records_unreachable",
-            "Records of sessions by id that the cluster's store did not give or take: such requests are answered 503",
-            shared.unreachable if shared else 0,
-        ),
-    ):
-        counter = CounterMetricFamily(name, help_text, labels=["replica"])
-        counter.add_metric([replica], times)
-        yield counter
     remembered = "Episodes in memory, in sessions and on streams; a batch is so many"
     yield _gauge("rlservo_episodes_remembered", remembered, replica, kept.rows)
 

@@ -1,7 +1,6 @@
-"""Clock of the event loop: tells when the loop stood still (a stopped process, a long computation, a starved machine).
+"""Detection of a blocked event loop: a stopped process, a long computation, a starved machine.
 
-What is read right after that has waited for an unknown time, up to all of it. That is for what carries no stamp of
-HAProxy's: frames of streams, and clients that ask a replica directly.
+What is read right after that has waited for an unknown time, up to all of it.
 """
 
 from __future__ import annotations

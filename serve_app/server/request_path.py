@@ -15,12 +15,11 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from rlservo.export.contract.errors import (
-    DeadlineError,
     InternalError,
     LateError,
     ObservationError,
@@ -34,7 +33,6 @@ from rlservo.export.contract.errors import (
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import Request, check_deadline
 from rlservo.serve_app.episodes.sessions import Session
-from rlservo.serve_app.episodes.shared_sessions import HOP_TIMEOUT_S, SharedSessions, without_policy
 from rlservo.serve_app.runtime.network_memory import NetworkDroppedError
 from rlservo.serve_app.server.loop_clock import LoopClock
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
@@ -44,15 +42,12 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.network_restorer import NetworkRestorer
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blame, blamed_version
 from rlservo.serve_app.versions.shadow import Shadows
-from rlservo.serve_app.wire.request_stamp import clock_id
 
 if TYPE_CHECKING:
     from rlservo.serve_app.server.request_recorder import RequestRecorder
 
 logger = logging.getLogger(__name__)
 
-HURRY_S = 0.05  # [s] for a body when too many are half sent
-LEAST_WAIT_S = 0.01  # that counts against a deadline: stamps are milliseconds, and so is the way from the proxy
 STRICTER = "stricter-than-production"
 """Counted for `bad-observation` where the version that production leads to takes the observation."""
 BUG = "the server failed on this request; its log says how"
@@ -92,53 +87,27 @@ class Admission:
         self._max_incoming = settings.max_incoming
         self._max_streams = settings.max_streams
         self.loop_clock = LoopClock(self.max_wait_s)
-        self._clock_id = clock_id().encode()
         self._burst = 0
         self._burst_began = 0.0
         self.incoming = 0
         self.streams = 0
         self.longest = 0  # the longest burst so far
-        self.turned_away = 0  # before anything was read of them
 
-    def admit_unread(self) -> bool:
-        """Return whether one more request may be read; if not, count it as turned away."""
-        if self._burst < self._max_queued:
-            return True
-        self.turned_away += 1
-        return False
-
-    def waited(self, stamp: bytes | None) -> float | None:
-        """Return how long [s] ago HAProxy had a request with this stamp, if it has one, and by our clock."""
-        if stamp is None:
-            return None
-        since, _, whose = stamp.partition(b"-")
-        if not whose.startswith(self._clock_id) or not since.isdigit() or len(since) > 15:
-            return None
-        return max(0.0, time.time() - int(since) / 1e3)
-
-    def check_age(self, waited: float | None) -> None:
-        """Raise LateError for a request that had `waited` too long; or, where that is unknown, may have."""
-        limit_s = self.max_wait_s
-        if waited is not None:
-            if waited > limit_s:
-                raise LateError(
-                    f"the observation waited {waited:.1f} s on its way here, longer than {limit_s * 1e3:g} ms: "
-                    "send a newer one"
-                )
-            return
+    def check_age(self) -> None:
+        """Raise LateError for a request that may have waited too long to be read."""
         now = time.perf_counter()
-        if now < self.loop_clock.unknown_until or now - self.loop_clock.next_tick > limit_s:
+        if now < self.loop_clock.unknown_until or now - self.loop_clock.next_tick > self.max_wait_s:
             raise LateError(
-                f"this replica stood still for longer than {limit_s * 1e3:g} ms, and the observation may be as old: "
-                "send a newer one"
+                f"the server was blocked for more than {self.max_wait_s * 1e3:g} ms, and the observation may be as "
+                "old: send a newer one"
             )
 
-    def enter(self, waited: float | None = None) -> float:
+    def enter(self) -> float:
         """Return when this request had arrived at the latest (`time.perf_counter`).
 
-        `waited` is how long it did before, where that is known. Raises OverloadedError or LateError.
+        Raises OverloadedError or LateError.
         """
-        self.check_age(waited)
+        self.check_age()
         now = time.perf_counter()
         if self._burst == 0:
             self._burst_began = now
@@ -156,22 +125,16 @@ class Admission:
         self.longest = max(self.longest, self._burst)
         self._burst = 0
 
-    def begin_body(self, timeout_s: float) -> float:
-        """Count a body that may still be on its way; return the seconds it has: few, where too many are."""
+    @contextlib.contextmanager
+    def reading_body(self) -> Iterator[None]:
+        """Count a request whose body has come in part. Raises OverloadedError."""
+        if self.incoming >= self._max_incoming:
+            raise OverloadedError(f"{self.incoming} requests are still being sent to this server: try again shortly")
         self.incoming += 1
-        return min(timeout_s, HURRY_S) if self.incoming > self._max_incoming else timeout_s
-
-    def end_body(self) -> None:
-        """Count it no longer."""
-        self.incoming -= 1
-
-    def late_body(self, timeout_s: float, given_s: float) -> RlservoError:
-        """Return the error of a body that did not come in the time it was given, of the time it is usually given."""
-        if given_s < timeout_s:
-            return OverloadedError(
-                f"{self._max_incoming} requests are still being sent to this replica: try again shortly"
-            )
-        return DeadlineError(f"the request body did not arrive within {timeout_s:g} s")
+        try:
+            yield
+        finally:
+            self.incoming -= 1
 
     def open_stream(self) -> None:
         """Count an open stream. Raises OverloadedError."""
@@ -194,7 +157,6 @@ class RequestPath:
         self.settings = settings
         self.admission = Admission(settings)
         self.episodes = Episodes(max_sessions=settings.max_sessions, idle_s=settings.session_idle_s)
-        self.shared_sessions: SharedSessions | None = None  # where requests of a session reach any of several replicas
         self.metrics = Metrics()
         self.log = RequestLog(settings)
         self.shadows = Shadows()
@@ -262,11 +224,7 @@ class RequestPath:
         while True:
             try:
                 if request.episode is not None or request.stream is not None:
-                    shared = self.shared_sessions
-                    if shared is not None and request.episode is not None and request.episode.session_id is not None:
-                        decision = await shared.act(store, request)
-                    else:
-                        decision = self.episodes.act(store, request)
+                    decision = self.episodes.act(store, request)
                 elif store.batches and not request.explore:
                     check = partial(_check_again, request, began, self.admission.max_wait_s)
                     decision = await store.act_together(name, version, obs, label=request.label, check=check)
@@ -284,31 +242,6 @@ class RequestPath:
         if shadow is not None and decision.version == shadow.of and not request.explore:
             self.shadows.offer(shadow, obs, decision)
         return decision
-
-    async def answer_peer(self, method: str, *arguments: Any) -> Any:
-        """Answer another replica's `SharedSessions`; what a request is refused with is returned."""
-        shared = self.shared_sessions
-        assert shared is not None
-        if method != "act":
-            return shared.adopt(self.store(), *arguments) if method == "adopt" else shared.forget(*arguments)
-        request, token, under_way_s = arguments
-        request.received = time.perf_counter()
-        request.arrived = request.received - under_way_s  # by this machine's clock
-        try:
-            self.admission.enter()
-            while True:
-                try:
-                    decision = await shared.act_here(self.store(), request, token)
-                    break
-                except NetworkDroppedError as dropped:  # the other replica waits no longer than a hop may take
-                    await self._restore(dropped, request, min(self.admission.max_wait_s, HOP_TIMEOUT_S / 2))
-        except RlservoError as error:
-            return error
-        if decision is None:
-            return None
-        if self.recorder is not None:
-            self.recorder.note_answer(request, decision, time.perf_counter() - request.received)
-        return without_policy(decision)
 
     async def _restore(self, dropped: NetworkDroppedError, request: Request, wait_s: float) -> None:
         """Wait for a network that was dropped, until `wait_s` after the request came.
@@ -409,12 +342,11 @@ class RequestPath:
     def _admit(self, request: Request) -> None:
         """Raise OverloadedError or LateError; a wait before `received` begins to count."""
         if request.stream_id is not None:  # request and reply alternate there, so that the streams' number is the bound
-            self.admission.check_age(request.waited)
+            if not request.is_fresh:
+                self.admission.check_age()
             return
         # Only now, when the body is here: one that is slow to come waits for itself.
-        request.received = min(request.received, self.admission.enter(request.waited))
-        if request.waited is not None and request.waited > LEAST_WAIT_S:
-            request.received -= request.waited
+        request.received = min(request.received, self.admission.enter())
 
     def _counted_as(self, request: Request, error: RlservoError) -> str:
         """Return what a failure is counted as: its code, or STRICTER where the version that was asked is at fault.

@@ -39,29 +39,31 @@ class ServerSettings(BaseModel):
     """More observations in one request are refused with 413: the event loop computes a batch in one go."""
 
     body_timeout_s: float = Field(2.0, gt=0, allow_inf_nan=False)
-    """[s] A client that takes longer to send its body is answered 408. HAProxy passes on what fits its buffer of 16 KB,
-    head included, only when it is complete, and gives it 5 s."""
+    """[s] A client that takes longer to send its body is answered 408 (embedded server; on a cluster nginx or an
+    Ingress in front of Ray Serve has to do it)."""
 
     max_ongoing_requests: int = Field(128, ge=1)
-    """Requests that may wait for one replica's processor at once; further ones are answered 503 immediately."""
+    """Requests that may wait for one process at once; further ones are answered 503 immediately."""
 
     max_queue_ms: float = Field(1000.0, gt=0, allow_inf_nan=False)
     """[ms] Requests that have waited longer in a replica are answered 503 instead of being computed."""
 
     max_incoming: int = Field(512, ge=1)
-    """Requests whose body may be half sent at once, per replica; those that come complete do not count."""
+    """Requests whose body may be half sent at once, per process; those that come complete do not count."""
 
     max_streams: int = Field(256, ge=1)
     """Streams (WebSocket, gRPC) that may be open at once, per replica."""
 
     max_connections_per_address: int = Field(1024, ge=0)
-    """Connections that one client address may have to HAProxy, and to each replica's direct port; further ones are
-    answered 429, many more are closed at once. Each takes 4096 altogether. 0: no bound, for a server that has another
-    proxy before it."""
+    """Connections that one client address may have to a process of the embedded server, of 4096 altogether; further
+    ones are answered 429, many more are closed at once. 0: no bound, for a server behind a proxy."""
 
-    direct_port: int | None = Field(None, ge=1, le=65535)
-    """A port on which the replicas of a machine listen themselves, without HAProxy before them: a shorter way, which
-    our clients on this machine find and use. `rlservo serve --direct-port` sets it, too."""
+    trusted_proxies: str = ""
+    """Addresses, separated by commas, of proxies in front of the embedded server whose `X-Forwarded-For` names the
+    client, for the log and the bound above it; no one's by default."""
+
+    grpc_reflection: bool = False
+    """Answer gRPC's reflection service, by which grpcurl and others find methods and messages (embedded server)."""
 
     stream_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
     """[s] A stream (WebSocket, gRPC) whose client says nothing for so long is closed."""
@@ -112,11 +114,6 @@ class ServerSettings(BaseModel):
 
     policy_options: dict[str, PolicyOptions] = {}
     """How strict each policy is at its edges, by policy name; '*' is for the others. As a variable: a JSON object."""
-
-    ahead_of_serve: bool = True
-    """Answer requests for actions, and streams, before Ray Serve's own handling, which takes as long as the rest of a
-    replica does. Off, Serve counts them in its own metrics and holds them to its `request_timeout_s`; where its tracing
-    is on, it handles them in any case."""
 
     record: str | None = None
     """Record every decision of the policies into this folder (`docs/recording.md`), but of those whose options say

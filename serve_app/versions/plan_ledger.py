@@ -27,6 +27,22 @@ class Ledger(Protocol):
         ...
 
 
+class MemoryLedger:
+    """The plans of one process."""
+
+    def __init__(self) -> None:
+        self._plans: dict[int, bytes] = {}
+
+    def newest(self) -> int:
+        return max(self._plans, default=0)
+
+    def fetch(self, generation: int) -> bytes | None:
+        return self._plans.get(generation)
+
+    def append(self, generation: int, content: bytes) -> bool:
+        return self._plans.setdefault(generation, content) is content
+
+
 class PlanLedger:
     """Plans in a ledger, fetched and appended in a thread: a ledger may block."""
 

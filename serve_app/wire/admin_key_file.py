@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 from rlservo.export.contract.errors import UsageError
@@ -11,10 +12,18 @@ LONGEST_KEY_FILE = 4096  # [bytes] far more than a key
 
 
 def key_file(port: int) -> Path:
-    """Return where the key of a server on this port is kept: below XDG_RUNTIME_DIR, else in the user's cache."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(runtime) if runtime else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return folder / "rlservo" / f"admin-{port}.key"
+    """Return where the key of a server on this port is kept.
+
+    Below XDG_RUNTIME_DIR, else in the user's cache, else (a user without a home) in the folder of temporary files.
+    """
+    name = f"admin-{port}.key"
+    folder = os.environ.get("XDG_RUNTIME_DIR") or os.environ.get("XDG_CACHE_HOME")
+    if folder:
+        return Path(folder) / "rlservo" / name
+    try:
+        return Path.home() / ".cache" / "rlservo" / name
+    except RuntimeError:
+        return Path(tempfile.gettempdir()) / f"rlservo-{os.getuid()}" / name
 
 
 def read_key(file: Path) -> str:

@@ -17,10 +17,9 @@ import pytest
 import yaml
 
 from rlservo.serve_app.client.admin_client import AdminClient
-from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.ray_serve.processes import MARK, end_marked, remove_folder
 from rlservo.serve_app.server.api_keys import new_key
-from servers import ROOT
+from servers import ROOT, free_ports
 
 pytestmark = [
     pytest.mark.serve,

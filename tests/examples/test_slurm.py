@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rlservo.serve_app.ray_serve.ports import free_ports
+from servers import free_ports
 from trainings import TINY
 
 ROOT = Path(__file__).resolve().parents[2]

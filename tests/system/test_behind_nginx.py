@@ -21,9 +21,8 @@ from rlservo.export.contract.errors import UnavailableError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.oip_messages import messages
-from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.runtime.policy import Policy
-from servers import ROOT, LiveServer
+from servers import ROOT, LiveServer, free_ports
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 

@@ -23,10 +23,9 @@ from rlservo.export.contract.contract import BakedStep
 from rlservo.export.contract.errors import RlservoError
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.runtime.drift import EVERY
 from rlservo.serve_app.server.settings import ServerSettings
-from servers import ROOT, LiveServer, ask
+from servers import ROOT, LiveServer, ask, free_ports
 from stores import load_store
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rlservo.serve_app.ray_serve.ports import free_ports
+from servers import free_ports
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from bundles import write_box_policy
-from rlservo.serve_app.ray_serve.ports import free_ports
-from servers import ask, running, wait_until_served
+from servers import ask, free_ports, running, wait_until_served
 from storages import SECRET, Storage
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]

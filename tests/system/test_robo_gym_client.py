@@ -30,8 +30,7 @@ from rlservo.envs.robot_server.manager import RobotServers, ServerManager
 from rlservo.envs.robot_server.server import RobotServer
 from rlservo.envs.robot_server.settings import URSettings
 from rlservo.envs.ur.model import BASE_HEIGHT
-from rlservo.serve_app.ray_serve.ports import free_ports
-from servers import HEEDING_CTRL_C, ShippedServer
+from servers import HEEDING_CTRL_C, ShippedServer, free_ports
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "robo_gym_client.py"

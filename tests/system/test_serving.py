@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.ray_serve.launcher import serve_policies
+from rlservo.serve_app.engines.local import serve_policies
 from rlservo.serve_app.runtime.policy import Policy
 from servers import LiveServer, ask
 

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.engines.local import serve_policies
 from rlservo.serve_app.protocols.oip_grpc import Grpc, is_local
 from rlservo.serve_app.protocols.oip_messages import messages
-from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.ports import free_ports
 from rlservo.serve_app.recording.episodes import episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.runtime.policy import Policy
+from servers import free_ports
 from stores import load_store
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]

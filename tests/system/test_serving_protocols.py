@@ -14,10 +14,9 @@ import websockets.sync.client
 from websockets.exceptions import InvalidStatus
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.ray_serve.launcher import serve_policies
-from rlservo.serve_app.ray_serve.ports import free_ports
+from rlservo.serve_app.engines.local import serve_policies
 from rlservo.serve_app.runtime.policy import Policy
-from servers import LiveServer
+from servers import LiveServer, free_ports
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 

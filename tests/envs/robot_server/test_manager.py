@@ -23,7 +23,8 @@ from rlservo.envs.robot_server.connections import count_connections
 from rlservo.envs.robot_server.manager import MANAGER_PORTS, RobotServers, ServerManager
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, SERVER_MANAGER, Empty, ManagerStatus, State
 from rlservo.envs.robot_server.server import CannotListenError, PortInUseError, bind
-from rlservo.serve_app.ray_serve.ports import check_port, free_ports
+from rlservo.serve_app.engines.ports import listen
+from servers import free_ports
 
 UR = "roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur5"
 MIR = "roslaunch mir100_robot_server sim_robot_server.launch"
@@ -62,7 +63,7 @@ def test_server_starts_answers_and_is_gone_after_the_kill(manager: ServerManager
     assert get_state(started.port).success
     assert client.kill(started.port).success
     assert not is_alive(pid)
-    check_port("127.0.0.1", started.port)  # it is free again
+    listen("127.0.0.1", started.port).close()  # it is free again
     with pytest.raises(grpc.RpcError):
         get_state(started.port)
 
@@ -329,7 +330,7 @@ def test_manager_takes_the_first_free_port_of_robo_gyms_range(command: Any) -> N
             assert verify(Empty().SerializeToString(), timeout=5).alive
     first.terminate()
     first.wait(5)
-    check_port("127.0.0.1", first_port)  # it is free again
+    listen("127.0.0.1", first_port).close()  # it is free again
 
 
 def test_manager_says_so_when_every_port_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:

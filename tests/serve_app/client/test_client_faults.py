@@ -29,7 +29,7 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.ray_serve.ports import free_ports
+from servers import free_ports
 
 CONTRACT = Contract(
     name="arm",

@@ -524,18 +524,6 @@ def test_no_route_reads_a_body_beyond_the_limit(server: Served) -> None:
             assert status == expected, (method, path, rest[:20])
 
 
-def test_a_body_that_stays_away_is_late_on_every_route(policies: Path, controlled: Controlled, served: Serve) -> None:
-    with controlled(policies) as control:
-        settings = ServerSettings(operator_key=ADMIN_LINE.split()[-1], body_timeout_s=0.2)
-        app = create_app(lambda: control.store, settings, control=control)
-        with served(app) as port:
-            for path in (b"/v1/admin/policies/ur5/load", b"/v2/repository/models/ur5/load", b"/v2/repository/index"):
-                with socket.create_connection(("127.0.0.1", port), timeout=30) as client:
-                    client.sendall(b"POST " + path + b" HTTP/1.1\r\nhost: 127.0.0.1\r\n" + bearer(ADMIN)[0])
-                    client.sendall(b"\r\ncontent-type: application/json\r\ncontent-length: 10\r\n\r\n{")
-                    assert int(client.recv(65536)[9:12]) == 408, path
-
-
 @pytest.mark.parametrize("name", [b"x-request-id", b"x-session-id", b"serve_multiplexed_model_id", b"user-agent"])
 def test_a_header_that_is_not_utf8_is_refused_after_the_key_in_our_form(server: Served, name: bytes) -> None:
     with Wire(server.port) as wire:
@@ -549,7 +537,7 @@ def test_a_header_that_is_not_utf8_is_refused_after_the_key_in_our_form(server: 
 
 @pytest.mark.serve
 @pytest.mark.slow
-def test_on_ray_serve_a_header_that_is_not_utf8_is_no_failure(live_server: Any) -> None:
+def test_live_a_header_that_is_not_utf8_is_no_failure(live_server: Any) -> None:
     """Serve itself decodes these, before the application sees the request (ray 2.60)."""
     with Wire(live_server.port) as wire:
         for name in (b"x-request-id", b"x-session-id", b"serve_multiplexed_model_id"):
@@ -567,7 +555,7 @@ def test_on_ray_serve_a_header_that_is_not_utf8_is_no_failure(live_server: Any) 
 
 @pytest.mark.serve
 @pytest.mark.slow
-def test_on_ray_serve_no_spelling_reaches_administration(live_server: Any) -> None:
+def test_live_no_spelling_reaches_administration(live_server: Any) -> None:
     """Through HAProxy, uvicorn and Serve, of which each reads a path in its own way; the server has no admin key."""
     with Wire(live_server.port) as wire:
         # A path without a slash is for Serve's own proxy, which may be there a moment later than the policies.

@@ -518,7 +518,7 @@ def test_a_foreign_page_gets_nothing_of_it(tab: Tab, server: Served, served: Ser
 
 @pytest.mark.serve
 @pytest.mark.slow
-def test_on_ray_serve_the_page_shows_what_runs(tab: Tab, live_server: Any) -> None:
+def test_live_the_page_shows_what_runs(tab: Tab, live_server: Any) -> None:
     """Through HAProxy and Serve, with a key."""
     url = f"http://127.0.0.1:{live_server.port}"
     tab.visit(url)

@@ -208,9 +208,7 @@ def test_a_page_whose_name_leads_to_the_server_moves_and_reads_nothing(browser: 
 
 @pytest.mark.serve
 @pytest.mark.slow
-def test_on_ray_serve_a_page_is_refused_for_where_it_comes_from(
-    browser: Browser, live_server: Any, served: Serve
-) -> None:
+def test_live_a_page_is_refused_for_where_it_comes_from(browser: Browser, live_server: Any, served: Serve) -> None:
     """Through HAProxy, ahead of Serve's handling and behind it; before anybody looks at a key."""
     pages = Pages(nothing, page_for(f"http://127.0.0.1:{live_server.port}"))
     with served(pages) as port:

@@ -8,7 +8,7 @@ import shutil
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -203,25 +203,15 @@ def test_files_that_hang_hold_up_only_those_who_wait_for_them(folder: Path, monk
     assert asyncio.run(run()).name == "c" and len(calls) == 1
 
 
-@pytest.mark.parametrize("shared", [False, True], ids=["alone", "another replica's"])
 @pytest.mark.parametrize("again", ["step", "reset"])
 def test_of_requests_of_a_session_that_wait_for_a_network_one_moves_its_memory(
-    shared: bool, again: str, core: Core, folder: Path
+    again: str, core: Core, folder: Path
 ) -> None:
     """A client gives up while its step waits, and asks again: with a number the same answer, without one a refusal."""
-    if shared:
-        cluster = Cluster()
-        core.share_sessions(cluster, cluster)
 
     async def ask(row: int, **more: Any) -> Any:
         step = request(LIMITED, OBS[row], episode=Episode(session_id="arm", reset=more.pop("reset", False)), **more)
-        session = core.episodes.sessions.peek(LIMITED, "arm")
-        if not shared or session is None or step.episode is None or step.episode.reset:
-            return await core.decide(step)
-        answer = await core.answer_peer("act", step, session.token, 0.0)
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
+        return await core.decide(step)
 
     async def run() -> None:
         await ask(0, reset=True)
@@ -242,51 +232,6 @@ def test_of_requests_of_a_session_that_wait_for_a_network_one_moves_its_memory(
             np.testing.assert_array_equal(answer.action, alone.act(OBS[4]))
 
     asyncio.run(run())
-
-
-class Cluster:
-    """Records and peers of a replica that is asked by another one, and asks nobody."""
-
-    def __init__(self) -> None:
-        self.records: dict[str, bytes] = {}
-
-    async def get(self, key: str) -> bytes | None:
-        return self.records.get(key)
-
-    async def put(self, key: str, value: bytes) -> None:
-        self.records[key] = value
-
-    async def create(self, key: str, value: bytes) -> bool:
-        return self.records.setdefault(key, value) is value
-
-    async def delete(self, key: str) -> None:
-        self.records.pop(key, None)
-
-    async def keys(self) -> Sequence[str]:
-        return list(self.records)
-
-    async def running(self) -> Sequence[str]:
-        return []
-
-    async def call(self, replica: str, method: str, *arguments: Any) -> Any:
-        raise ProcessLookupError(replica)
-
-
-def test_a_step_that_another_replica_asks_for_waits_for_the_network(core: Core, folder: Path) -> None:
-    cluster = Cluster()
-    core.share_sessions(cluster, cluster)
-
-    async def run() -> Any:
-        await core.decide(request(LIMITED, OBS[0], episode=Episode(session_id="arm", reset=True)))
-        session = core.episodes.sessions.peek(LIMITED, "arm")
-        assert session is not None
-        drop(core, LIMITED)
-        step = request(LIMITED, OBS[1], episode=Episode(session_id="arm"))
-        return await core.answer_peer("act", step, session.token, 0.0)
-
-    with Policy.load(folder / LIMITED / "1", options=OPTIONS[LIMITED]) as alone:
-        alone.act(OBS[0])
-        np.testing.assert_array_equal(asyncio.run(run()).action, alone.act(OBS[1]))
 
 
 def test_a_shadow_that_was_dropped_computes_along(folder: Path) -> None:

@@ -20,7 +20,6 @@ from websockets.exceptions import ConnectionClosed
 
 from rlservo.export.contract.errors import OverloadedError
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.ray_serve.environment import ray_environment
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.request_path import Admission
 from rlservo.serve_app.server.settings import ServerSettings
@@ -92,22 +91,6 @@ def test_what_exceeds_the_queue_is_refused_at_once_and_the_rest_gets_its_own_act
             assert answer(client)[0] == 200
 
 
-def test_256_half_sent_requests_stall_nobody_and_are_told_in_time(serve: Serve) -> None:
-    with serve(body_timeout_s=1.0) as port, connections(port, 257) as clients:
-        whole = ask(OBS[0])
-        for client in clients[1:]:
-            client.sendall(whole[:-5])
-        taken = []
-        for _ in range(30):
-            started = time.perf_counter()
-            clients[0].sendall(whole)
-            assert answer(clients[0])[0] == 200
-            taken.append(time.perf_counter() - started)
-        assert np.median(taken) < 0.25  # a place among the half-sent would have come free after a second
-        codes = {(status, document["code"]) for status, _, document in map(answer, clients[1:])}
-        assert codes == {(408, "deadline-passed")}
-
-
 def test_more_half_sent_requests_than_allowed_are_refused_and_whole_ones_still_served(serve: Serve) -> None:
     with serve(max_incoming=8, body_timeout_s=5.0) as port, connections(port, 10) as clients:
         whole = ask(OBS[0])
@@ -176,12 +159,3 @@ def test_a_wait_in_the_queue_counts_from_the_beginning_of_the_burst() -> None:
         assert admission.enter() > first and admission.longest == 3
 
     asyncio.run(burst())
-
-
-def test_the_proxy_says_in_json_that_no_replica_is_there(tmp_path: Path) -> None:
-    """What else is changed in its configuration, and in Ray's own: test_haproxy_wrapper.py."""
-    ray_environment(tmp_path, haproxy="/bin/true", mark="test")
-    answer_file = tmp_path / "503.http"
-    head, _, body = answer_file.read_bytes().partition(b"\r\n\r\n")
-    assert b" 503 " in head and b"retry-after: 1" in head
-    assert json.loads(body)["code"] == "unavailable"

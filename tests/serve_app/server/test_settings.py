@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.ray_serve.haproxy import configuration
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 
@@ -41,10 +40,3 @@ def test_a_key_put_where_its_hash_belongs_is_not_shown() -> None:
     with pytest.raises(UsageError, match="RLSERVO_OPERATOR_KEY is not usable") as caught:
         ServerSettings.from_environment(environment={"RLSERVO_OPERATOR_KEY": key})
     assert key not in caught.value.message
-
-
-def test_the_proxys_defaults_are_the_settings() -> None:
-    """HAProxy's wrapper runs without pydantic, so it cannot read them there."""
-    settings = ServerSettings()
-    assert settings.max_connections_per_address == configuration.MAX_CONNECTIONS
-    assert settings.stream_idle_s == configuration.STREAM_IDLE_S

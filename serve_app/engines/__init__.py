@@ -1,0 +1,1 @@
+"""Engines that run the one application: uvicorn on this machine, or Ray Serve on a cluster."""

@@ -1,0 +1,84 @@
+"""gRPC server of the Open Inference Protocol, in the HTTP server's event loop, with gRPC's own health service."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import grpc
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+
+from rlservo.export.contract.errors import UnavailableError
+from rlservo.serve_app.protocols.oip_grpc import METHODS, Grpc
+from rlservo.serve_app.protocols.oip_messages import SERVICE, messages
+from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.wire.loopback import is_loopback
+
+LONGEST_S = 86400.0  # [s] gRPC expresses "no deadline" as one far away
+DRAIN_S = 5.0
+OVERHEAD_BYTES = 4096  # of a message beside what `max_body_bytes` bounds
+MAX_CALLS = 1024
+
+
+class GrpcServer:
+    """Serves gRPC calls of one process."""
+
+    def __init__(self, core: Core, host: str, port: int, *, is_shared: bool) -> None:
+        """`is_shared`: whether several processes listen on the port, which the kernel then shares out."""
+        settings = core.settings
+        self._address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        self._grpc = Grpc(core, local_only=is_loopback(host))
+        self._server = grpc.aio.server(
+            maximum_concurrent_rpcs=MAX_CALLS,
+            options=[
+                ("grpc.so_reuseport", int(is_shared)),
+                ("grpc.max_receive_message_length", settings.max_body_bytes + OVERHEAD_BYTES),
+                ("grpc.max_connection_idle_ms", int(settings.stream_idle_s * 1000)),
+            ],
+        )
+        methods: dict[str, Any] = {
+            name: grpc.unary_unary_rpc_method_handler(self._unary(name)) for name in (*METHODS, "ModelInfer")
+        }
+        methods["ModelStreamInfer"] = grpc.stream_stream_rpc_method_handler(self._stream)
+        self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, methods),))
+        service: Any = health  # its asyncio part is not in its type stubs
+        self._health = service.aio.HealthServicer()  # what orchestrators probe, without a key
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+        if settings.grpc_reflection:
+            _add_reflection(self._server)
+
+    async def start(self) -> None:
+        """Listen, and report to be serving. Raises UnavailableError where the port cannot be listened on."""
+        try:
+            self._server.add_insecure_port(self._address)
+        except RuntimeError as error:
+            raise UnavailableError(f"gRPC cannot listen on {self._address}: {error}") from None
+        await self._server.start()
+        for service in ("", SERVICE):
+            await self._health.set(service, health_pb2.HealthCheckResponse.SERVING)
+
+    async def stop(self) -> None:
+        """Report not to be serving, and end when the calls in progress are answered."""
+        await self._health.enter_graceful_shutdown()
+        await self._server.stop(DRAIN_S)
+
+    def _unary(self, name: str) -> Callable[[bytes, Any], Awaitable[bytes]]:
+        async def call(content: bytes, context: Any) -> bytes:
+            remaining = context.time_remaining()
+            deadline = None if remaining is None or remaining > LONGEST_S else remaining
+            reply: bytes = (await self._grpc.answer(name, (content, deadline), context)).SerializeToString()
+            return reply
+
+        return call
+
+    async def _stream(self, requests: AsyncIterator[bytes], context: Any) -> AsyncIterator[bytes]:
+        async for reply in self._grpc.stream(requests, context):
+            yield reply.SerializeToString()
+
+
+def _add_reflection(server: Any) -> None:
+    """Let grpcurl and others ask which methods and messages the protocol has."""
+    from grpc_reflection.v1alpha import reflection
+
+    pool = messages.ModelInferRequest.DESCRIPTOR.file.pool
+    reflection.enable_server_reflection((SERVICE, reflection.SERVICE_NAME), server, pool=pool)

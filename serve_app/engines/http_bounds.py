@@ -1,0 +1,227 @@
+"""Bounds on HTTP connections: head, body, trailers, pipelined requests, connections of one address.
+
+uvicorn (0.54) waits indefinitely for a request's head and body, reads heads and trailers of any size, takes a trailer
+for a header, and queues any number of pipelined requests. `BoundedHttp` is uvicorn's connection with limits, given to
+uvicorn by its option `http`. It overrides methods of `asyncio.Protocol` and callbacks of httptools' parser.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import time
+from collections.abc import Awaitable, Iterable
+from typing import Any, cast
+
+from starlette.types import Receive, Scope, Send
+from uvicorn.config import Config
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.server import ServerState
+
+from rlservo.export.contract.errors import DeadlineError, OverloadedError, RequestError
+from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.settings import ServerSettings
+
+LIMITS = "rlservo.limits"  # in the application's lifespan state, which uvicorn hands to each connection
+HEAD_S = 5.0  # [s] for a request's head, from the connection's start or the head's first byte
+MAX_HEAD_BYTES = 16384  # of a head, and of trailers
+MAX_PIPELINED = 32  # requests that a connection may send before the first one is answered
+MAX_CONNECTIONS = 4096  # of one process
+SPARE = 32  # connections of an address beyond its bound that are answered 429; further ones are closed at once
+UNREAD_MS = 30_000  # [ms] that a client may leave a reply unread
+ERROR_CODES = {
+    400: RequestError.code,
+    408: DeadlineError.code,
+    429: OverloadedError.code,
+    431: RequestError.code,
+}
+CHECK_S = 1.0  # [s] between two looks at a connection's phase
+
+
+class ConnectionLimits:
+    """Limits that differ from server to server."""
+
+    def __init__(self, settings: ServerSettings, core: Core) -> None:
+        self.per_address = settings.max_connections_per_address
+        self.body_s = settings.body_timeout_s
+        self._core = core
+
+    def record(self, status: int, sentence: str, peer: str | None) -> None:
+        """Count and log what was refused before the application had it."""
+        request = Request("http", "", None, time.perf_counter())
+        self._core.record_failure(request, ERROR_CODES[status], sentence, peer=peer)
+
+
+class _Refused(Exception):
+    """A request is refused by the parser's callback; httptools and uvicorn answer 400 for any exception of one."""
+
+
+class BoundedHttp(HttpToolsProtocol):
+    """A connection that ends when a client sends too much or takes too long."""
+
+    _check_timer: asyncio.TimerHandle | None = None
+    _phase_limit_s: float | None = HEAD_S  # [s] None while nothing is awaited from the client
+    _is_late = False  # whether the phase was beyond its limit at the last check
+    _in_body = False
+    _head_bytes = 0
+    _trailer_bytes = 0
+    _sentence = ""
+
+    def __init__(
+        self,
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self._limits: ConnectionLimits = app_state[LIMITS]
+        self._since = self.loop.time()
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Count the connection, and begin to wait for the first head."""
+        super().connection_made(transport)
+        connection = transport.get_extra_info("socket")
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # the kernel ends it when a reply stays unread, a WebSocket's too
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREAD_MS)
+        self._check_timer = self.loop.call_later(CHECK_S, self._check)
+        excess = self._excess()
+        if excess >= SPARE:
+            transport.abort()
+        elif excess > 0:
+            self.app = self._refuse_connection
+
+    def _excess(self) -> int:
+        """Return by how many connections this one's address, or all together, are beyond the bound."""
+        total = len(self.connections) - MAX_CONNECTIONS
+        if not self._limits.per_address or self.client is None or len(self.connections) <= self._limits.per_address:
+            return total
+        peers: Iterable[Any] = cast("Iterable[Any]", self.connections)
+        own = sum(peer.client is not None and peer.client[0] == self.client[0] for peer in peers)
+        return max(int(own) - self._limits.per_address, total)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop the checks."""
+        self._stop_checks()
+        super().connection_lost(exc)
+
+    def handle_websocket_upgrade(self) -> None:
+        """Leave the connection to the WebSocket, which has bounds of its own."""
+        self._stop_checks()
+        super().handle_websocket_upgrade()
+
+    def data_received(self, data: bytes) -> None:
+        """Read what came; of a head no more than may come."""
+        super().data_received(data)
+        if not self._in_body and self._phase_limit_s is not None:
+            self._head_bytes += len(data)
+            if self._head_bytes > MAX_HEAD_BYTES and not self.transport.is_closing():
+                self._end(431, f"the request's headers are larger than {MAX_HEAD_BYTES} bytes")
+
+    # Callbacks of the parser
+
+    def on_message_begin(self) -> None:
+        """Begin to wait for a head."""
+        super().on_message_begin()
+        self._await(HEAD_S)
+        self._head_bytes = 0
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        """Take a header. What comes after the body is a trailer: it is ignored, and bounded."""
+        if not self._in_body:
+            super().on_header(name, value)
+            return
+        self._trailer_bytes += len(name) + len(value)
+        if self._trailer_bytes > MAX_HEAD_BYTES:
+            self._refuse("the request's trailers are too large")
+
+    def on_headers_complete(self) -> None:
+        """Begin to wait for the body."""
+        parser: Any = self.parser
+        if parser.should_upgrade():
+            self._check_upgrade(parser.get_method())
+        if len(self.pipeline) >= MAX_PIPELINED:
+            self._refuse(f"more than {MAX_PIPELINED} requests were sent before the first one was answered")
+        self._in_body = True
+        self._trailer_bytes = 0
+        self._await(self._limits.body_s)
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """Await nothing more of this request."""
+        super().on_message_complete()
+        self._in_body = False
+        self._await(None)
+
+    def send_400_response(self, msg: str) -> None:  # noqa: ARG002
+        """Answer what the parser or one of its callbacks refused, and close."""
+        self._end(400, self._sentence or "the request is not valid HTTP/1.1")
+
+    # Ours
+
+    def _await(self, limit_s: float | None) -> None:
+        self._phase_limit_s, self._since, self._is_late = limit_s, self.loop.time(), False
+
+    def _check(self) -> None:
+        self._check_timer = self.loop.call_later(CHECK_S, self._check)
+        if self._phase_limit_s is None or self.loop.time() - self._since <= self._phase_limit_s:
+            return
+        if not self._is_late:  # a process that was starved has yet to read what came in time
+            self._is_late = True
+        elif self.cycle is not None and self._in_body and self.cycle.response_started:
+            self.transport.abort()  # it was answered, and the rest of its body never came
+        else:
+            self._end(408, f"the request did not arrive within {self._phase_limit_s:g} s")
+
+    def _stop_checks(self) -> None:
+        if self._check_timer is not None:
+            self._check_timer.cancel()
+            self._check_timer = None
+
+    def _check_upgrade(self, method: bytes) -> None:
+        """Refuse any Upgrade but a WebSocket's without a body, since uvicorn would drop the body."""
+        headers = dict(self.headers)
+        is_websocket = headers.get(b"upgrade", b"").lower() == b"websocket" and method == b"GET"
+        has_body = headers.get(b"content-length", b"0") != b"0" or b"transfer-encoding" in headers
+        if not is_websocket or has_body:
+            self._refuse("the header Upgrade is supported for a WebSocket only, which begins with a GET without a body")
+
+    def _refuse(self, sentence: str) -> None:
+        self._sentence = sentence
+        raise _Refused
+
+    def _end(self, status: int, sentence: str) -> None:
+        """Answer with an error in place of the application, and close the connection."""
+        if self.cycle is not None and not self.cycle.response_complete:
+            self.cycle.disconnected = True  # the application's reply, if it still makes one, goes nowhere
+            self.cycle.message_event.set()
+        self._limits.record(status, sentence, self.client and self.client[0])
+        content = _encode(status, sentence)
+        self.transport.write(
+            b"HTTP/1.1 %d \r\ncontent-type: application/json\r\nconnection: close\r\ncontent-length: %d\r\n\r\n%s"
+            % (status, len(content), content)
+        )
+        self.transport.close()
+
+    def _refuse_connection(self, _scope: Scope, _receive: Receive, send: Send) -> Awaitable[None]:
+        count = self._limits.per_address
+        sentence = f"your address has more than {count} connections, or all clients {MAX_CONNECTIONS}: close some"
+        self._limits.record(429, sentence, self.client and self.client[0])
+        return _answer(send, 429, _encode(429, sentence))
+
+
+async def _answer(send: Send, status: int, content: bytes) -> None:
+    headers = [
+        (b"content-type", b"application/json"),
+        (b"content-length", b"%d" % len(content)),
+        (b"retry-after", b"1"),
+        (b"connection", b"close"),
+    ]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": content})
+
+
+def _encode(status: int, sentence: str) -> bytes:
+    return json.dumps({"error": sentence, "code": ERROR_CODES[status]}, separators=(",", ":")).encode()

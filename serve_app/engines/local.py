@@ -1,0 +1,395 @@
+"""Embedded engine: the application on uvicorn, in this process or in workers under uvicorn's supervisor.
+
+One worker runs in the calling process. Several are processes of uvicorn's `Multiprocess`, which replaces a worker that
+died or hangs, and all of them, one by one, on SIGHUP. A worker whose parent has died ends itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import multiprocessing
+import os
+import resource
+import signal
+import socket
+import threading
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import uvicorn
+from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.supervisors import Multiprocess
+
+from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
+from rlservo.serve_app.engines.http_bounds import LIMITS, MAX_CONNECTIONS, BoundedHttp, ConnectionLimits
+from rlservo.serve_app.engines.ports import BACKLOG, listen
+from rlservo.serve_app.engines.serving import Serving
+from rlservo.serve_app.server.admin_key import operator_key
+from rlservo.serve_app.server.api_keys import Role, check_exposure
+from rlservo.serve_app.server.request_log import configure
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.server.start_check import load_served
+from rlservo.serve_app.versions.object_storage import place_of
+from rlservo.serve_app.versions.plan import ServedConfig
+from rlservo.serve_app.wire.loopback import is_loopback
+
+logger = logging.getLogger(__name__)
+
+KEEP_ALIVE_S = 90  # [s] that a connection may be idle
+DRAIN_S = 15  # [s] for requests in progress when the server stops
+HUNG_S = 15  # [s] after which the supervisor replaces a worker that does not respond; a start may take as long
+EXIT_S = DRAIN_S + 5  # [s] for a worker to exit
+DESCRIPTORS = MAX_CONNECTIONS + 256  # open files that a full server needs
+FEWEST_DESCRIPTORS = 64  # with fewer a server cannot start
+UVICORN = logging.getLogger("uvicorn.error")
+
+
+@dataclass(frozen=True)
+class RunningServer:
+    """Addresses and policies of a server that answers requests."""
+
+    url: str
+    policies: tuple[tuple[str, str], ...]  # (name, default version)
+    grpc: str | None = None  # host:port, if gRPC is served
+    admin_key_file: Path | None = None  # the operator's key, for as long as the server runs
+
+
+def serve_policies(
+    places: Sequence[str | Path],
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    grpc_port: int | None = None,
+    workers: int = 1,
+    settings: Mapping[str, Any] | None = None,
+    served: Mapping[str, Any] | None = None,
+    admin_key_file: Path | None = None,
+    on_ready: Callable[[RunningServer], None] | None = None,
+    on_stop: Callable[[], None] | None = None,
+    stop: threading.Event | None = None,
+) -> None:
+    """Serve the policies at or below `places`, folders or URIs, until Ctrl-C, SIGTERM or `stop`; return when all ended.
+
+    `served` is a `ServedConfig`: versions, aliases, canary, shadow. With an `admin_key_file`, and no admin key in the
+    settings, a key for administration is written there, readable by this user alone, and removed at the end. `on_ready`
+    is called when requests are answered, `on_stop` when the server begins to stop. A second Ctrl-C does not wait for
+    requests in progress.
+
+    In the main thread this takes over SIGINT, SIGTERM and SIGHUP while it runs; in another thread, where there can only
+    be one worker, `stop` ends it. Raises UsageError or BundleError where something is wrong from the start, and
+    UnavailableError where a port or a storage cannot be had.
+    """
+    if workers < 1:
+        raise UsageError(f"workers must be 1 or more, got {workers}")
+    in_main = threading.current_thread() is threading.main_thread()
+    if workers > 1 and not in_main:
+        raise UsageError("several workers need the main thread, for their supervisor's signals")
+    chosen = ServerSettings.from_environment(settings)
+    ServedConfig.parse(dict(served or {}))
+    keys = check_exposure(host, chosen)
+    if not keys.keys and not is_loopback(host):
+        logger.warning("listening on %s without authentication: whoever reaches this port can ask for actions", host)
+    if keys.operator is not None or any(key.role is Role.admin for key in keys.keys):
+        admin_key_file = None
+    _raise_descriptor_limit()
+    with contextlib.ExitStack() as stack:
+        listener = stack.enter_context(contextlib.closing(listen(host, port)))
+        if grpc_port is not None:
+            listen(host, grpc_port, option="--grpc-port").close()
+        digest = "" if admin_key_file is None else stack.enter_context(operator_key(admin_key_file))
+        if digest:
+            chosen = chosen.model_copy(update={"operator_key": digest})
+        server = EmbeddedServer(
+            tuple(place_of(place) for place in places), host, grpc_port, workers, chosen, dict(served or {})
+        )
+        shown = "127.0.0.1" if host == "0.0.0.0" else "[::1]" if host == "::" else f"[{host}]" if ":" in host else host
+        url = f"http://{shown}:{listener.getsockname()[1]}"
+        grpc = None if grpc_port is None else f"{shown}:{grpc_port}"
+
+        def ready(policies: Sequence[tuple[str, str]]) -> None:
+            if on_ready is not None:
+                on_ready(RunningServer(url, tuple(policies), grpc, admin_key_file if digest else None))
+
+        if workers == 1:
+            _run_here(server, listener, ready, on_stop, stop, in_main)
+        else:
+            _run_workers(server, listener, ready, on_stop)
+
+
+@dataclass
+class EmbeddedServer:
+    """Recipe of the application, which travels to the workers; uvicorn calls it in the process that serves."""
+
+    places: tuple[str, ...]
+    host: str
+    grpc_port: int | None
+    workers: int
+    settings: ServerSettings
+    served: dict[str, Any]
+    failure: RlservoError | None = None
+    """Why the start failed, in the process that serves."""
+    policies: tuple[tuple[str, str], ...] = ()
+
+    def __call__(self) -> ASGIApp:
+        """Return the application, in the process that serves it."""
+        return _Application(self)
+
+    def config(self, **options: Any) -> uvicorn.Config:
+        """Return uvicorn's configuration."""
+        trusted = self.settings.trusted_proxies
+        return uvicorn.Config(
+            self,
+            factory=True,
+            interface="asgi3",
+            http=BoundedHttp,
+            lifespan="on",
+            workers=self.workers,
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            proxy_headers=bool(trusted),
+            forwarded_allow_ips=trusted or None,
+            backlog=BACKLOG,
+            timeout_keep_alive=KEEP_ALIVE_S,
+            timeout_graceful_shutdown=DRAIN_S,
+            timeout_worker_healthcheck=HUNG_S,
+            ws_max_size=self.settings.max_body_bytes,
+            ws_per_message_deflate=False,  # costs more than it saves for messages of kilobytes
+            **options,
+        )
+
+
+class _Application:
+    """The application with its lifespan: policies are loaded and gRPC listens before the first connection."""
+
+    def __init__(self, server: EmbeddedServer) -> None:
+        self._server = server
+        self._is_worker = server.workers > 1
+        replica = str(os.getpid()) if self._is_worker else ""
+        if self._is_worker:
+            configure(server.settings, replica=replica)
+        self._serving: Serving | None = None
+        self._grpc: Any = None
+        self._replica = replica
+        self._app: ASGIApp | None = None
+
+    def __call__(self, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
+        """Answer one connection, or the server's own start and stop."""
+        app = self._live if self._app is None or scope["type"] == "lifespan" else self._app
+        return app(scope, receive, send)
+
+    async def _live(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await receive()
+        try:
+            await self._start(scope["state"])
+        except RlservoError as error:
+            self._server.failure = error
+            if self._is_worker:
+                logger.error("a worker could not start: %s", error.message)
+            await send({"type": "lifespan.startup.failed", "message": ""})
+            return
+        await send({"type": "lifespan.startup.complete"})
+        await receive()
+        await self._stop()
+        await send({"type": "lifespan.shutdown.complete"})
+
+    async def _start(self, state: dict[str, Any]) -> None:
+        server, settings = self._server, self._server.settings
+        if self._is_worker:
+            _stop_with_parent()
+        serving = Serving(server.places, settings, replica=self._replica, host=server.host)
+        await serving.start(server.served)
+        store = serving.core.store()
+        if settings.default_policy not in (None, *store.names):
+            raise UsageError(
+                f"the default policy '{settings.default_policy}' is not among those to serve: {', '.join(store.names)}"
+            )
+        server.policies = tuple((name, store.default(name)) for name in store.names)
+        if server.grpc_port is not None:
+            from rlservo.serve_app.engines.grpc_server import GrpcServer  # takes a quarter of the start
+
+            self._grpc = GrpcServer(serving.core, server.host, server.grpc_port, is_shared=self._is_worker)
+            await self._grpc.start()
+        state[LIMITS] = ConnectionLimits(settings, serving.core)
+        self._serving, self._app = serving, serving.app
+
+    async def _stop(self) -> None:
+        if self._grpc is not None:
+            await self._grpc.stop()
+        if self._serving is not None:
+            await self._serving.stop()
+
+
+def _stop_with_parent() -> None:
+    """Stop this worker when its supervisor has died."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        asyncio.get_running_loop().add_reader(parent.sentinel, os.kill, os.getpid(), signal.SIGTERM)
+
+
+class _Server(uvicorn.Server):
+    """uvicorn's server, which reports when it answers and when it begins to stop."""
+
+    def __init__(
+        self, config: uvicorn.Config, on_ready: Callable[[], None], on_stop: Callable[[], None] | None
+    ) -> None:
+        super().__init__(config)
+        self._on_ready, self._on_stop = on_ready, on_stop
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Load the policies and listen."""
+        await super().startup(sockets)
+        if self.started:
+            self._on_ready()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Answer what is in progress, and stop."""
+        if self._on_stop is not None:
+            self._on_stop()
+        await super().shutdown(sockets)
+
+
+def _run_here(
+    server: EmbeddedServer,
+    listener: socket.socket,
+    ready: Callable[[Sequence[tuple[str, str]]], None],
+    on_stop: Callable[[], None] | None,
+    stop: threading.Event | None,
+    in_main: bool,
+) -> None:
+    running = _Server(server.config(), lambda: ready(server.policies), on_stop)
+
+    def request_stop() -> None:
+        running.should_exit = True
+
+    configure(server.settings)
+    UVICORN.setLevel(logging.CRITICAL)  # what it would say of a failed start, our exception says
+    with _stop_signals(request_stop) if in_main else contextlib.nullcontext(), _stop_event(stop, request_stop):
+        try:
+            running.run(sockets=[listener])
+        except SystemExit:
+            raise server.failure or UnavailableError("the server could not start: see its log") from None
+
+
+def _run_workers(
+    server: EmbeddedServer,
+    listener: socket.socket,
+    ready: Callable[[Sequence[tuple[str, str]]], None],
+    on_stop: Callable[[], None] | None,
+) -> None:
+    # What is wrong with the policies is told here, once, before any worker starts.
+    with contextlib.closing(load_served(server.places, ServedConfig.parse(server.served), server.settings)) as store:
+        policies = tuple((name, store.default(name)) for name in store.names)
+    UVICORN.setLevel(logging.INFO)
+    with _stop_signals(lambda: None):  # put back what the supervisor takes over
+        supervisor = _Supervisor(server.config(), [listener], lambda: ready(policies), on_stop)
+        supervisor.run()
+    if not supervisor.is_asked_to_stop:
+        raise UnavailableError("a worker could not start: the lines above say why")
+
+
+class _Supervisor(Multiprocess):
+    """uvicorn's supervisor, which reports when all workers answer and ends those that do not exit."""
+
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        sockets: list[socket.socket],
+        on_ready: Callable[[], None],
+        on_stop: Callable[[], None] | None,
+    ) -> None:
+        super().__init__(config, sockets)
+        self._on_ready: Callable[[], None] | None = on_ready
+        self._on_stop = on_stop
+        self.is_asked_to_stop = False
+
+    def keep_subprocess_alive(self) -> None:
+        """Replace workers that died or hang; report once when all are ready."""
+        super().keep_subprocess_alive()
+        if self._on_ready is not None and all(process.is_ready() for process in self.processes):
+            self._on_ready()
+            self._on_ready = None
+
+    def handle_int(self) -> None:
+        """Stop on Ctrl-C."""
+        self._stop()
+
+    def handle_term(self) -> None:
+        """Stop on SIGTERM."""
+        self._stop()
+
+    def _stop(self) -> None:
+        if not self.is_asked_to_stop and self._on_stop is not None:
+            self._on_stop()
+        self.is_asked_to_stop = True
+        self.should_exit.set()
+
+    def join_all(self) -> None:
+        """Wait for the workers to exit, and end those that do not."""
+        for process in self.processes:
+            process.process.join(EXIT_S)
+            if process.process.exitcode is None:
+                process.process.kill()
+        super().join_all()
+
+
+@contextlib.contextmanager
+def _stop_signals(request_stop: Callable[[], None]) -> Iterator[None]:
+    """Stop on SIGINT, SIGTERM and SIGHUP also before and after uvicorn handles them, and without an exception.
+
+    uvicorn raises a signal again when it has shut down. SIGHUP stays ignored where it is, as under nohup.
+    """
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        request_stop()
+
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    previous = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _stop_event(stop: threading.Event | None, request_stop: Callable[[], None]) -> Iterator[None]:
+    if stop is None:
+        yield
+        return
+    ended = threading.Event()
+
+    def wait() -> None:
+        while not ended.is_set():
+            if stop.wait(0.1):
+                request_stop()
+                return
+
+    waiter = threading.Thread(target=wait, daemon=True)
+    waiter.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        waiter.join()
+
+
+def _raise_descriptor_limit() -> None:
+    """Allow as many open files as a full server needs, as far as the system does. Raises UsageError."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = DESCRIPTORS if hard == resource.RLIM_INFINITY else min(DESCRIPTORS, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    if hard != resource.RLIM_INFINITY and hard < FEWEST_DESCRIPTORS:
+        raise UsageError(f"this process may open {hard} files, and a server needs {FEWEST_DESCRIPTORS}: ulimit -n")
+    if hard != resource.RLIM_INFINITY and hard < DESCRIPTORS:
+        logger.warning(
+            "this process may open %d files: about %d connections at once fit, further ones wait", hard, hard - 64
+        )

@@ -1,0 +1,52 @@
+"""Listening TCP sockets, and the sentence that says why one cannot be had."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+
+import psutil
+
+from rlservo.export.contract.errors import UsageError
+
+BACKLOG = 2048
+
+
+def listen(host: str, port: int, *, option: str = "--port") -> socket.socket:
+    """Return a socket that listens on host:port (port 0: any). Raises UsageError, naming the command's `option`."""
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except OSError as error:
+        raise UsageError(f"host '{host}' is not an address of this machine: {error.strerror}") from error
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # closed connections lingering are no obstacle
+    try:
+        listener.bind(address)
+        listener.listen(BACKLOG)
+    except OSError as error:
+        listener.close()
+        raise UsageError(_why_not(host, port, option, error)) from error
+    return listener
+
+
+def _why_not(host: str, port: int, option: str, error: OSError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        holder = port_holder(port)
+        by = "" if holder is None else f" by '{holder[1]}' (process {holder[0]})"
+        return f"port {port} on {host} is in use{by}: stop it, or choose another with {option}"
+    if error.errno == errno.EACCES:
+        return f"port {port} needs more rights than this user has: choose one above 1023 with {option}"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return f"host '{host}' is not an address of this machine: use 127.0.0.1, or 0.0.0.0 for all of its addresses"
+    return f"cannot listen on {host}:{port}: {error.strerror}"
+
+
+def port_holder(port: int) -> tuple[int, str] | None:
+    """Return (pid, command name) of a process that listens on a TCP port, where the system shows it to this user."""
+    for process in psutil.process_iter():  # psutil.net_connections names one process for each socket
+        with contextlib.suppress(psutil.Error):
+            listening = (each for each in process.net_connections("tcp") if each.status == psutil.CONN_LISTEN)
+            if any(each.laddr and each.laddr.port == port for each in listening):
+                return process.pid, process.name()
+    return None

@@ -1,0 +1,213 @@
+"""Distributed engine: the application as one Ray Serve deployment, run by Ray's own commands.
+
+`serve run rlservo.serve_app.engines.ray_serve:build policies=DIR`, `serve deploy deploy/serve.yaml`. Ray starts,
+scales, replaces and upgrades the replicas. One deployment holds every policy: a policy is kilobytes and microseconds, a
+hop to another actor is milliseconds. A replica imports neither torch nor ray.rllib.
+"""
+
+# No `from __future__ import annotations` here: Serve reads the type of build's argument to know what to make of `args`.
+
+import asyncio
+import logging
+import os
+from collections.abc import AsyncIterator
+from typing import Any, cast
+
+import grpc
+import ray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from ray import serve
+from ray.serve import Application, Deployment
+
+from rlservo.export.contract.errors import RlservoError
+from rlservo.serve_app.engines.autoscaling import BUSY, Load
+from rlservo.serve_app.engines.serving import Serving
+from rlservo.serve_app.protocols.http_endpoint import PolicyApp
+from rlservo.serve_app.protocols.oip_grpc import Grpc
+from rlservo.serve_app.protocols.oip_messages import SERVICE, STREAM, UNARY
+from rlservo.serve_app.server.api_keys import check_exposure
+from rlservo.serve_app.server.request_log import configure
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.object_storage import place_of
+from rlservo.serve_app.versions.plan import ServedConfig
+from rlservo.serve_app.wire.loopback import is_loopback
+
+logger = logging.getLogger(__name__)
+
+DEPLOYMENT = "PolicyServer"
+SPARE = 64  # requests for health, metrics and documentation
+SWITCHES = ("RAY_SERVE_ENABLE_HA_PROXY", "RAY_SERVE_THROUGHPUT_OPTIMIZED")
+CONTROLLER = ("SERVE_CONTROLLER_ACTOR", "serve")  # the name and namespace of Serve's controller
+EVERYWHERE = "0.0.0.0"
+
+
+class BuildArguments(BaseModel):
+    """The `args` of an application in serve.yaml, or `key=value` after `serve run`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    policies: list[str] = Field(min_length=1)
+    """Bundle folders, policy folders, repositories, or URIs of published ones; on the command line separated by
+    commas."""
+
+    replicas: int = Field(1, ge=1)
+    """Processes that serve the same policies; each loads all of them."""
+
+    served: dict[str, Any] = {}
+    """Versions, aliases, canary and shadow (ServedConfig), where `user_config` cannot be given; `user_config` wins."""
+
+    settings: dict[str, Any] = {}
+    """Fields of ServerSettings; what is not given comes from RLSERVO_* variables, then from the defaults."""
+
+    @field_validator("policies", mode="before")
+    @classmethod
+    def _split(cls, value: Any) -> Any:
+        return value.split(",") if isinstance(value, str) else value
+
+
+def build(args: BuildArguments) -> Application:
+    """Return the application for `serve run` and `serve deploy`. Raises UsageError.
+
+    Relative folders are taken from the directory this runs in, since a replica's own is another.
+    """
+    settings = ServerSettings.from_environment(args.settings)
+    ServedConfig.parse(args.served)
+    # A folder may exist only on the nodes that run replicas, so it is the replica that looks.
+    places = [place_of(place) for place in args.policies]
+    server: Deployment = cast("Deployment", PolicyServer)  # the decorator's type says it is still the class
+    # More than a replica takes on: what waits at Serve's limit waits behind clients that are slow to send a body.
+    limit = settings.max_ongoing_requests + settings.max_incoming + settings.max_streams + SPARE
+    options = server.options(num_replicas=args.replicas, max_ongoing_requests=limit, user_config=args.served)
+    return options.bind(places, settings.model_dump())
+
+
+class InferenceMethods:
+    """The gRPC methods that Serve looks for on the deployment's class; messages are bytes (`add_service`)."""
+
+    _grpc: Grpc
+
+    async def ModelStreamInfer(self, requests: AsyncIterator[bytes], grpc_context: Any) -> AsyncIterator[Any]:
+        async for reply in self._grpc.stream(requests, grpc_context):
+            yield reply
+
+
+def _method(name: str) -> Any:
+    async def answer(self: InferenceMethods, request: bytes, grpc_context: Any) -> Any:
+        return await self._grpc.answer(name, (request, None), grpc_context)
+
+    return answer
+
+
+for _name in UNARY:
+    setattr(InferenceMethods, _name, _method(_name))
+
+
+@serve.deployment(
+    name=DEPLOYMENT,
+    # A policy server spends its time waiting; a whole logical CPU would only keep replicas off small machines.
+    ray_actor_options={"num_cpus": 0.1},
+    # A line per request costs more than the policy; below this level Serve makes one all the same and drops it (5%).
+    logging_config={"enable_access_log": False, "log_level": "WARNING"},
+    health_check_period_s=1,  # a replica that hangs is replaced after three checks
+    health_check_timeout_s=2,
+    graceful_shutdown_timeout_s=15,
+    user_config={},
+    max_surge_percent=100,  # a rolling update starts the new replica before the old one stops
+)
+@serve.ingress()
+class PolicyServer(InferenceMethods):
+    """A replica: the policies, the HTTP application and the gRPC methods over them."""
+
+    def __init__(self, places: list[str], settings: dict[str, Any]) -> None:
+        """Check the settings. Serve calls `reconfigure` next, and sends requests only after that."""
+        self._settings = ServerSettings(**settings)
+        self._load = Load()
+        self._is_started = False
+        replica = serve.get_replica_context().replica_tag
+        host = _listening_host()
+        try:
+            configure(self._settings, replica=replica)
+            check_exposure(host, self._settings)
+            self._serving = Serving(places, self._settings, replica=replica, host=host, is_behind_serve=True)
+        except RlservoError as error:
+            raise _plain(error) from None
+        self._grpc = Grpc(self._serving.core, local_only=is_loopback(host))
+        if os.environ.get(SWITCHES[0]) != "1":
+            logger.warning(
+                "requests reach this replica through Serve's Python proxy, ten times slower than HAProxy: set %s=1 and "
+                "%s=1 for `serve run`, or for `ray start` on every node",
+                *SWITCHES,
+            )
+
+    def __serve_build_asgi_app__(self) -> PolicyApp:  # Serve's hook: the app is built in the replica
+        return self._serving.app
+
+    async def reconfigure(self, user_config: Any) -> None:
+        """Serve what the configuration says: Serve calls this at the start, and on `serve deploy` with another one.
+
+        Serve sends a replica nothing while this runs, so only the first call waits until all is loaded.
+        """
+        if self._is_started:
+            self._reconfiguring = asyncio.create_task(self._configure(user_config))
+            return
+        try:
+            await self._serving.start(user_config)
+        except RlservoError as error:
+            raise _plain(error) from None
+        self._is_started = True
+
+    def record_autoscaling_stats(self) -> dict[str, float]:
+        """Tell Serve's autoscaler how busy this replica is, for `autoscaling.by_load`."""
+        return {BUSY: self._load.measure()}
+
+    async def check_health(self) -> None:
+        """Tell Serve's controller that the event loop runs and the policies are loaded; if not, it replaces us."""
+        await asyncio.sleep(0)
+        if not self._is_started:
+            raise RuntimeError("no policies are loaded: the deployment's user_config must be a map, and not null")
+
+    async def __del__(self) -> None:
+        """End the recording. Serve calls this when the replica has answered its last request."""
+        if (serving := getattr(self, "_serving", None)) is not None:
+            await serving.stop()
+
+    async def _configure(self, user_config: Any) -> None:
+        try:
+            await self._serving.control.configure(user_config)
+        except Exception:
+            logger.exception("the configuration cannot be read; still serving the previous one")
+
+
+def add_service(_servicer: Any, server: Any) -> None:
+    """Register the Open Inference Protocol at one of Serve's gRPC servers.
+
+    `grpc_options.grpc_servicer_functions: [rlservo.serve_app.engines.ray_serve:add_service]` names it to Serve, which
+    puts its own functions in place of these, and passes a request on to the replica's method of the same name. Messages
+    stay bytes until they are there: garbage is then answered like every other error.
+    """
+    methods: dict[str, Any] = {name: grpc.unary_unary_rpc_method_handler(_nothing) for name in UNARY}
+    methods[STREAM] = grpc.stream_stream_rpc_method_handler(_nothing)
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, methods),))
+
+
+def _nothing(_request: Any, _context: Any) -> None:
+    """Serve puts its own function in this one's place."""
+
+
+def _plain(error: RlservoError) -> RuntimeError:
+    """Return one sentence: Ray pickles what a constructor raises, and prints its text."""
+    return RuntimeError(error.message)
+
+
+def _listening_host() -> str:
+    """Return the address that Serve's HTTP options name; every address where Serve does not tell.
+
+    Serve has no public question for it. Its controller has a well-known name and answers; a Serve whose controller is
+    another one is taken to listen everywhere, which asks for API keys.
+    """
+    try:
+        controller: Any = ray.get_actor(*CONTROLLER)
+        options: Any = ray.get(controller.get_http_config.remote())
+        return str(options.host)
+    except (ValueError, AttributeError):
+        return EVERYWHERE

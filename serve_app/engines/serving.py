@@ -1,0 +1,60 @@
+"""Policies, application and background tasks of one server process, the same under every engine."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+from collections.abc import Sequence
+from typing import Any
+
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.server.start_check import version_loader
+from rlservo.serve_app.versions.plan_ledger import MemoryLedger
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+
+
+class Serving:
+    """What one process serves: an engine makes it, starts it in its event loop, and stops it there."""
+
+    def __init__(
+        self, places: Sequence[str], settings: ServerSettings, *, replica: str, host: str, is_behind_serve: bool = False
+    ) -> None:
+        """Take the folders and URIs of policies, this process's name and the address that is listened on.
+
+        Nothing is loaded yet. Raises UsageError.
+        """
+        self.settings = settings
+        self.control = ReplicaVersions(version_loader(places, settings), MemoryLedger(), replica=replica)
+        self.app = create_app(
+            lambda: self.control.store,
+            settings,
+            replica=replica,
+            control=self.control,
+            host=host,
+            is_behind_serve=is_behind_serve,
+        )
+        self.core = self.app.state.core
+        self._tasks: list[asyncio.Task[None]] = []
+
+    async def start(self, served: Any) -> None:
+        """Load and prove what `served` (ServedConfig) says. Raises UsageError, BundleError and UnavailableError."""
+        await self.control.configure(served)
+        self.core.admission.loop_clock.start()
+        self._tasks.append(asyncio.create_task(self.control.poll_ledger()))
+        if self.settings.poll_s is not None:
+            self._tasks.append(asyncio.create_task(self.control.poll_repository(self.settings.poll_s)))
+        # What is loaded by now stays: a collection that walks it would hold requests up.
+        gc.collect()
+        gc.freeze()
+
+    async def stop(self) -> None:
+        """End the background tasks and complete the recording."""
+        for task in self._tasks:
+            task.cancel()
+        for task in self._tasks:
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+        if self.core.recorder is not None:
+            await asyncio.to_thread(self.core.recorder.close)

@@ -1,1 +1,0 @@
-"""Ray Serve integration: deployment, ingress, HAProxy, cluster processes, autoscaling."""

@@ -1,0 +1,160 @@
+"""Contract of the server, held by the embedded engine and by Ray Serve alike."""
+
+from __future__ import annotations
+
+import http.client
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+
+from clusters import KEY, Cluster
+from rlservo.export.contract.errors import ObservationError, UnauthenticatedError
+from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.runtime.policy import Policy
+from servers import LiveServer
+
+pytestmark = [pytest.mark.serve, pytest.mark.slow]
+
+OBS = np.linspace(-0.5, 0.5, 27, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Engine:
+    """A running server and the policy that answers for ur5."""
+
+    port: int
+    grpc_port: int
+    key: str
+    policy: Policy
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def ask(
+        self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
+    ) -> tuple[int, http.client.HTTPMessage, bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        try:
+            every = {"authorization": f"Bearer {self.key}", "content-type": "application/json", **(headers or {})}
+            connection.request(method, path, body, {name: value for name, value in every.items() if value})
+            reply = connection.getresponse()
+            return reply.status, reply.headers, reply.read()
+        finally:
+            connection.close()
+
+
+@pytest.fixture(params=["embedded", "ray serve"], scope="module")
+def engine(request: pytest.FixtureRequest, policies: Path) -> Engine:
+    if request.param == "embedded":
+        server: LiveServer = request.getfixturevalue("live_server")
+        return Engine(server.port, server.grpc_port, server.key, Policy.load(policies / "ur5"))
+    cluster: Cluster = request.getfixturevalue("cluster")
+    return Engine(cluster.port, cluster.grpc_port, KEY, Policy.load(cluster.repository / "ur5" / "1"))
+
+
+Act = Callable[[Engine], Any]
+
+
+def over_json(engine: Engine) -> Any:
+    with PolicyClient(engine.url, "ur5", api_key=engine.key, timeout_s=30) as policy:
+        return policy.act(OBS)
+
+
+def over_a_websocket(engine: Engine) -> Any:
+    with StreamClient(engine.url, "ur5", api_key=engine.key, timeout_s=30) as policy:
+        return policy.act(OBS)
+
+
+def over_oip(engine: Engine) -> Any:
+    _, _, content = engine.ask("GET", "/v2/models/ur5")
+    name = json.loads(content)["inputs"][0]["name"]
+    tensor = {"name": name, "shape": [1, 27], "datatype": "FP32", "data": OBS.tolist()}
+    status, _, content = engine.ask("POST", "/v2/models/ur5/infer", json.dumps({"inputs": [tensor]}).encode())
+    assert status == 200, content
+    return json.loads(content)["outputs"][0]["data"]
+
+
+def over_grpc(engine: Engine) -> Any:
+    metadata = (("authorization", f"Bearer {engine.key}"), ("application", "rlservo"))
+    with grpc.insecure_channel(f"127.0.0.1:{engine.grpc_port}") as channel:
+
+        def call(method: str, request: Any, reply: Any) -> Any:
+            multicall = channel.unary_unary(f"/inference.GRPCInferenceService/{method}")
+            content = multicall(request.SerializeToString(), metadata=metadata, timeout=30, wait_for_ready=True)
+            return reply.FromString(content)
+
+        described = call("ModelMetadata", messages.ModelMetadataRequest(name="ur5"), messages.ModelMetadataResponse)
+        request = messages.ModelInferRequest(model_name="ur5", raw_input_contents=[OBS.tobytes()])
+        request.inputs.add(name=described.inputs[0].name, datatype="FP32", shape=[1, 27])
+        reply = call("ModelInfer", request, messages.ModelInferResponse)
+    return np.frombuffer(reply.raw_output_contents[0], np.float32)
+
+
+@pytest.mark.parametrize("act", [over_json, over_a_websocket, over_oip, over_grpc])
+def test_every_protocol_gives_the_policys_action(engine: Engine, act: Act) -> None:
+    expected = np.asarray(engine.policy.act(OBS), np.float64).ravel()
+    np.testing.assert_allclose(np.asarray(act(engine), np.float64).ravel(), expected, rtol=1e-6, atol=1e-7)
+
+
+def test_an_observation_of_the_wrong_length_is_refused_by_its_element(engine: Engine) -> None:
+    with PolicyClient(engine.url, "ur5", api_key=engine.key, timeout_s=30) as policy:
+        with pytest.raises(ObservationError, match="27"):
+            policy.act(OBS[:-1])
+        broken = OBS.copy()
+        broken[3] = np.nan
+        with pytest.raises(ObservationError):
+            policy.act(broken)
+
+
+def test_without_a_key_nothing_of_the_policies_is_told(engine: Engine) -> None:
+    with PolicyClient(engine.url, "ur5", timeout_s=30) as policy, pytest.raises(UnauthenticatedError):
+        policy.act(OBS)
+    for path in ("/v1/policies", "/metrics", "/v2/models/ur5"):
+        assert engine.ask("GET", path, headers={"authorization": ""})[0] == 401
+    assert engine.ask("GET", "/v2/health/ready", headers={"authorization": ""})[0] == 200
+
+
+def test_replies_carry_the_requests_id_once(engine: Engine) -> None:
+    body = json.dumps({"obs": OBS.tolist()}).encode()
+    status, headers, _ = engine.ask("POST", "/v1/policies/ur5/act", body, {"x-request-id": "robot-7-41"})
+    assert status == 200 and headers.get_all("x-request-id") == ["robot-7-41"]
+    _, headers, _ = engine.ask("POST", "/v1/policies/ur5/act", body)
+    (given,) = headers.get_all("x-request-id") or ()
+    assert given
+
+
+def test_a_key_in_a_trailer_is_no_key(engine: Engine) -> None:
+    body = json.dumps({"obs": OBS.tolist()}).encode()
+    connection = http.client.HTTPConnection("127.0.0.1", engine.port, timeout=30)
+    connection.putrequest("POST", "/v1/policies/ur5/act")
+    connection.putheader("content-type", "application/json")
+    connection.putheader("transfer-encoding", "chunked")
+    connection.endheaders()
+    trailer = f"authorization: Bearer {engine.key}\r\n"
+    connection.send(b"%x\r\n%s\r\n0\r\n%s\r\n" % (len(body), body, trailer.encode()))
+    status = connection.getresponse().status
+    connection.close()
+    assert status in (400, 401)  # behind Ray Serve a chunked body is refused altogether
+
+
+def test_another_hosts_request_and_another_pages_are_refused(engine: Engine) -> None:
+    body = json.dumps({"obs": OBS.tolist()}).encode()
+    assert engine.ask("POST", "/v1/policies/ur5/act", body, {"host": "evil.example"})[0] == 403
+    assert engine.ask("POST", "/v1/policies/ur5/act", body, {"origin": "http://evil.example"})[0] == 403
+
+
+def test_metrics_and_the_status_page_are_served(engine: Engine) -> None:
+    over_json(engine)
+    status, _, text = engine.ask("GET", "/metrics")
+    assert status == 200 and b"rlservo_requests_total" in text
+    status, _, page = engine.ask("GET", "/", headers={"accept": "text/html"})
+    assert status == 200 and b"<html" in page.lower()
