@@ -42,7 +42,7 @@ logger = logging.getLogger(__name__)
 
 KEEP_ALIVE_S = 90  # [s] that a connection may be idle
 DRAIN_S = 15  # [s] for requests in progress when the server stops
-HUNG_S = 15  # [s] after which the supervisor replaces a worker that does not respond; a start may take as long
+HUNG_S = 30  # [s] until an unresponsive worker is replaced; a start on a busy machine takes as long
 EXIT_S = DRAIN_S + 5  # [s] for a worker to exit
 DESCRIPTORS = MAX_CONNECTIONS + 256  # open files that a full server needs
 FEWEST_DESCRIPTORS = 64  # with fewer a server cannot start

@@ -1,8 +1,9 @@
-"""The Open Inference Protocol over gRPC, through Ray Serve and HAProxy, with keys on; Triton's own client included."""
+"""The Open Inference Protocol over gRPC, on the embedded server, with keys on; Triton's own client included."""
 
 from __future__ import annotations
 
 import json
+import signal
 import socket
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.recording.episodes import episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.runtime.policy import Policy
-from servers import free_ports
+from servers import free_ports, launched
 from stores import load_store
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -186,42 +187,6 @@ def test_bytes_that_are_no_message_are_a_bad_request(call: Call) -> None:
     assert code == "INVALID_ARGUMENT" and "no ModelInferRequest" in details
 
 
-def test_the_callers_deadline_reaches_the_policy(live_server: Any, ur5: Path) -> None:
-    """A servicer of our own stands where Serve would: it is told what the caller still waits."""
-    import asyncio
-
-    from rlservo.serve_app.ray_serve.grpc_ingress import add_service
-
-    seen: list[Any] = []
-
-    class Server(grpc.aio._server.Server):  # Serve's does the same to the handlers it is given
-        def add_generic_rpc_handlers(self, handlers: Any) -> None:
-            async def answer(request: Any, _context: Any) -> bytes:
-                seen.append(request)
-                return b""
-
-            table = handlers[0]._method_handlers
-            for path, handler in table.items():
-                table[path] = handler._replace(unary_unary=answer)
-            super().add_generic_rpc_handlers(handlers)
-
-    async def run() -> None:
-        server = Server(None, (), (), (), None, None)
-        port = server.add_insecure_port("127.0.0.1:0")
-        add_service(None, server)
-        await server.start()
-        async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
-            stub = channel.unary_unary("/inference.GRPCInferenceService/ModelInfer")
-            await stub(b"one", timeout=5.0)
-            await stub(b"two")
-        await server.stop(None)
-
-    asyncio.run(run())
-    (one, within), (two, ever) = seen
-    assert (one, two, ever) == (b"one", b"two", None)
-    assert 3.0 < within < 5.1  # gRPC rounds a deadline to its wheel of timers
-
-
 def test_a_deadline_that_has_passed_is_not_worked_for(ur5: Path) -> None:
     from rlservo.serve_app.server.core import Core
     from rlservo.serve_app.server.settings import ServerSettings
@@ -280,14 +245,6 @@ def test_a_message_beyond_the_limit_is_refused_compressed_or_not(live_server: An
             assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
 
 
-def test_a_call_for_another_of_serves_applications_is_refused(live_server: Any) -> None:
-    with grpc.insecure_channel(f"127.0.0.1:{live_server.grpc_port}") as channel:
-        stub = channel.unary_unary("/inference.GRPCInferenceService/ServerLive")
-        with pytest.raises(grpc.RpcError) as caught:
-            stub(b"", metadata=(("application", "another"),), timeout=20)
-        assert caught.value.code() is grpc.StatusCode.NOT_FOUND and "another" in (caught.value.details() or "")
-
-
 def test_a_request_id_comes_back(live_server: Any) -> None:
     with grpc.insecure_channel(f"127.0.0.1:{live_server.grpc_port}") as channel:
         stub = channel.unary_unary("/inference.GRPCInferenceService/ServerLive")
@@ -329,3 +286,20 @@ def test_messages_leave_the_process_wide_pool_alone() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "free", done.stderr
+
+
+def test_health_is_told_without_a_key_and_reflection_where_it_is_wanted(policies: Path) -> None:
+    from grpc_health.v1 import health_pb2, health_pb2_grpc
+    from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+
+    with launched(policies, with_grpc=True, settings={"grpc_reflection": True}) as run:
+        run.wait_until_ready()
+        with grpc.insecure_channel(f"127.0.0.1:{run.grpc_port}") as channel:
+            for service in ("", "inference.GRPCInferenceService"):
+                request = health_pb2.HealthCheckRequest(service=service)
+                reply = health_pb2_grpc.HealthStub(channel).Check(request, timeout=20)
+                assert reply.status == health_pb2.HealthCheckResponse.SERVING
+            ask = reflection_pb2.ServerReflectionRequest(file_containing_symbol="inference.GRPCInferenceService")
+            (found,) = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter([ask]))
+            assert b"ModelStreamInfer" in found.file_descriptor_response.file_descriptor_proto[0]
+        assert run.end(signal.SIGTERM) == 0

@@ -1,4 +1,4 @@
-"""Every protocol through the real thing, Ray Serve and HAProxy included, with keys on."""
+"""Every protocol of the embedded server, with keys on."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_batch_of_1024_goes_through_as_binary_tensors(live_server: LiveServer,
         np.testing.assert_allclose(action, policy.act(BATCH), rtol=1e-6)
 
 
-def test_a_stream_runs_through_the_proxy(live_server: LiveServer, ur5: Path) -> None:
+def test_a_stream_is_answered(live_server: LiveServer, ur5: Path) -> None:
     url = f"ws://127.0.0.1:{live_server.port}/"
     with (
         Policy.load(ur5) as policy,

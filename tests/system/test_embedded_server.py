@@ -1,0 +1,216 @@
+"""The embedded server: its start, its end, and workers that are killed, stopped and replaced under load."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from rlservo.export.contract.errors import BundleError, RlservoError, UsageError
+from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.engines.local import serve_policies
+from rlservo.serve_app.runtime.policy import Policy
+from servers import Run, ask, free_ports, launched, running, wait_until_served
+
+OBS = [round(0.01 * i, 2) for i in range(27)]
+CLIENTS = 8
+PATIENCE_S = 120  # [s] on a busy machine
+
+
+def test_arguments_and_bundles_are_checked_before_anything_starts(policies: Path, tmp_path: Path) -> None:
+    (port,) = free_ports(1)
+    with pytest.raises(BundleError, match="does not exist"):
+        serve_policies([tmp_path / "nowhere"], port=port)
+    with pytest.raises(UsageError, match="workers must be 1 or more"):
+        serve_policies([policies], port=port, workers=0)
+    with pytest.raises(UsageError, match="threads"):
+        serve_policies([policies], port=port, settings={"threads": -1})
+    with pytest.raises(UsageError, match="the default policy 'no' is not among those to serve"):
+        serve_policies([policies], port=port, settings={"default_policy": "no"})
+    with pytest.raises(UsageError, match="without API keys"):
+        serve_policies([policies], port=port, host="0.0.0.0")
+
+
+@pytest.mark.serve
+def test_a_port_that_is_taken_is_named_with_its_holder(policies: Path) -> None:
+    with launched(policies) as run:
+        run.wait_until_ready()
+        with pytest.raises(UsageError, match=rf"port {run.port} on 127.0.0.1 is in use by '.*' \(process \d+\)"):
+            serve_policies([policies], port=run.port)
+        assert ask(run.port, "GET", "/v2/health/ready")[0] == 200
+
+
+@pytest.mark.serve
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_server_that_is_ended_leaves_nothing(policies: Path, number: signal.Signals, workers: int) -> None:
+    with launched(policies, workers=workers, with_admin_key=number != signal.SIGKILL, with_grpc=True) as run:
+        run.wait_until_ready()
+        assert run.end(number) == (-signal.SIGKILL if number == signal.SIGKILL else 0)
+
+
+@pytest.mark.serve
+def test_a_bundle_that_is_refused_ends_the_command_with_its_sentence(policies: Path, tmp_path: Path) -> None:
+    for workers in ("1", "2"):
+        command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(tmp_path), "--workers", workers]
+        done = subprocess.run(
+            [*command, "--port", "0"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        )
+        assert done.returncode != 0 and "Traceback" not in done.stderr
+        assert str(tmp_path) in done.stderr
+
+
+@pytest.mark.serve
+def test_a_user_without_a_home_is_served(policies: Path) -> None:
+    (port,) = free_ports(1)
+    command = ["env", "-u", "HOME", "-u", "XDG_RUNTIME_DIR", "-u", "XDG_CACHE_HOME", sys.executable, "-m"]
+    with running([*command, "rlservo.deploy.cli", "serve", str(policies), "--port", str(port)], port) as run:
+        wait_until_served(run)
+        assert ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[0] == 200
+        assert run.end(signal.SIGINT) == 0
+
+
+@pytest.mark.serve
+def test_few_open_files_are_a_warning_and_connections_wait(policies: Path) -> None:
+    limit_by = ["sh", "-c", 'ulimit -n 256; exec "$@"', "sh"]
+    (port,) = free_ports(1)
+    command = [*limit_by, sys.executable, "-m", "rlservo.deploy.cli", "serve", str(policies), "--port", str(port)]
+    with running(command, port) as run:
+        wait_until_served(run)
+        connections = []
+        for _ in range(400):
+            with contextlib.suppress(OSError):
+                connections.append(socket.create_connection(("127.0.0.1", port), timeout=5))
+        for connection in connections:
+            connection.close()
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            with contextlib.suppress(OSError):
+                if ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[0] == 200:
+                    break
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+        assert run.end(signal.SIGTERM) == 0
+        assert run.process.stdout is not None
+        assert "this process may open 256 files" in run.process.stdout.read()
+
+
+@dataclass
+class Load:
+    """Clients that never stop asking, and what they got."""
+
+    port: int
+    expected: np.ndarray[Any, Any]
+    asked: int = 0
+    failures: list[str] = field(default_factory=list)
+    wrong: int = 0
+    longest_s: float = 0.0
+
+    @contextlib.contextmanager
+    def run(self) -> Iterator[Load]:
+        ended = threading.Event()
+        threads = [threading.Thread(target=self._ask, args=(ended,)) for _ in range(CLIENTS)]
+        for thread in threads:
+            thread.start()
+        try:
+            yield self
+        finally:
+            ended.set()
+            for thread in threads:
+                thread.join(PATIENCE_S)
+
+    def _ask(self, ended: threading.Event) -> None:
+        with PolicyClient(f"http://127.0.0.1:{self.port}", "ur5", timeout_s=5, retries=3) as policy:
+            while not ended.is_set():
+                began = time.monotonic()
+                try:
+                    action = policy.act(OBS)
+                except RlservoError as error:
+                    self.failures.append(error.message)
+                else:
+                    self.wrong += not np.array_equal(action, self.expected)
+                self.longest_s = max(self.longest_s, time.monotonic() - began)
+                self.asked += 1
+                time.sleep(0.005)
+
+
+@pytest.fixture(scope="module")
+def workers(policies: Path) -> Iterator[tuple[Run, Load]]:
+    expected = Policy.load(policies / "ur5" / "10").act(OBS)
+    with launched(policies, workers=2) as run:
+        run.wait_until_ready()
+        yield run, Load(run.port, np.asarray(expected))
+        assert run.end(signal.SIGTERM) == 0
+
+
+def worker_pids(run: Run) -> list[int]:
+    found = []
+    for child in psutil.Process(run.process.pid).children():
+        with contextlib.suppress(psutil.Error):  # it may have ended
+            if "spawn_main" in " ".join(child.cmdline()):
+                found.append(child.pid)
+    return sorted(found)
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.2)
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_worker_that_is_killed_or_stopped_is_replaced_under_load(
+    workers: tuple[Run, Load], number: signal.Signals
+) -> None:
+    run, load = workers
+    before = worker_pids(run)
+    assert len(before) == 2
+    with load.run():
+        time.sleep(1)
+        os.kill(before[0], number)
+        wait_for(lambda: before[0] not in (now := worker_pids(run)) and len(now) == 2)
+        time.sleep(2)
+    assert load.asked > 100 and load.wrong == 0
+    # A stopped worker keeps its clients waiting up to their own time limit; then they ask another one.
+    assert len(load.failures) <= (0 if number == signal.SIGKILL else CLIENTS), load.failures
+    load.failures.clear()
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+def test_sighup_replaces_every_worker_and_no_request_fails(workers: tuple[Run, Load]) -> None:
+    run, load = workers
+    before = worker_pids(run)
+    with load.run():
+        time.sleep(1)
+        run.process.send_signal(signal.SIGHUP)
+        wait_for(lambda: not set(before) & set(now := worker_pids(run)) and len(now) == 2)
+        time.sleep(1)
+    assert load.asked > 100 and (load.wrong, load.failures) == (0, [])
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+def test_workers_whose_parent_was_killed_end_themselves(policies: Path) -> None:
+    with launched(policies, workers=2) as run:
+        run.wait_until_ready()
+        left = worker_pids(run)
+        run.process.kill()
+        run.process.wait()
+        wait_for(lambda: not any(map(psutil.pid_exists, left)))
