@@ -1,4 +1,4 @@
-"""`rlservo demo`: export two checkpoints, serve them, drive two robots, show what happened.
+"""`rlservo demo`: export two checkpoints, serve them on both engines, drive two robots, show what happened.
 
 Exporting and serving run as the very commands a user would type, in other processes; the loop runs here.
 """
@@ -6,7 +6,9 @@ Exporting and serving run as the very commands a user would type, in other proce
 from __future__ import annotations
 
 import ctypes
+import importlib.util
 import json
+import os
 import shlex
 import shutil
 import signal
@@ -14,8 +16,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rlservo.deploy.demo.commands import show
-from rlservo.deploy.demo.picture import Robot, RobotRun, Trace, draw_picture, film
+from rlservo.deploy.demo.picture import Frame, Robot, RobotRun, Trace, draw_picture, film
 from rlservo.deploy.terminal import ends_like_ctrl_c
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
@@ -81,29 +84,24 @@ def run_demo(
     )
 
     console.rule("2  serve: both policies on one endpoint")
-    runs: list[RobotRun] = []
-    counts = ("--episodes", str(episodes), "--seed", str(FIRST_SEED))
-    with ends_like_ctrl_c(), _server(console, repository, out / "server.log") as url:
+    with ends_like_ctrl_c(), _server(console, _embedded(repository), out / "server.log") as url:
         if cockpit is not None:
             console.rule("3  drive: choose the robot on the page, drag its target")
             with suppress(KeyboardInterrupt):
                 cockpit(url)
             return
         console.rule(f"3  drive: {episodes} episodes each, every action over HTTP")
-        for robot in ROBOTS:
-            show(console, ["rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts])
-            with PolicyClient(url, robot.policy) as policy, console.status("driving ..."):
-                traces: list[Trace] = []
-                report = rollout(_Recorder(policy, traces), robot.env_id, episodes=episodes, seed=FIRST_SEED)
-                if report.interrupted:
-                    raise KeyboardInterrupt
-                longest = max(report.episodes, key=lambda row: (bool(row.success), row.steps))
-                seed = FIRST_SEED + longest.index
-                frames = film(policy, robot.env_id, seed=seed, steps=longest.steps, note=console.print)
-                runs.append(RobotRun(robot, report, traces, frames))
+        runs = _drive(console, url, episodes, with_pictures=True)
+    results = {"embedded": runs}
+    console.rule("4  the same on Ray Serve")
+    if importlib.util.find_spec("ray") is None:
+        console.print("Ray is not installed: pip install '.[ray]' in the checkout adds it, and this demo then shows it")
+    else:
+        with ends_like_ctrl_c(), _server(console, _ray_serve(repository, out), out / "ray_serve.log") as url:
+            results["Ray Serve"] = _drive(console, url, episodes, with_pictures=False)
     picture = draw_picture(out / "demo.png", runs)
-    console.rule("4  result")
-    console.print(_table(runs))
+    console.rule("5  result")
+    console.print(_table(results))
     console.print(f"picture: {picture}   bundles: {repository}   {time.monotonic() - start:.0f} s in all", markup=False)
     console.print(
         f"drive them yourself, in the browser: rlservo cockpit --bundle {shlex.quote(str(repository))}",
@@ -142,18 +140,76 @@ def _run(commands: Iterable[list[str]]) -> None:
         raise RlservoError(f"the export ended with exit code {result.returncode}")
 
 
-@contextmanager
-def _server(console: Console, repository: Path, log: Path) -> Iterator[str]:
-    """Run `rlservo serve` on a free port until the block ends; stop it as Ctrl-C would."""
+def _drive(console: Console, url: str, episodes: int, *, with_pictures: bool) -> list[RobotRun]:
+    """Drive every robot with its policy on a server."""
+    runs: list[RobotRun] = []
+    counts = ("--episodes", str(episodes), "--seed", str(FIRST_SEED))
+    for robot in ROBOTS:
+        show(console, ["rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts])
+        with PolicyClient(url, robot.policy) as policy, console.status("driving ..."):
+            traces: list[Trace] = []
+            report = rollout(_Recorder(policy, traces), robot.env_id, episodes=episodes, seed=FIRST_SEED)
+            if report.interrupted:
+                raise KeyboardInterrupt
+            frames: list[Frame] = []
+            if with_pictures:
+                longest = max(report.episodes, key=lambda row: (bool(row.success), row.steps))
+                seed = FIRST_SEED + longest.index
+                frames = film(policy, robot.env_id, seed=seed, steps=longest.steps, note=console.print)
+            runs.append(RobotRun(robot, report, traces, frames))
+    return runs
+
+
+@dataclass(frozen=True)
+class _Command:
+    """A server's command, as it is shown and as it runs."""
+
+    shown: str
+    words: list[str]
+    port: int
+    environment: dict[str, str] = field(default_factory=dict)
+
+
+def _embedded(repository: Path) -> _Command:
+    port = _free_port()
+    words = ["serve", str(repository), "--port", str(port)]
+    return _Command(shlex.join(["rlservo", *words]), [sys.executable, "-m", "rlservo.deploy.cli", *words], port)
+
+
+def _ray_serve(repository: Path, out: Path) -> _Command:
+    """Return `serve run` with a configuration such as deploy/serve.yaml, in a Ray of its own on this machine."""
+    port = _free_port()
+    application = {
+        "name": "rlservo",
+        "route_prefix": "/",
+        "import_path": "rlservo.serve_app.engines.ray_serve:build",
+        "args": {"policies": [str(repository.absolute())]},
+    }
+    file = out / "serve.yaml"
+    file.write_text(json.dumps({"http_options": {"host": "127.0.0.1", "port": port}, "applications": [application]}))
+    switches = {"RAY_SERVE_ENABLE_HA_PROXY": "1", "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1", "RAY_AUTH_MODE": "token"}
+    shown = " ".join(f"{name}={value}" for name, value in switches.items())
+    words = [sys.executable, "-m", "ray.serve.scripts", "run", str(file)]
+    environment = {**switches, "RAY_ADDRESS": "local", "RAY_USAGE_STATS_ENABLED": "0"}
+    return _Command(f"{shown} serve run {file}", words, port, environment)
+
+
+def _free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    words = ("serve", str(repository), "--port", str(port))
-    show(console, words)
-    url = f"http://127.0.0.1:{port}"
+        port: int = free.getsockname()[1]
+    return port
+
+
+@contextmanager
+def _server(console: Console, command: _Command, log: Path) -> Iterator[str]:
+    """Run a server until the block ends; stop it as Ctrl-C would."""
+    console.print(f"$ {command.shown}", style="bold", markup=False, highlight=False, soft_wrap=True)
+    url = f"http://127.0.0.1:{command.port}"
     with log.open("wb") as stream:
         # Not in our process group: a Ctrl-C at the terminal reaches us alone, and we pass it on once.
         server = subprocess.Popen(
-            [sys.executable, "-m", "rlservo.deploy.cli", *words],
+            command.words,
+            env={**os.environ, **command.environment},
             stdout=stream,
             stderr=subprocess.STDOUT,
             start_new_session=True,
@@ -204,22 +260,25 @@ def _stop(server: subprocess.Popen[bytes]) -> None:
         server.wait(STOP_TIMEOUT_S)
 
 
-def _table(runs: list[RobotRun]) -> Table:
-    table = Table(title="Every action asked of the server, random targets, means over the episodes")
-    table.add_column("robot", no_wrap=True)
+def _table(results: Mapping[str, Sequence[RobotRun]]) -> Table:
+    table = Table(title="Every action asked of a server, random targets, means over the episodes")
+    for column in ("robot", "engine"):
+        table.add_column(column, no_wrap=True)
     for column in ("at the target", "return", "time", "answer p50", "answer p99", "later than 100 ms"):
         table.add_column(column, justify="right")
-    for run in runs:
-        report = run.report
-        latency = report.latency_ms
-        rate = report.control_rate_hz or 10.0
-        table.add_row(
-            run.robot.title,
-            f"{report.successes} of {len(report.episodes)}",
-            f"{report.return_mean:.2f}",
-            f"{(report.length_mean or 0.0) / rate:.1f} s",
-            f"{latency.p50:.2f} ms" if latency else "-",
-            f"{latency.p99:.2f} ms" if latency else "-",
-            f"{report.deadline_misses} of {report.steps}",
-        )
+    for engine, runs in results.items():
+        for run in runs:
+            report = run.report
+            latency = report.latency_ms
+            rate = report.control_rate_hz or 10.0
+            table.add_row(
+                run.robot.title,
+                engine,
+                f"{report.successes} of {len(report.episodes)}",
+                f"{report.return_mean:.2f}",
+                f"{(report.length_mean or 0.0) / rate:.1f} s",
+                f"{latency.p50:.2f} ms" if latency else "-",
+                f"{latency.p99:.2f} ms" if latency else "-",
+                f"{report.deadline_misses} of {report.steps}",
+            )
     return table

@@ -54,7 +54,7 @@ def test_demo_serves_a_page_until_ctrl_c_then_reaches_the_targets_and_leaves_not
     (out / "demo.png").write_bytes(b"of an earlier demo")
     done = subprocess.run([*command, "--episodes", "4"], capture_output=True, text=True, timeout=900, cwd=ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count("4 of 4 ") == 2
+    assert done.stdout.count("4 of 4 ") == 4  # two robots on each engine
     assert done.stdout.rstrip().endswith(f"rlservo cockpit --bundle {out / 'policies'}")
     assert (out / "demo.png").read_bytes().startswith(b"\x89PNG")
     assert (out / "policies" / "ur5" / "1" / "contract.json").is_file()
