@@ -277,7 +277,7 @@ def _write_graphs(
     graph = PolicyGraph(recipe, restored.network)
     batches = draw_batches(recipe, SEED)
     progress(f"asking RLlib itself for {sum(len(batch) for batch in batches):,} actions")
-    references = record(restored.start_loop, batches, recipe.observation_leaves)
+    references = record(restored.start_loop, batches)
     pair = next(batch for batch in batches if len(batch) == BATCH_SIZES[1])
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(len(pair), np.bool_))
     progress("writing TorchScript and ONNX")

@@ -86,24 +86,15 @@ class Reference:
     outputs: Outputs
 
 
-def record(
-    start_loop: Callable[[], Loop], batches: Sequence[Batch], spaces: Mapping[str, Any] | None = None
-) -> list[Reference]:
+def record(start_loop: Callable[[], Loop], batches: Sequence[Batch]) -> list[Reference]:
     """Run RLlib on every batch; `start_loop` starts RLlib acting step after step.
-
-    The gate's wide and extreme observations leave the space, where RLlib's own pipeline may fail (the logarithm of an
-    action mask below zero): then all of them are cut back into the bounds of `spaces`, which are by input name.
 
     The observations are copied: a connector may write into what it is given. Raises UnsupportedError when RLlib's own
     pipeline fails on an observation of the policy's own space.
     """
     try:
         return _record(start_loop, batches)
-    except Exception:  # RLlib's own connectors and the user's raise anything
-        inside = [replace(batch, inputs=_inside(batch.inputs, spaces or {})) for batch in batches]
-    try:
-        return _record(start_loop, inside)
-    except Exception as error:
+    except Exception as error:  # RLlib's own connectors and the user's raise anything
         raise UnsupportedError(
             f"RLlib's own pipeline fails on an observation of the policy's space: {first_line(error)}"
         ) from error
@@ -140,15 +131,6 @@ def _by_last_bit(values: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]
     single = values.astype(np.float32)  # what the network computes with
     towards = np.where(rng.random(values.shape) < 0.5, np.float32(np.inf), np.float32(-np.inf))
     return np.asarray(np.nextafter(single, towards), values.dtype)
-
-
-def _inside(inputs: Inputs, spaces: Mapping[str, Any]) -> Inputs:
-    """Return the observations within their Box's bounds."""
-    boxes = {name: space for name, space in spaces.items() if isinstance(space, Box)}
-    return {
-        name: np.clip(values, boxes[name].low, boxes[name].high).astype(values.dtype) if name in boxes else values
-        for name, values in inputs.items()
-    }
 
 
 def replay(

@@ -1,11 +1,13 @@
-"""Sample observations for the proof: likely ones, wide ones, and extremes that make every clip engage.
+"""Sample observations for the proof: likely ones, wide ones, and extremes.
 
+They stay inside of bounds, outside of which `out_of_bounds` decides; but a filter that comes first must show its clip.
 A policy with a state is shown sequences, in which episodes end and begin at different steps in different rows. The
 numbers come from a recipe's observation space and filter.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +24,8 @@ UNBOUNDED = 1e6  # a bound beyond this (CartPole's 3.4e38) says nothing of the v
 WIDE = 10.0  # standard deviations
 EXTREME = 1e3
 SEQUENCE_STEPS = {1: 200, 2: 200, 257: 3}
+LARGE = 4096  # elements of an observation: such a network takes 0.1 s for a step, and TorchScript as much again
+LARGE_SEQUENCE_STEPS = {1: 16, 2: 16, 257: 2}
 NEW_EPISODE = 0.02  # the chance of a row's episode to end at a step, beside the ends that are certain
 
 
@@ -50,7 +54,7 @@ class Batch:
 def draw_batches(recipe: Recipe, seed: int) -> list[Batch]:
     """Return batches of every kind and every size in BATCH_SIZES; the same seed draws the same.
 
-    For a policy with a state they are sequences of SEQUENCE_STEPS batches of one size.
+    For a policy with a state they are sequences of SEQUENCE_STEPS batches of one size; of images, shorter ones.
     """
     rng = np.random.default_rng(seed)
     if recipe.state:
@@ -60,12 +64,19 @@ def draw_batches(recipe: Recipe, seed: int) -> list[Batch]:
     return [Batch(kind, _observations(recipe, kind, rng, size)) for kind in KINDS for size in sizes]
 
 
+def draw_pair(recipe: Recipe) -> Inputs:
+    """Return two likely observations."""
+    return _observations(recipe, "likely", np.random.default_rng(0), 2)
+
+
 def _sequence(recipe: Recipe, rng: np.random.Generator, size: int) -> Iterator[Batch]:
-    for step in range(SEQUENCE_STEPS[size]):
+    elements = sum(math.prod(leaf.shape) for leaf in recipe.observation_leaves.values())
+    steps = (SEQUENCE_STEPS if elements <= LARGE else LARGE_SEQUENCE_STEPS)[size]
+    for step in range(steps):
         kind = str(rng.choice(list(KINDS), p=[0.8, 0.1, 0.1]))
         inputs = _observations(recipe, kind, rng, size)
         restart = rng.random(size) < NEW_EPISODE
-        if step in (0, 60, 61):
+        if step in ((0, 60, 61) if steps > 61 else (0, 7, 8)):
             restart[:] = True
         if recipe.needs_reward:
             rewards = rng.standard_normal(size).astype(np.float32)
@@ -74,8 +85,10 @@ def _sequence(recipe: Recipe, rng: np.random.Generator, size: int) -> Iterator[B
 
 
 def _observations(recipe: Recipe, kind: str, rng: np.random.Generator, size: int) -> Inputs:
+    filtered_first = bool(recipe.steps) and isinstance(recipe.steps[0], ObservationFilter)
     return {
-        name: _draw(kind, _Leaf(space, recipe.filter), rng, size) for name, space in recipe.observation_leaves.items()
+        name: _draw(kind, _Leaf(space, recipe.filter, filtered_first), rng, size)
+        for name, space in recipe.observation_leaves.items()
     }
 
 
@@ -83,6 +96,7 @@ def _observations(recipe: Recipe, kind: str, rng: np.random.Generator, size: int
 class _Leaf:
     space: Any
     filter: ObservationFilter | None
+    filtered_first: bool
 
 
 def _draw(kind: str, leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[Any]:
@@ -124,11 +138,12 @@ def _likely(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.floa
 def _wide(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
     """Normal about the centre, ten standard deviations wide: about a third of the elements reach the filter's clip."""
     centre, spread = _centre_and_spread(leaf)
-    return centre + WIDE * spread * rng.standard_normal((size, *centre.shape))
+    drawn = centre + WIDE * spread * rng.standard_normal((size, *centre.shape))
+    return drawn if leaf.filtered_first else _within(leaf, drawn)
 
 
 def _extreme(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
-    """Corners of the space; in half of the rows some elements at 0.0 or -0.0 and some a thousand times too large."""
+    """Corners of the space; in half of the rows some elements at 0.0 or -0.0 and, if unbounded, some at a thousand."""
     low, high, bounded = _bounds(leaf)
     centre, spread = _centre_and_spread(leaf)
     shape = (size, *low.shape)
@@ -138,7 +153,7 @@ def _extreme(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.flo
     zero = np.copysign(0.0, huge)  # angles and divisions tell the two zeros apart
     spoiled = np.where(dice < 0.1, zero, np.where(dice < 0.3, huge, corner))
     rows = rng.random((size, *[1] * low.ndim)) < 0.5
-    return np.where(rows, spoiled, corner)
+    return _within(leaf, np.where(rows, spoiled, corner))
 
 
 KINDS: dict[str, Callable[[_Leaf, np.random.Generator, int], NDArray[np.float64]]] = {
@@ -151,6 +166,11 @@ KINDS: dict[str, Callable[[_Leaf, np.random.Generator, int], NDArray[np.float64]
 def _bounds(leaf: _Leaf) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     low, high = leaf.space.low.astype(np.float64), leaf.space.high.astype(np.float64)
     return low, high, (np.abs(low) < UNBOUNDED) & (np.abs(high) < UNBOUNDED)
+
+
+def _within(leaf: _Leaf, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    low, high, _ = _bounds(leaf)
+    return np.clip(values, low, high)
 
 
 def _centre_and_spread(leaf: _Leaf) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

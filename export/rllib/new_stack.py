@@ -35,7 +35,7 @@ from rlservo.export.contract.errors import CheckpointError, UnsupportedError, fi
 from rlservo.export.contract.scores import Q_VALUES
 from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.recipe.runners import Inputs, Outputs
-from rlservo.export.recipe.samples import draw_batches
+from rlservo.export.recipe.samples import draw_pair
 from rlservo.export.recipe.trees import (
     Tree,
     build,
@@ -401,8 +401,7 @@ def _unbound(kind: type) -> type:
 
 def _forward_once(pipelines: Pipelines, recipe: Recipe) -> dict[str, Any]:
     """Return the inference forward's output for two likely observations."""
-    batch = next(batch for batch in draw_batches(recipe, seed=0) if len(batch) == 2)
-    episodes = [pipelines.begin(obs) for obs in _rows(recipe.observation_space, batch.inputs, 2)]
+    episodes = [pipelines.begin(obs) for obs in _rows(recipe.observation_space, draw_pair(recipe), 2)]
     name = type(pipelines.module).__name__
     try:
         forward = pipelines.forward(pipelines.to_module(episodes)[0])
