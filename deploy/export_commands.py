@@ -33,6 +33,9 @@ def export(
         str | None, typer.Option(help="For which agent, where a module serves several that are filtered differently.")
     ] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+    value: Annotated[
+        bool, typer.Option("--value/--no-value", help="Whether the bundle has the value head, too.")
+    ] = True,
     untrained_filter: Annotated[
         bool,
         typer.Option(
@@ -79,6 +82,7 @@ def export(
                 version=version,
                 description=description,
                 app_dir=app_dir,
+                value=value,
                 untrained_filter=untrained_filter,
                 notify=note,
                 progress=status.update,
@@ -93,6 +97,7 @@ def export(
                 module_id=module_id,
                 agent_id=agent_id,
                 app_dir=app_dir,
+                value=value,
                 untrained_filter=untrained_filter,
                 notify=note,
                 progress=status.update,

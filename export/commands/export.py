@@ -11,7 +11,7 @@ import datetime
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,8 +36,17 @@ from rlservo.export.contract.bundle import (
     write_contract,
     write_golden,
 )
-from rlservo.export.contract.contract import Contract, Distribution, Parity, Provenance, TensorSpec, contract_json
+from rlservo.export.contract.contract import (
+    VALUE,
+    Contract,
+    Distribution,
+    Parity,
+    Provenance,
+    TensorSpec,
+    contract_json,
+)
 from rlservo.export.contract.errors import AgentsDifferError, CheckpointError, ParityError, UsageError
+from rlservo.export.contract.spaces import leaf_specs
 from rlservo.export.graph.one_thread import one_thread
 from rlservo.export.proof.parity import GraphLoop, Reference, prove, record, record_perturbed, replay, ties
 from rlservo.export.recipe.describe import baked_steps
@@ -202,13 +211,16 @@ def _build(
     folder = folders.enter_context(_temporary_folder(target))
     with one_thread():
         labels = [element.name for element in elements.action]
-        parity, inputs, outputs = _write_graphs(folder, restored, labels, files.api_stack, options.progress)
+        parity, inputs, outputs = _write_graphs(
+            folder, restored, labels, files.api_stack, options.notify, options.progress
+        )
         recipe = restored.recipe
+        unread = recipe.observation_leaves.keys() - inputs.keys()
         contract = Contract(
             name=target.parent.name,
             version=target.name,
             description=options.description,
-            observation_space=space_spec(recipe.observation_space, elements.observation),
+            observation_space=space_spec(recipe.observation_space, elements.observation, unread=unread),
             action_space=space_spec(recipe.action_space, elements.action, action=True),
             inputs=tuple(_tensor(name, values) for name, values in inputs.items()),
             outputs=tuple(_tensor(output, values) for output, values in outputs.items()),
@@ -216,7 +228,7 @@ def _build(
             distribution=(
                 Distribution(kind=recipe.distribution, transform=recipe.transform) if recipe.distribution else None
             ),
-            baked_in=baked_steps(recipe, restored.module_class, restored.network.module),
+            baked_in=baked_steps(recipe, restored.module_class, restored.network.module, sorted(unread)),
             control_rate_hz=elements.control_rate_hz,
             provenance=_provenance(files, facts, restored),
             parity=parity,
@@ -265,24 +277,40 @@ def _temporary_folder(target: Path) -> Iterator[Path]:
 
 
 def _write_graphs(
-    folder: Path, restored: RestoredPolicy, labels: list[str], api_stack: str, progress: Notify
+    folder: Path, restored: RestoredPolicy, labels: list[str], api_stack: str, notify: Notify, progress: Notify
 ) -> tuple[Parity, Inputs, Outputs]:
-    """Write both formats, prove them, and return the proof and the golden vectors."""
-    from rlservo.export.graph.onnx_file import run_onnx, write_onnx
+    """Write both formats, prove them, and return the proof and the golden vectors.
+
+    Parts of the observation that nothing reads are no inputs of theirs.
+    """
+    from rlservo.export.graph.onnx_file import inputs_read, run_onnx, write_onnx
     from rlservo.export.graph.policy_graph import PolicyGraph
     from rlservo.export.graph.torchscript_file import run_torchscript, write_torchscript
     from rlservo.export.proof.why_different import why_different
 
     recipe = restored.recipe
-    graph = PolicyGraph(recipe, restored.network)
     batches = draw_batches(recipe, SEED)
     progress(f"asking RLlib itself for {sum(len(batch) for batch in batches):,} actions")
     references = record(restored.start_loop, batches)
     pair = next(batch for batch in batches if len(batch) == BATCH_SIZES[1])
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(len(pair), np.bool_))
     progress("writing TorchScript and ONNX")
-    frozen = write_torchscript(graph, example, folder / TORCHSCRIPT_FILE)
-    write_onnx(graph, example, folder / ONNX_FILE)
+
+    def write(left_out: Collection[str]) -> tuple[PolicyGraph, list[str]]:
+        graph = PolicyGraph(recipe, restored.network, left_out)
+        frozen = write_torchscript(graph, example, folder / TORCHSCRIPT_FILE)
+        write_onnx(graph, example, folder / ONNX_FILE)
+        return graph, frozen
+
+    graph, frozen = write(())
+    if left_out := _left_out(recipe, inputs_read(folder / ONNX_FILE)):
+        graph, frozen = write(left_out)
+    only_valued = _left_out(recipe, inputs_read(folder / ONNX_FILE, without=VALUE)) - left_out
+    if only_valued:
+        notify(
+            f"{', '.join(sorted(only_valued))}: only the value head reads it, and the policy asks for it; --no-value "
+            "exports without both"
+        )
     onnx = run_onnx(folder / ONNX_FILE)
     script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
     progress("proving both against RLlib's actions")
@@ -297,6 +325,14 @@ def _write_graphs(
     outputs = onnx(inputs)
     ordered = {name: inputs[name] for name in graph.input_names}
     return parity, ordered, {name: outputs[name] for name in graph.output_names}
+
+
+def _left_out(recipe: Recipe, read: Collection[str]) -> set[str]:
+    """Return the observation's leaves that a graph need not have: a Dict's unread ones, unless nothing is read."""
+    leaves = recipe.observation_leaves.keys()
+    unread = leaves - set(read)
+    kept = leaf_specs(space_spec(recipe.observation_space, unread=unread), "obs").keys()
+    return set(leaves - kept) if unread < leaves else set()
 
 
 def _golden_inputs(recipe: Recipe, references: list[Reference], run: Runner) -> Inputs:

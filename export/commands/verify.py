@@ -126,8 +126,10 @@ def _formats(bundle: Bundle) -> dict[str, Any]:
 
 
 def _check_spaces(contract: Contract, recipe: Recipe) -> None:
+    unread = recipe.observation_leaves.keys() - {tensor.name for tensor in contract.inputs}
+    read = leaf_specs(space_spec(recipe.observation_space, unread=unread), "obs")
     for which, root, spec, leaves in (
-        ("observation", "obs", contract.observation_space, recipe.observation_leaves),
+        ("observation", "obs", contract.observation_space, read),
         ("action", "action", contract.action_space, recipe.action_leaves),
     ):
         ours = {name: tuple(leaf.shape) for name, leaf in leaf_specs(spec, root).items()}

@@ -138,6 +138,7 @@ class DictSpec(_NestedSpec):
 
     kind: Literal["dict"] = "dict"
     spaces: dict[str, SpaceSpec]
+    ignored: tuple[str, ...] = Field((), description="Keys of the environment's own space that the graph does not read")
 
 
 class TupleSpec(_NestedSpec):

@@ -37,27 +37,60 @@ IR_VERSION = 8
 def write_onnx(graph: PolicyGraph, example: Inputs, file: Path) -> None:
     """Write `graph` to `file`, weights inside, the graph's inputs and outputs by name, with a dynamic batch.
 
-    `example` is two rows of every input. Raises UnsupportedError when an operation of the network has no ONNX form.
+    Inputs that nothing reads stay. `example` is two rows of every input. Raises UnsupportedError when an operation of
+    the network has no ONNX form.
     """
     try:
         _export(graph, example, file, dynamo=False)
-        _finish(file)
+        _finish(file, graph, example)
     except Exception as first:  # torch.onnx, onnx and onnxruntime raise several unrelated types
         try:
             _export(graph, example, file, dynamo=True)
-            _finish(file)
+            _finish(file, graph, example)
         except Exception as error:
             raise UnsupportedError(why_not_onnx(graph, example, [error, first])) from error
 
 
-def _finish(file: Path) -> None:
+def inputs_read(file: Path, *, without: str = "") -> set[str]:
+    """Return the names of what the graph's outputs are computed from, its inputs among them; `without` is one less."""
+    model = onnx.load(str(file))
+    makers = {name: node for node in model.graph.node for name in node.output}
+    waiting = [output.name for output in model.graph.output if output.name != without]
+    found: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found.add(name)
+            waiting += _reads(makers[name]) if name in makers else ()
+    return found
+
+
+def _reads(node: onnx.NodeProto) -> Iterator[str]:
+    """Yield what a node takes, and what the graphs inside it take from outside."""
+    yield from node.input
+    for attribute in node.attribute:
+        for graph in (attribute.g, *attribute.graphs):
+            yield from (output.name for output in graph.output)
+            for inner in graph.node:
+                yield from _reads(inner)
+
+
+def _finish(file: Path, graph: PolicyGraph, example: Inputs) -> None:
     """Check what torch wrote, which is not always ONNX (a logarithm of integers), and give it its last form.
 
-    onnxruntime opens it: it lacks kernels for some of ONNX, such as most double-precision functions.
+    torch drops inputs that nothing reads, which TorchScript keeps: they are listed again. onnxruntime opens the file;
+    it lacks kernels for some of ONNX, such as most double-precision functions.
     """
     model = onnx.load(str(file))
     model.ir_version = IR_VERSION
     model.producer_name, model.producer_version = "rlservo", ""
+    written = {one.name: one for one in model.graph.input}
+    del model.graph.input[:]
+    for name in graph.input_names:
+        values = example[name]
+        kind = onnx.helper.np_dtype_to_tensor_dtype(values.dtype)
+        missing = onnx.helper.make_tensor_value_info(name, kind, ["batch", *values.shape[1:]])
+        model.graph.input.append(written.get(name, missing))
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, str(file))
     open_ort_session(file)
@@ -128,9 +161,10 @@ def run_onnx(file: Path) -> Runner:
     """Return a function that runs the file in onnxruntime on one thread, as a server does."""
     ort_session = open_ort_session(file)
     names = [output.name for output in ort_session.get_outputs()]
+    wanted = [node.name for node in ort_session.get_inputs()]
 
     def run(inputs: Inputs) -> dict[str, NDArray[Any]]:
-        values = ort_session.run(names, inputs)
+        values = ort_session.run(names, {name: inputs[name] for name in wanted})
         return {name: np.asarray(value) for name, value in zip(names, values, strict=True)}
 
     return run

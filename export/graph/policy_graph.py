@@ -8,7 +8,7 @@ single precision allows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -39,10 +39,12 @@ class TracedNetwork(Protocol):
 class PolicyGraph(nn.Module):
     """Observation steps, network, action rule. Inputs are `input_names`, outputs `output_names`, in that order."""
 
-    def __init__(self, recipe: Recipe, network: TracedNetwork) -> None:
+    def __init__(self, recipe: Recipe, network: TracedNetwork, left_out: Collection[str] = ()) -> None:
+        """`left_out` are the observation's leaves that nothing reads: the graph has no such inputs."""
         super().__init__()
         self.space = recipe.observation_space
-        self.leaves = len(recipe.observation_leaves)
+        self.leaves = recipe.observation_leaves
+        self.left_out = frozenset(left_out)
         self.steps: nn.ModuleList = observation_nodes(recipe)
         self.network = network
         self.action = ActionNode(recipe)
@@ -51,7 +53,7 @@ class PolicyGraph(nn.Module):
         self.network_state_names = [state.name for state in recipe.network_state]
         self.needs_reward = recipe.needs_reward
         self.input_names = (
-            *recipe.observation_leaves,
+            *(name for name in recipe.observation_leaves if name not in self.left_out),
             *([REWARD] if self.needs_reward else []),
             *(f"state_in.{name}" for name in self.state_names),
         )
@@ -65,7 +67,8 @@ class PolicyGraph(nn.Module):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the outputs for observation leaves `[batch, ...]` of the space's dtype, then reward and state."""
         rest = list(inputs)
-        obs: Tree = build(self.space, [rest.pop(0) for _ in range(self.leaves)])
+        obs: Tree = build(self.space, [self._unread(leaf, inputs[0]) if name in self.left_out else rest.pop(0)
+                                       for name, leaf in self.leaves.items()])  # fmt: skip
         state: dict[str, Tensor] = {REWARD: rest.pop(0)} if self.needs_reward else {}
         state.update(zip(self.state_names, rest, strict=True))
         for step in self.steps:
@@ -82,6 +85,12 @@ class PolicyGraph(nn.Module):
             state["previous_actions"] = _append_code(state["previous_actions"], actions[0], self.action.choices)
         state.update(zip(self.network_state_names, next_state, strict=True))
         return (*actions, *named, *(state[name] for name in self.state_names))
+
+    @staticmethod
+    def _unread(leaf: Any, like: Tensor) -> Tensor:
+        """Return what stands for a leaf that nothing reads, in `like`'s batch."""
+        one = torch.from_numpy(np.zeros(leaf.shape, leaf.dtype))
+        return one.expand(like.shape[0], *leaf.shape)
 
 
 def _append_code(codes: Tensor, action: Tensor, choices: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,9 +24,17 @@ from rlservo.export.recipe.recipe import (
 from rlservo.export.recipe.trees import space_leaves
 
 
-def baked_steps(recipe: Recipe, module_class: str, module: Any) -> tuple[BakedStep, ...]:
-    """Return the contract's `baked_in` for a recipe and the torch module it surrounds."""
+def baked_steps(recipe: Recipe, module_class: str, module: Any, unread: Sequence[str] = ()) -> tuple[BakedStep, ...]:
+    """Return the contract's `baked_in` for a recipe, the torch module it surrounds, and leaves that nothing reads."""
     steps = [observation_step(step) for step in recipe.steps]
+    if unread:
+        steps.append(
+            BakedStep(
+                step="ignored",
+                detail=f"{', '.join(unread)}: nothing reads it, and an observation may be given without",
+                values={"names": list(unread)},
+            )
+        )
     parameters = sum(weights.numel() for weights in module.parameters())
     recurrent = ", recurrent" if recipe.network_state else ""
     steps.append(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,17 +21,36 @@ from rlservo.export.contract.spaces import (
     TupleSpec,
 )
 from rlservo.export.recipe.recipe import StateLeaf
+from rlservo.export.recipe.trees import space_leaves
 
 
-def space_spec(space: Any, elements: Sequence[Element] = (), *, action: bool = False) -> SpaceSpec:
+def space_spec(
+    space: Any,
+    elements: Sequence[Element] = (),
+    *,
+    action: bool = False,
+    unread: Collection[str] = (),
+    name: str = "obs",
+) -> SpaceSpec:
     """Return the contract's form of `space`; only a leaf names `elements`.
 
-    An action's Discrete loses its `start`: the contract says what goes to `env.step`, and RLlib sends 0 .. n - 1.
+    A Dict's key of which all leaves are `unread` (by input name) is only mentioned; a Tuple keeps its length. An
+    action's Discrete loses its `start`: the contract says what goes to `env.step`, and RLlib sends 0 .. n - 1.
     """
     if isinstance(space, Dict):
-        return DictSpec(spaces={key: space_spec(space.spaces[key], action=action) for key in sorted(space.spaces)})
+        paths = {key: f"{name}.{key}" for key in sorted(space.spaces)}
+        ignored = [key for key, path in paths.items() if all(leaf in unread for leaf in space_leaves(space[key], path))]
+        kept = {
+            key: space_spec(space[key], action=action, unread=unread, name=path)
+            for key, path in paths.items()
+            if key not in ignored
+        }
+        return DictSpec(spaces=kept, ignored=tuple(ignored))
     if isinstance(space, Tuple):
-        return TupleSpec(spaces=tuple(space_spec(child, action=action) for child in space.spaces))
+        inside = enumerate(space.spaces)
+        return TupleSpec(
+            spaces=tuple(space_spec(child, action=action, unread=unread, name=f"{name}.{i}") for i, child in inside)
+        )
     named = tuple(elements)
     if isinstance(space, Discrete):
         return DiscreteSpec(n=int(space.n), start=0 if action else int(space.start), dtype="int64", elements=named)

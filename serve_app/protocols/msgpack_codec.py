@@ -72,7 +72,9 @@ class MsgpackCodec:
         stream = request.stream
         policy = self._core.store().get(request.policy, request.version) if stream is None else stream.policy
         space = policy.contract.observation_space
-        return name in (space.spaces if isinstance(space, DictSpec) else {element.name for element in space.elements})
+        if isinstance(space, DictSpec):
+            return name in space.spaces or name in space.ignored
+        return any(name == element.name for element in space.elements)
 
 
 def encode_metadata(contract: Contract) -> bytes:

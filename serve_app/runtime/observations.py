@@ -86,7 +86,7 @@ class ObservationParser:
                     path, f"expected a map with the keys {', '.join(sorted(space.spaces))}, got {describe(value)}"
                 )
             missing = sorted(set(space.spaces) - set(value))
-            unknown = sorted(str(key) for key in value if key not in space.spaces)
+            unknown = sorted(str(key) for key in value if key not in space.spaces and key not in space.ignored)
             if missing or unknown:
                 parts = [f"missing {', '.join(missing)}"] if missing else []
                 parts += [f"unknown {', '.join(name[:64] for name in unknown[:8])}"] if unknown else []
