@@ -53,7 +53,7 @@ def trained(script: str) -> Path:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that need these checkpoints."""
     for item in items:
-        if {"zoo", "wide_zoo", "old_zoo", "layout_zoo"} & set(getattr(item, "fixturenames", ())):
+        if {"zoo", "wide_zoo", "old_zoo", "layout_zoo", "reported_zoo"} & set(getattr(item, "fixturenames", ())):
             item.add_marker("trained")
 
 
@@ -79,3 +79,9 @@ def old_zoo() -> Path:
 def layout_zoo() -> Path:
     """The same for every place where a checkpoint may hold a filter's statistics."""
     return trained("train_layout_zoo.py")
+
+
+@pytest.fixture(scope="session")
+def reported_zoo() -> Path:
+    """The same for what people brought and an export had refused."""
+    return trained("train_reported_zoo.py")

@@ -78,8 +78,11 @@ class CheckpointFiles:
 
     @property
     def has_pipelines(self) -> bool:
-        """Whether the checkpoint holds the connector pipelines, with what they have learned."""
-        return self.runner.is_dir()
+        """Whether the checkpoint holds the connector pipelines, with what they have learned.
+
+        An environment runner that talks to an environment elsewhere has none.
+        """
+        return any((self.runner / name).is_dir() for name in (ENV_TO_MODULE, MODULE_TO_ENV))
 
     @property
     def is_of_evaluation(self) -> bool:

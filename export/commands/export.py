@@ -45,7 +45,7 @@ from rlservo.export.contract.contract import (
     TensorSpec,
     contract_json,
 )
-from rlservo.export.contract.errors import AgentsDifferError, CheckpointError, ParityError, UsageError
+from rlservo.export.contract.errors import AgentsDifferError, CheckpointError, NoNetworkError, ParityError, UsageError
 from rlservo.export.contract.spaces import leaf_specs
 from rlservo.export.graph.one_thread import one_thread
 from rlservo.export.proof.parity import GraphLoop, Reference, prove, record, record_perturbed, replay, ties
@@ -144,6 +144,7 @@ def export_all_modules(
 ) -> list[ExportResult]:
     """Export every policy of a checkpoint, each to `out/<name>-<module id>/<version>/`: all of them, or none.
 
+    A module that is no network but a script is left out, which `notify` is told.
     A module whose agents are treated differently gives a bundle an agent, `<name>-<module id>-<agent id>`. The rest is
     as for `export_checkpoint`.
     """
@@ -178,6 +179,10 @@ def _export(
                 if not name_all:
                     raise
                 queue[:0] = [locate_checkpoint(files.root, files.module_id, agent) for agent in error.agents]
+            except NoNetworkError as error:
+                if not name_all or not (written or queue):
+                    raise
+                options.notify(f"module '{files.module_id}' is left out: {error.message}")
         _publish(written)
     return [result for _, result in written]
 

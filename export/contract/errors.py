@@ -77,6 +77,10 @@ class UnsupportedError(CheckpointError):
     code = "checkpoint-unsupported"
 
 
+class NoNetworkError(UnsupportedError):
+    """A module is a script, and no network."""
+
+
 class ParityError(RlservoError):
     """The exported graph does not give RLlib's own actions; nothing was written."""
 

@@ -65,10 +65,13 @@ class AgentSlot:
     """All agents for whom this one stands."""
 
     def part(self, space: Any) -> Any:
-        """Return the agent's own part of a space, which behind the mapping is its module's."""
+        """Return the agent's own part of a space, which behind the mapping is its module's.
+
+        None behind the mapping for a module that was added in training: RLlib saves the mapping as it began.
+        """
         if self.agent is None:
             return space
-        return space[self.agent] if self.agent in space.spaces else space[self.module]
+        return space[self.agent] if self.agent in space.spaces else space.spaces.get(self.module)
 
 
 SINGLE_AGENT = AgentSlot()
@@ -190,10 +193,16 @@ def _user_step(piece: Any, pipeline: str, consequence: str) -> UserStep:
     function = getattr(piece, HOOK, None)
     if callable(function):
         return UserStep(f"{kind.__module__}.{kind.__name__}", function)
+    saved_whole = kind.__module__ == "__main__"
+    again = (
+        "; the checkpoint holds the class as the script had it, so restore and save it with the new one"
+        if saved_whole
+        else ""
+    )
     raise UnsupportedError(
         f"the {pipeline} connector {kind.__name__} ({kind.__module__}) is not exported: it is code of your own, and "
         f"without it {consequence}. If it keeps no state, give it a method '{HOOK}(self, data)' that does the same to "
-        "torch tensors with a leading batch axis"
+        f"torch tensors with a leading batch axis{again}"
     )
 
 

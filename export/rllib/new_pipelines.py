@@ -128,7 +128,7 @@ def pipelines_of(
     return MultiAgentPipelines(module, env_to_module, module_to_env, observation_space, action_space, together, slot)
 
 
-def find_agent_slot(files: CheckpointFiles, env_to_module: Any, module_to_env: Any) -> AgentSlot:
+def find_agent_slot(files: CheckpointFiles, module: Any, env_to_module: Any, module_to_env: Any) -> AgentSlot:
     """Return for which agent a module is exported; SINGLE_AGENT where the environment has only one.
 
     A module may serve several: any stands for all where their spaces and the steps before the network are the same.
@@ -141,7 +141,7 @@ def find_agent_slot(files: CheckpointFiles, env_to_module: Any, module_to_env: A
             raise CheckpointError(f"{files.root} was trained with one agent: leave --agent-id out")
         return SINGLE_AGENT
     _check_separate(files)
-    agents = _served(mapping, files.module_id)
+    agents = _served(mapping, files.module_id, module)
     if files.agent_id is not None:
         chosen = [agent for agent in agents if str(agent) == files.agent_id]
         if not chosen:
@@ -163,8 +163,11 @@ def find_agent_slot(files: CheckpointFiles, env_to_module: Any, module_to_env: A
     return dataclasses.replace(slots[0], agents=tuple(str(agent) for agent in agents))
 
 
-def _served(mapping: Any, module_id: str) -> list[Any]:
-    """Return the agents that a module serves, as RLlib asks it; all that it could serve where that is drawn anew."""
+def _served(mapping: Any, module_id: str, module: Any) -> list[Any]:
+    """Return the agents that a module serves, as RLlib asks it.
+
+    All that it could serve where that is drawn in each episode, or where the module was added in training.
+    """
     agents = list(mapping.input_observation_space.spaces)
     module_of = private_names.get(mapping, "_agent_to_module_mapping_fn")
     try:
@@ -173,7 +176,8 @@ def _served(mapping: Any, module_id: str) -> list[Any]:
         served = []
     if served:
         return served
-    wanted = (mapping.observation_space[module_id], mapping.action_space[module_id])
+    observations, actions = mapping.observation_space.spaces, mapping.action_space.spaces
+    wanted = (observations.get(module_id, module.observation_space), actions.get(module_id, module.action_space))
     return [
         agent
         for agent in agents

@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from rlservo.export.checkpoints.facts import read_config
 from rlservo.export.checkpoints.location import CTOR_FILE, ENV_TO_MODULE, MODULE_TO_ENV, STATE_STEMS, CheckpointFiles
 from rlservo.export.checkpoints.unpickle import explain, unpickle
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError, first_line
+from rlservo.export.contract.errors import CheckpointError, NoNetworkError, UnsupportedError, first_line
 from rlservo.export.contract.scores import Q_VALUES
 from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.recipe.runners import Inputs, Outputs
@@ -52,7 +52,7 @@ from rlservo.export.rllib.gaussian_heads import replace_heads
 from rlservo.export.rllib.new_connectors import read_action_steps, read_observation_steps
 from rlservo.export.rllib.new_pipelines import Pipelines, find_agent_slot, own_copy, pipelines_of
 from rlservo.export.rllib.restore_order import connectors_that_rllib_restores
-from rlservo.export.rllib.restored_policy import RestoredPolicy
+from rlservo.export.rllib.restored_policy import RestoredPolicy, diverged_weights
 from rlservo.export.rllib.supported_spaces import check_spaces
 
 PIPELINE_SETTINGS = (
@@ -210,16 +210,16 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
 
     name = type(module).__name__
     if not isinstance(module, TorchRLModule):
-        raise UnsupportedError(f"module {name} is not a torch RLModule: only torch modules are exported")
+        raise NoNetworkError(f"module {name} is not a torch RLModule: only torch modules are exported")
     if why := REFUSED_MODULES.get(name):
         raise UnsupportedError(f"module {name} is not exported: {why}")
-    module.eval().requires_grad_(False)
     no_value = _check_weights(files, module)
-    slot = find_agent_slot(files, env_to_module, module_to_env)
+    module.eval().requires_grad_(False)
+    slot = find_agent_slot(files, module, env_to_module, module_to_env)
     observation_space = slot.part(env_to_module.input_observation_space)
     action_space: Any = slot.part(module_to_env.input_action_space) or module.action_space
-    check_spaces(observation_space, action_space)
     steps = read_observation_steps(env_to_module, files, slot)
+    check_spaces(observation_space, action_space, steps)
     transform, action_steps = read_action_steps(module_to_env, action_space)
     state = _network_state(module)
     pipelines = pipelines_of(slot, module, env_to_module, module_to_env, observation_space, action_space)
@@ -281,7 +281,8 @@ def _build_pipelines(files: CheckpointFiles, module: Any, notify: Callable[[str]
             if name in saved:
                 private_names.replace(config, name, saved[name])
         notify(
-            "the checkpoint has no environment runner (recorded data): the pipelines are built from its configuration"
+            "the checkpoint holds no connectors (recorded data, or an environment elsewhere): the pipelines are built "
+            "from its configuration"
         )
     spaces = (config.observation_space or module.observation_space, config.action_space or module.action_space)
     try:
@@ -330,11 +331,11 @@ def _check_weights(files: CheckpointFiles, module: Any) -> str:
     """Return '' when every weight was in the checkpoint, or why the value head has none.
 
     RLlib ignores weights that are missing and leaves them random. Raises CheckpointError where an action needs them,
-    and where a weight is not a finite number.
+    and where training has diverged.
     """
     unneeded = _unneeded(module)
-    for key, weights in module.state_dict().items():
-        if not torch.isfinite(weights).all() and not any(key.startswith(f"{prefix}.") for prefix in unneeded):
+    for key in diverged_weights(module):
+        if not any(key.startswith(f"{prefix}.") for prefix in unneeded):
             raise CheckpointError(f"{files.module}: the weights '{key}' are not all finite: training diverged")
     if module.inference_only:
         return "it was saved for inference only"

@@ -37,14 +37,14 @@ from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.checkpoints.unpickle import explain, unpickle
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError, first_line
 from rlservo.export.contract.scores import ACTION_DIST_INPUTS, Q_VALUES
-from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLeaf
+from rlservo.export.recipe.recipe import DistributionKind, Mode, ObservationStep, Recipe, StateLeaf
 from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.trees import build, named_leaves, space_leaves, tree_leaves
 from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_heads
 from rlservo.export.rllib.old_connectors import check_connectors, read_old_steps, read_old_transform
 from rlservo.export.rllib.old_models import register_custom_parts
-from rlservo.export.rllib.restored_policy import RestoredPolicy
+from rlservo.export.rllib.restored_policy import RestoredPolicy, diverged_weights
 from rlservo.export.rllib.supported_spaces import check_spaces
 
 AGENT = "agent0"  # what RLlib calls the one agent of an environment
@@ -155,7 +155,7 @@ def restore_old_stack(
     action_space = policy.action_space
     observation_space = getattr(policy.observation_space, "original_space", policy.observation_space)
     steps = read_old_steps(policy.agent_connectors)
-    _check_spaces(policy, observation_space, action_space)
+    _check_spaces(policy, observation_space, action_space, steps)
     transform = read_old_transform(policy.action_connectors, action_space)
     state = _network_state(policy)
     distribution, mode, names = _action_rule(policy, action_space, notify)
@@ -260,19 +260,18 @@ def _check_policy(files: OldStackFiles, policy: Any) -> None:
             f"policy {name} explores with ParameterNoise, and RLlib saves its weights with the noise of that moment in "
             "them (ray 2.60): they are not those it acts with when it does not explore"
         )
+    for key in diverged_weights(policy.model):
+        raise CheckpointError(f"{files.state}: the weights '{key}' are not all finite: training diverged")
     _prepare(policy)
-    for key, weights in policy.model.state_dict().items():
-        if not torch.isfinite(weights).all():
-            raise CheckpointError(f"{files.state}: the weights '{key}' are not all finite: training diverged")
 
 
 def _prepare(policy: Any) -> None:
     policy.model.eval().requires_grad_(False)
 
 
-def _check_spaces(policy: Any, observation_space: Any, action_space: Any) -> None:
+def _check_spaces(policy: Any, observation_space: Any, action_space: Any, steps: tuple[ObservationStep, ...]) -> None:
     """Raise UnsupportedError unless both spaces are of a kind that is exported."""
-    check_spaces(observation_space, action_space, integer_actions=True)
+    check_spaces(observation_space, action_space, steps, integer_actions=True)
     if policy.observation_space.shape is None:
         raise UnsupportedError(
             f"observations {observation_space} reach model {type(policy.model).__name__} in parts, as RLlib's "

@@ -10,6 +10,7 @@ from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.recipe.describe import unexpected_steps
 from rlservo.export.rllib import quick_import
 from rlservo.export.rllib.restored_policy import RestoredPolicy
+from rlservo.export.rllib.supported_spaces import check_unsquashing
 
 
 def restore(files: Files, app_dir: Path, notify: Callable[[str], None], *, value: bool = True) -> RestoredPolicy:
@@ -28,6 +29,7 @@ def restore(files: Files, app_dir: Path, notify: Callable[[str], None], *, value
         from rlservo.export.rllib.new_stack import restore_new_stack
 
         restored = restore_new_stack(files, notify, value=value)
+    check_unsquashing(restored.recipe.action_space, restored.recipe.transform)
     for sentence in unexpected_steps(restored.recipe):
         notify(sentence)
     return restored

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from rlservo.export.recipe.recipe import Recipe
 from rlservo.export.recipe.runners import Loop
 from rlservo.export.recipe.trees import Tree
+
+
+def diverged_weights(module: nn.Module) -> Iterator[str]:
+    """Yield the names of weights that show that training diverged: NaN, or infinite where training changes them.
+
+    A mask or a bound may be infinite. To be asked before the module is frozen.
+    """
+    trained = {name for name, weights in module.named_parameters() if weights.requires_grad}
+    for name, weights in module.state_dict().items():
+        if weights.isnan().any() or (name in trained and not torch.isfinite(weights).all()):
+            yield name
 
 
 class RestoredNetwork(Protocol):

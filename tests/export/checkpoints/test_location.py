@@ -193,9 +193,12 @@ def test_without_the_critics_weights_there_is_no_value_output_and_a_notice(
     assert "no value head" in " ".join(notices)
 
 
-def test_weights_that_are_not_finite_are_refused(copy_of: Callable[[str], Path], notices: list[str]) -> None:
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_weights_that_are_not_finite_are_refused(
+    copy_of: Callable[[str], Path], notices: list[str], number: float
+) -> None:
     damaged = copy_of("pendulum")
-    rewrite_weights(damaged, lambda state: np.copyto(state["pi.net.mlp.0.bias"], np.nan))
+    rewrite_weights(damaged, lambda state: np.copyto(state["pi.net.mlp.0.bias"], number))
     with pytest.raises(CheckpointError, match="training diverged"):
         restore(locate_checkpoint(damaged), Path(), notices.append)
 
