@@ -11,7 +11,10 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rlservo.envs.opengl import CannotDrawError, has_display, offscreen_context
+
 RENDER_MODES = ("human", "rgb_array")
+MAX_GEOMS = 10_000  # in a picture, as mujoco.Renderer has it
 
 Start = Literal["own", "random", "here"]
 Vector = NDArray[np.float64]
@@ -123,17 +126,15 @@ class Camera:
         self._view = mujoco.MjvCamera()
         self._view.lookat[:] = lookat
         self._view.distance, self._view.azimuth, self._view.elevation = distance, azimuth, elevation
-        self._renderer: Any = None
+        self._picture: _Picture | None = None
         self._viewer: Any = None
         self._viewer_threads: set[threading.Thread] = set()
 
     def frame(self) -> NDArray[np.uint8]:
-        """Return the current view as (height, width, 3) uint8."""
-        renderer = self._renderer
-        if renderer is None:
-            renderer = self._renderer = mujoco.Renderer(self.model, height=self._height, width=self._width)
-        renderer.update_scene(self.data, camera=self._view)
-        return np.asarray(renderer.render(), dtype=np.uint8)
+        """Return the current view as (height, width, 3) uint8. Raises CannotDrawError."""
+        if self._picture is None:
+            self._picture = _Picture(self.model, self._width, self._height)
+        return self._picture.draw(self.data, self._view)
 
     def viewpoint(self) -> tuple[Vector, Vector]:
         """Return where the camera stands and what it looks at [m] (3,) each."""
@@ -142,8 +143,16 @@ class Camera:
         return self._view.lookat - self._view.distance * ahead, self._view.lookat.copy()
 
     def show(self) -> None:
-        """Open the viewer window at the first call, refresh it at the next ones. Needs a display."""
+        """Open the viewer window at the first call, refresh it at the next ones.
+
+        Raises CannotDrawError where there is no display.
+        """
         if self._viewer is None:
+            if not has_display():
+                raise CannotDrawError(
+                    "no window can be opened: DISPLAY and WAYLAND_DISPLAY name no display with OpenGL; "
+                    "render_mode='rgb_array' needs none"
+                )
             import mujoco.viewer  # opens a display connection when imported, so only where one is wanted
 
             before = set(threading.enumerate())
@@ -157,12 +166,42 @@ class Camera:
 
     def close(self) -> None:
         """Free the GL context and close the window."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        if self._picture is not None:
+            self._picture.free()
+            self._picture = None
         if self._viewer is not None:
             # The window lives in threads of its own. Left to themselves they crash a second window, or Python's exit.
             self._viewer.close()
             for thread in self._viewer_threads:
                 thread.join(timeout=10.0)
             self._viewer = None
+
+
+class _Picture:
+    """What one camera draws into, off screen. `mujoco.Renderer` could not: it takes no OpenGL context of our choice."""
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        self._model = model
+        self._gl = offscreen_context(width, height)
+        self._gl.make_current()
+        self._scene = mujoco.MjvScene(model, maxgeom=MAX_GEOMS)
+        self._options = mujoco.MjvOption()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._pixels: NDArray[np.uint8] = np.empty((height, width, 3), dtype=np.uint8)
+
+    def draw(self, data: mujoco.MjData, view: mujoco.MjvCamera) -> NDArray[np.uint8]:
+        """Return a picture of the simulation's state, (height, width, 3) uint8."""
+        self._gl.make_current()  # another camera's may be
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._options, None, view, everything, self._scene)
+        mujoco.mjr_render(self._rectangle, self._scene, self._context)
+        mujoco.mjr_readPixels(self._pixels, None, self._rectangle, self._context)
+        return np.array(self._pixels[::-1])  # OpenGL's rows start at the bottom
+
+    def free(self) -> None:
+        """Free the graphics memory."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()

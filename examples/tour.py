@@ -25,7 +25,6 @@ from gymnasium.utils.env_checker import check_env
 from shared.training_run import RETURN, STEPS, Run
 
 from rlservo import Policy, rollout
-from rlservo.deploy.serve_commands import choose_gl_backend
 
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
 SHIPPED = Path(__file__).resolve().parent / "checkpoints" / "ur5_positioning"
@@ -58,7 +57,6 @@ def main() -> None:
         parser.error(f"{unknown[0]} is no stop of the tour: expected {', '.join(stops)}")
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws CartPole without a display
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # and looks for a sound card
-    choose_gl_backend()
     training_run.pickle_by_value(sys.modules[__name__])
     settings = Settings(args.out.resolve(), args.quick, not args.no_video)
     settings.out.mkdir(parents=True, exist_ok=True)

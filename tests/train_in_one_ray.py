@@ -23,11 +23,9 @@ sys.path[:0] = [str(EXAMPLES), str(HERE)]
 import shared.training_run as training_run  # noqa: E402
 
 import quick_rllib  # noqa: E402, F401
-from rlservo.deploy.serve_commands import choose_gl_backend  # noqa: E402
 
 
 def main() -> None:
-    choose_gl_backend()  # before the first script imports mujoco
     with training_run.ray_session(num_cpus=1, app_dir=OWN_CODE):
         training_run.ray_session = lambda **_: contextlib.nullcontext()  # the scripts' own
         for line in sys.stdin:

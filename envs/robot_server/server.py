@@ -50,10 +50,7 @@ class RobotServer:
 
     def __init__(self, settings: Settings) -> None:
         self.robot = make_robot(settings)
-        gui = settings.gui and has_display()
-        if settings.gui and not gui:
-            log.warning("there is no display to open a window on: the robot goes on without one")
-        self.service = RobotService(self.robot, Clock(settings.clock, self.robot.cycle_s), gui=gui)
+        self.service = RobotService(self.robot, Clock(settings.clock, self.robot.cycle_s), gui=settings.gui)
         self._server = grpc.server(futures.ThreadPoolExecutor(THREADS, "robot-server"), options=OPTIONS)
         self._server.add_generic_rpc_handlers((self.service.handler(),))
         self.port = bind(self._server, settings.host, settings.port)
@@ -74,11 +71,6 @@ def make_robot(settings: Settings) -> Robot:
     from rlservo.envs.robot_server.mir100_robot import Mir100Robot
 
     return Mir100Robot(settings)
-
-
-def has_display() -> bool:
-    """Whether a window can be opened. MuJoCo's viewer ends the whole process where it cannot."""
-    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def bind(server: grpc.Server, host: str, port: int) -> int:

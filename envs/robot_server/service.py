@@ -98,7 +98,7 @@ class RobotService:
         try:
             self._robot.camera.show()
         except Exception as error:  # whatever a display can do; the robot goes on without a window
-            log.warning("no window: %s", error)
+            log.warning("%s: the robot goes on without a window", error)
             self._gui = False
 
 

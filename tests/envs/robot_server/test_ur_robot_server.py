@@ -341,9 +341,9 @@ def test_window_that_cannot_be_opened_is_no_reason_not_to_serve(
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     client = serve(URSettings(gui=True))
-    assert "there is no display to open a window on" in caplog.text
     assert client.set_state(state_dict=named())
     assert client.send(ros(START))
+    assert caplog.text.count("no window can be opened") == 1
 
 
 def test_slow_client_does_not_hold_up_another(serve: Serve) -> None:
