@@ -40,7 +40,7 @@ def robot_server_ur(
     action_mode: Annotated[
         str, typer.Option(help="abs_pos: actions are joint positions; delta_pos: offsets from where the arm is.")
     ] = "abs_pos",
-    action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz]; 200/n.")] = 25.0,
+    action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz].")] = 25.0,
     max_velocity_scale_factor: Annotated[float, typer.Option(help="Of the joints' velocity limits.")] = 1.0,
     world: Annotated[str, typer.Option(help="empty, or a tabletop world of robo-gym.")] = "tabletop",
     model: Annotated[

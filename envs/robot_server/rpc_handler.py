@@ -1,22 +1,33 @@
 """gRPC handler of robo-gym's services: every failure is a reply and a line in the log.
 
-Requests are parsed by the calls rather than by gRPC, so that garbage is answered like every other error.
+robo-gym asks ten times for what was refused: the same failure within a minute is not logged again. Requests are parsed
+by the calls rather than by gRPC, so that garbage is answered like every other error.
 """
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import grpc
 from google.protobuf.message import DecodeError
 
+REPEATED_S = 60.0
+
 
 def rpc_handler(
     service: str, calls: Mapping[str, Callable[[bytes], Any]], fail: Callable[[str, str], Any], log: logging.Logger
 ) -> grpc.GenericRpcHandler:
     """Return what a gRPC server is given; `fail` makes the reply from a failed call's name and the reason."""
+    last, last_at = "", 0.0
+
+    def is_new(line: str) -> bool:
+        nonlocal last, last_at
+        before, before_at = last, last_at
+        last, last_at = line, time.monotonic()
+        return line != before or last_at - before_at > REPEATED_S
 
     def answering(name: str, call: Callable[[bytes], Any]) -> grpc.RpcMethodHandler:
         def answer(request: bytes, _context: grpc.ServicerContext) -> bytes:
@@ -25,7 +36,8 @@ def rpc_handler(
             except (DecodeError, ValueError) as error:
                 is_garbage = isinstance(error, DecodeError)
                 reason = f"{len(request)} bytes that are no such message" if is_garbage else str(error)
-                log.error("%s: %s", name, reason)
+                if is_new(f"{name}: {reason}"):
+                    log.error("%s: %s", name, reason)
                 message = fail(name, reason)
             except Exception as error:
                 log.exception("%s failed", name)

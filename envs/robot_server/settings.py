@@ -6,7 +6,6 @@ The names are those of robo-gym's launch files; see launch_line.py for the lines
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 from rlservo.envs.mir100.worlds import WORLDS as MIR100_WORLDS
 from rlservo.envs.robot_server.robot import CLOCKS
 from rlservo.envs.ur.objects import object_model
-from rlservo.envs.ur.parameters import ur_parameters
+from rlservo.envs.ur.parameters import cycle_of, ur_parameters
 from rlservo.envs.ur.rs_modes import rs_mode_of
 
 ACTION_MODES = ("abs_pos", "delta_pos")
@@ -77,8 +76,7 @@ class URSettings(Common):
         _one_of("action_mode", self.action_mode, ACTION_MODES)
         _one_of("reference_frame", self.reference_frame, REFERENCE_FRAMES)
         _one_of("world", self.world, UR_WORLDS, suffix=".world")
-        if not (math.isfinite(self.action_cycle_rate) and self.action_cycle_rate > 0.0):
-            raise ValueError(f"action_cycle_rate is {self.action_cycle_rate:g} Hz: expected more than 0")
+        cycle_of(self.action_cycle_rate)
         if not 0.0 < self.max_velocity_scale_factor <= 1.0:
             raise ValueError(
                 f"max_velocity_scale_factor is {self.max_velocity_scale_factor:g}: expected more than 0, at most 1"

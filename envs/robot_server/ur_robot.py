@@ -15,7 +15,7 @@ from rlservo.envs.rendering import Camera
 from rlservo.envs.robot_server.robot import RobotState
 from rlservo.envs.robot_server.settings import URSettings
 from rlservo.envs.ur.object_paths import object_path
-from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
+from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, cycle_of
 from rlservo.envs.ur.rs_modes import ROS_ORDER, state_names
 from rlservo.envs.ur.server_state import state_dict
 from rlservo.envs.ur.simulation import SETTLE_CYCLES, VIEW, URSimulation
@@ -36,7 +36,7 @@ class URRobot:
         self.simulation = URSimulation(
             settings.ur_model,
             max_velocity_scale=settings.max_velocity_scale_factor,
-            cycle_s=1.0 / settings.action_cycle_rate,
+            cycle_s=self.cycle_s,
             objects=settings.object_names,
             table=settings.table,
         )
@@ -51,7 +51,7 @@ class URRobot:
     @property
     def cycle_s(self) -> float:
         """How long a control cycle lasts [s]."""
-        return 1.0 / self._settings.action_cycle_rate
+        return cycle_of(self._settings.action_cycle_rate)
 
     def state(self) -> RobotState:
         """Return the state of the server's mode, as a list and by names."""

@@ -27,7 +27,7 @@ from rlservo.envs.checks import (
 )
 from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
 from rlservo.envs.ur.model import BASE_HEIGHT
-from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
+from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, cycle_of
 from rlservo.envs.ur.simulation import VIEW, URSimulation
 
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
@@ -85,7 +85,7 @@ class URArmEnv(RenderedEnv):
         super().__init__(render_mode, gui=gui)
         self.metadata = {**self.metadata, "render_fps": rate_hz}
         self._build = partial(
-            URSimulation, max_velocity_scale=scale, cycle_s=1.0 / rate_hz, objects=self.OBJECTS, table=self.TABLE
+            URSimulation, max_velocity_scale=scale, cycle_s=cycle_of(rate_hz), objects=self.OBJECTS, table=self.TABLE
         )
         self._simulations = {ur_model: self._build(ur_model)}  # an arm that comes again is not built again
         self.simulation = self._simulations[ur_model]

@@ -14,7 +14,7 @@ import mujoco
 from rlservo.envs.ur.objects import ObjectModel, object_model
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, TABLE_CENTRE, TABLE_SIZE, URParameters
 
-TIMESTEP = 0.005  # [s]
+TIMESTEP = 0.005  # [s], at most; a control cycle is a whole number of steps
 BASE_HEIGHT = TABLE_CENTRE[2] + TABLE_SIZE[2] / 2  # [m], base_link above the world's ground
 
 PARKED_HEIGHT = 3.0  # [m], of an object that has no place yet, above base_link

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+RATES_HZ = (0.1, 1000.0)  # [Hz], the slowest and the fastest control rate
 JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 POSITION_LIMITS = (2 * math.pi, 2 * math.pi, math.pi, 2 * math.pi, 2 * math.pi, 2 * math.pi)  # [rad], +-
@@ -84,6 +85,14 @@ UR_PARAMETERS: dict[str, URParameters] = {
     "ur10e": _arm((0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 0.1762, 0.0393), _UR10),
     "ur16e": _arm((0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, 0.176, 0.04), _UR16),
 }
+
+
+def cycle_of(rate_hz: float) -> float:
+    """Return how long a control cycle lasts [s], or raise ValueError for a rate outside RATES_HZ."""
+    low, high = RATES_HZ
+    if not low <= rate_hz <= high:
+        raise ValueError(f"action_cycle_rate is {rate_hz:g} Hz: expected {low:g} to {high:g} Hz")
+    return 1.0 / rate_hz
 
 
 def ur_parameters(model: str) -> URParameters:

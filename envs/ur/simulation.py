@@ -23,7 +23,6 @@ from rlservo.envs.ur.server_state import state_dict
 
 MIN_TRAJECTORY_S = 0.5  # [s], the robot server never plans a shorter one
 SETTLE_CYCLES = 20  # the robot server lets so many pass after it has set a state
-UPDATE_SUBSTEPS = round(1.0 / (UPDATE_RATE_HZ * TIMESTEP))  # of physics, between two positions of a moving object
 
 # Of a camera.
 VIEW: dict[str, Any] = {"lookat": (0.0, 0.05, 0.42), "distance": 2.3, "azimuth": 145.0, "elevation": -18.0}
@@ -50,7 +49,7 @@ class _DataSheet(NamedTuple):
 
 
 class URSimulation:
-    """One arm on its table, at 200 Hz physics.
+    """One arm on its table, at 200 Hz physics, or the next higher rate of which a control cycle is a whole number.
 
     `max_velocity_scale` multiplies the arm's joint velocity limits, as the robot server's parameter of that name.
     `objects` are names of `OBJECT_MODELS`. Without `table` the arm stands 0.1 m above bare ground.
@@ -71,12 +70,9 @@ class URSimulation:
         self.model: mujoco.MjModel = build_model(self.parameters, objects=objects, table=table)
         self.data = mujoco.MjData(self.model)
         self.max_velocity = max_velocity_scale * np.array(self.parameters.velocity_limits)  # [rad/s], (6,)
-        self._substeps = round(cycle_s / self.model.opt.timestep)
-        if self._substeps < 1 or abs(self._substeps * self.model.opt.timestep - cycle_s) > 1e-9:
-            raise ValueError(
-                f"a control cycle of {cycle_s:g} s is not a multiple of the physics step of "
-                f"{self.model.opt.timestep:g} s: expected a rate of 200/n Hz"
-            )
+        self._substeps = math.ceil(cycle_s / TIMESTEP - 1e-9)
+        if abs(self._substeps * TIMESTEP - cycle_s) > 1e-9:
+            self.model.opt.timestep = cycle_s / self._substeps
         self._servo = np.array([self.data.actuator(name).id for name in JOINTS])
         self._feed_forward = np.array([self.data.actuator(f"{name}_velocity").id for name in JOINTS])
         self._tool = self.model.site("tool0").id
@@ -229,10 +225,9 @@ class URSimulation:
                 self.in_collision = True
 
     def _move_objects(self) -> None:
-        update, rest = divmod(self._tick, UPDATE_SUBSTEPS)
-        if rest == 0:
-            for mocap, path in self._moving.items():
-                self.data.mocap_pos[mocap] = path[update % len(path)]
+        update = int(self._tick * self.model.opt.timestep * UPDATE_RATE_HZ + 1e-6)
+        for mocap, path in self._moving.items():
+            self.data.mocap_pos[mocap] = path[update % len(path)]
 
     # -- reading
 

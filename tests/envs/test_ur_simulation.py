@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rlservo.envs.ur.model import BASE_HEIGHT
-from rlservo.envs.ur.parameters import UR_PARAMETERS, URParameters
+from rlservo.envs.ur.parameters import UR_PARAMETERS, URParameters, cycle_of
 from rlservo.envs.ur.simulation import URSimulation
 
 MODELS = list(UR_PARAMETERS)
@@ -240,5 +240,28 @@ def test_unknown_arm_and_impossible_settings_are_refused_in_a_sentence() -> None
         URSimulation("ur7")
     with pytest.raises(ValueError, match="more than 0, at most 1"):
         URSimulation(max_velocity_scale=0.0)
-    with pytest.raises(ValueError, match="not a multiple of the physics step"):
-        URSimulation(cycle_s=1 / 30)
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 7.0, 15.0, 20.0, 30.0, 60.0, 125.0, 200.0 / 3.0, 500.0])
+def test_a_second_is_a_second_at_every_control_rate(rate_hz: float) -> None:
+    sim = URSimulation(max_velocity_scale=0.1, cycle_s=cycle_of(rate_hz))
+    sim.place(START)
+    heights = np.linspace(1.0, 2.0, 1001)[:, None] * (0.0, 0.0, 1.0)  # a new one every 10 ms
+    sim.move_objects({0: heights})
+    goal = np.array(START)
+    goal[0] += 1.0
+    sim.command(goal)
+    cycles = max(1, round(2.0 * rate_hz))
+    for _ in range(cycles):
+        sim.advance()
+    passed = cycles / rate_hz
+    assert sim.data.time == pytest.approx(passed)
+    assert sim.model.opt.timestep <= 0.005
+    assert sim.joint_positions[0] == pytest.approx(START[0] + 0.1 * np.pi * passed, abs=2e-3)
+    assert sim.object_position(0)[2] == pytest.approx(1.0 + 0.1 * passed, abs=2e-3)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -20.0, 0.05, 2000.0, float("nan"), float("inf")])
+def test_a_control_rate_that_cannot_be_simulated_is_refused_in_a_sentence(rate_hz: float) -> None:
+    with pytest.raises(ValueError, match=f"action_cycle_rate is {rate_hz:g} Hz: expected 0.1 to 1000 Hz"):
+        cycle_of(rate_hz)

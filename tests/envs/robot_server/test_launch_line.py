@@ -89,7 +89,7 @@ def test_mir100_and_two_object_lines_are_understood() -> None:
         (f"{UR} ur_model:=ur5 --screen", "'--screen' is no launch argument"),
         (f"{UR} ur_model:=ur5 rs_mode:=voxels", "rs_mode 'voxels' does not exist: expected one of only_robot"),
         (f"{UR} ur_model:=ur5 action_cycle_rate:=fast", "action_cycle_rate:=fast is no number"),
-        (f"{UR} ur_model:=ur5 action_cycle_rate:=-1", "action_cycle_rate is -1 Hz: expected more than 0"),
+        (f"{UR} ur_model:=ur5 action_cycle_rate:=-1", "action_cycle_rate is -1 Hz: expected 0.1 to 1000 Hz"),
         (f"{UR} ur_model:=ur5 max_velocity_scale_factor:=2", "expected more than 0, at most 1"),
         (f"{UR} ur_model:=ur5 world_name:=moon.world", "world 'moon.world' does not exist: expected one of empty"),
         (f"{UR} ur_model:=ur5 reference_frame:=world", "reference_frame 'world' does not exist"),

@@ -74,14 +74,15 @@ def test_line_that_cannot_be_honoured_is_answered_with_the_reason(
     for line, reason in (
         (f"{UR} colour:=red", "launch arguments that are not known: colour"),
         ("roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur99", "ur_model 'ur99' does not exist"),
-        (f"{UR} action_cycle_rate:=30", "a rate of 200/n Hz"),
+        (f"{UR} action_cycle_rate:=5000", "action_cycle_rate is 5000 Hz: expected 0.1 to 1000 Hz"),
         ("", "expected 'roslaunch"),
     ):
-        answer = client.start(line)
-        assert not answer.success
-        assert answer.port == 0
-        assert reason in answer.info
-        assert reason in caplog.text
+        for _ in range(10):  # as robo-gym's client does
+            answer = client.start(line)
+            assert not answer.success
+            assert answer.port == 0
+            assert reason in answer.info
+        assert caplog.text.count(reason) == 1
     assert manager.servers.running == {}
 
 
@@ -398,7 +399,7 @@ def test_a_signal_that_interrupts_no_wait_still_ends_it() -> None:
         (("robot-server", "ur", "--ur-model", "ur7"), "ur_model 'ur7' does not exist: expected one of ur3"),
         (("robot-server", "ur", "--rs-mode", "x"), "rs_mode 'x' does not exist"),
         (("robot-server", "ur", "--object", "duck"), "object model 'duck' does not exist"),
-        (("robot-server", "ur", "--action-cycle-rate", "30"), "expected a rate of 200/n Hz"),
+        (("robot-server", "ur", "--action-cycle-rate", "0"), "action_cycle_rate is 0 Hz: expected 0.1 to 1000 Hz"),
         (("robot-server", "mir100", "--world", "moon"), "world 'moon' does not exist: expected one of"),
         (("server-manager", "--host", "203.0.113.7", "--port", "50101"), "cannot listen on 203.0.113.7:50101"),
     ],
