@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from enum import Enum
 from pathlib import Path
@@ -77,9 +78,29 @@ def export(
         episodes, frames = export_lerobot(recording, out, name=policy, task=task)
         line = f"written {out}: {episodes} episodes, {frames} frames"
     else:
-        identity, episodes = export_minari(recording, out, name=policy)
-        line = f"written {out}: {episodes} episodes; {PATH_VARIABLE}={out}, then minari.load_dataset({identity!r})"
-    terminal.output().print(line, markup=False, highlight=False, soft_wrap=True)
+        identity, episodes, env = export_minari(recording, out, name=policy)
+        made_in = f"of {env}" if env else "of no environment that is installed here"
+        place = f"{PATH_VARIABLE}={shlex.quote(str(out.resolve()))}"
+        line = f"written {out}: {episodes} episodes {made_in}; {place}, then minari.load_dataset({identity!r})"
+    _line(line)
+
+
+@log.command()
+def repair(
+    file: Annotated[Path, typer.Argument(metavar="FILE", exists=True, dir_okay=False, help="A recording (.mcap).")],
+    out: Annotated[Path, typer.Option(help="New file.")],
+) -> None:
+    """Copy a recording that was cut off into a whole file.
+
+    To its last whole chunk, with an end and an index, which other programs need. FILE stays as it is.
+
+    Example: `rlservo log repair run.mcap --out whole.mcap`
+    """
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.repair import repair_recording
+
+    facts = repair_recording(file, out)
+    _line(f"written {out}: {facts.messages} messages{f'; {file} is {facts.damage}' if facts.damage else ''}")
 
 
 @log.command()

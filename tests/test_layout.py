@@ -66,7 +66,9 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
         "envs/robot_server/", "serve_app/protocols/oip_grpc.py", "serve_app/wire/protobuf_messages.py",
     ),
     "google.protobuf.message_factory": ("serve_app/wire/protobuf_messages.py",),
-    "mcap": ("serve_app/recording/log_file.py", "serve_app/recording/reader.py"),
+    "mcap": (
+        "serve_app/recording/log_file.py", "serve_app/recording/reader.py", "serve_app/recording/repair.py",
+    ),
     "pyarrow": ("serve_app/recording/parquet_export.py", "serve_app/recording/lerobot_export.py", "export/"),
     "fsspec": ("serve_app/versions/object_storage.py", "export/checkpoints/remote.py"),
     "aiohttp": ("serve_app/versions/reply_bound.py",),

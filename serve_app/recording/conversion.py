@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -33,12 +35,31 @@ def optional_package(name: str, purpose: str) -> ModuleType:
         raise UsageError(f"{purpose} needs the Python package {package!r}: pip install {package}") from error
 
 
-def new_folder(out: Path) -> Path:
-    """Make the folder of a conversion; raise UsageError where it exists and holds something."""
+@contextmanager
+def new_path(out: Path) -> Iterator[Path]:
+    """Yield where to write a file or folder that becomes `out` at the end, and is removed where something fails.
+
+    Raises UsageError where `out` exists, unless as an empty folder.
+    """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out} exists: give a new folder")
-    out.mkdir(parents=True, exist_ok=True)
-    return out
+        raise UsageError(f"{out} exists: give a new path")
+    part = out.with_name(f".{out.name}.part")
+    _remove(part)  # of a conversion that was killed
+    part.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield part
+        if out.is_dir():
+            out.rmdir()
+        part.replace(out)
+    finally:
+        _remove(part)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def episodes_of_one(recording: Recording, name: str | None) -> Iterator[Episode]:

@@ -7,6 +7,8 @@ episodes with each one's own statistics, whose columns are named `stats/<feature
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.recording.conversion import episodes_of_one, new_folder, optional_package
+from rlservo.serve_app.recording.conversion import episodes_of_one, new_path, optional_package
 from rlservo.serve_app.recording.episodes import Columns, Episode
 from rlservo.serve_app.recording.reader import Recording
 
@@ -22,6 +24,7 @@ DATA_FILE = "data/chunk-000/file-000.parquet"
 EPISODES_FILE = "meta/episodes/chunk-000/file-000.parquet"
 QUANTILES = {"q01": 1, "q10": 10, "q50": 50, "q90": 90, "q99": 99}
 DEFAULT_FPS = 10
+REWARD = "next.reward"
 TASKS_FOR_PANDAS = {  # LeRobot looks tasks up by their sentence: it is the table's index
     "index_columns": ["task"],
     "column_indexes": [],
@@ -43,13 +46,19 @@ def export_lerobot(
     """
     pa = optional_package("pyarrow", "an export to LeRobot")
     pq = optional_package("pyarrow.parquet", "an export to LeRobot")
-    folder = new_folder(Path(out))
+    with new_path(Path(out)) as folder, ExitStack() as stack:
+        return _write(pa, pq, stack, folder, episodes_of_one(recording, name), task)
+
+
+def _write(
+    pa: Any, pq: Any, stack: ExitStack, folder: Path, episodes: Iterator[Episode], task: str | None
+) -> tuple[int, int]:
     (folder / DATA_FILE).parent.mkdir(parents=True)
     (folder / EPISODES_FILE).parent.mkdir(parents=True)
     writer: Any = None
     rows: list[dict[str, Any]] = []
     frames, fps, features, sentence = 0, float(DEFAULT_FPS), {}, task or ""
-    for episode in episodes_of_one(recording, name):
+    for episode in episodes:
         if not episode.id or not episode.begins or episode.goes_on or episode.gap is not None:
             continue
         if not (episode.acted | episode.fell_back).all():
@@ -61,7 +70,15 @@ def export_lerobot(
         features = _features(episode, data)
         table = pa.table({key: _column(pa, column) for key, column in data.items()})
         if writer is None:
-            writer = pq.ParquetWriter(folder / DATA_FILE, table.schema)
+            writer = stack.enter_context(pq.ParquetWriter(folder / DATA_FILE, table.schema))
+        elif table.column_names != writer.schema.names:
+            which, before = (
+                ("lacks rewards", "has them") if REWARD in writer.schema.names else ("has rewards", "lacks them")
+            )
+            raise UsageError(
+                f"episode {episode.id!r} {which}, and the one before it {before}: the frames of a LeRobotDataset have "
+                f"the same columns throughout; convert recordings with and without rewards apart, or to parquet"
+            )
         writer.write_table(table)
         row: dict[str, Any] = {
             "episode_index": len(rows),
@@ -120,7 +137,7 @@ def _frame_columns(episode: Episode, number: int, first: int, fps: float) -> dic
         "task_index": np.zeros(len(episode), np.int64),
     }
     if np.isfinite(episode.reward).all():
-        columns["next.reward"] = episode.reward.astype(np.float32)
+        columns[REWARD] = episode.reward.astype(np.float32)
         columns["next.done"] = (steps == len(episode) - 1) & episode.ended
     return columns
 

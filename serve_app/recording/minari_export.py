@@ -11,19 +11,22 @@ from typing import Any
 
 import numpy as np
 
+from rlservo.export.contract.contract import Provenance
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.nested import build_action
-from rlservo.serve_app.recording.conversion import episodes_of_one, gym_space, new_folder, optional_package
+from rlservo.serve_app.recording.conversion import episodes_of_one, gym_space, new_path, optional_package
 from rlservo.serve_app.recording.episodes import Episode
 from rlservo.serve_app.recording.reader import Recording
 
 PATH_VARIABLE = "MINARI_DATASETS_PATH"
 
 
-def export_minari(recording: Recording, out: str | Path, *, name: str | None = None) -> tuple[str, int]:
-    """Write a dataset into the new folder `out` and return (its id, episodes).
+def export_minari(recording: Recording, out: str | Path, *, name: str | None = None) -> tuple[str, int, str | None]:
+    """Write a dataset into the new folder `out` and return (its id, episodes, the id of its environment).
 
-    `MINARI_DATASETS_PATH=out` lets minari load it by that id. Minari's episodes need every reward, an end and the
+    `MINARI_DATASETS_PATH=out`, an absolute path, lets minari load it by that id. The environment, which minari's
+    `recover_environment` makes, is the one that the policy was trained in, None where this Python does not have it with
+    the policy's observations and actions. Minari's episodes need every reward, an end and the
     observation after the last action: others are left out. Raises UsageError where nothing is left, and RecordingError.
     """
     minari = optional_package("minari", "an export to Minari")
@@ -37,14 +40,14 @@ def export_minari(recording: Recording, out: str | Path, *, name: str | None = N
         last = episode
         final = episode.final_obs
         assert final is not None
-        spaces = episode.policy.contract
+        contract = episode.policy.contract
         observations = {key: np.concatenate([leaf, final[key]]) for key, leaf in episode.obs.items()}
         ends = np.arange(len(episode)) == len(episode) - 1
         buffers.append(
             collector.EpisodeBuffer(
                 id=len(buffers),
-                observations=build_action(spaces.observation_space, observations, "obs"),
-                actions=build_action(spaces.action_space, episode.executed, "action"),
+                observations=build_action(contract.observation_space, observations, "obs"),
+                actions=build_action(contract.action_space, episode.executed, "action"),
                 rewards=episode.reward.tolist(),
                 terminations=(ends & episode.terminated).tolist(),
                 truncations=(ends & ~np.bool_(episode.terminated)).tolist(),
@@ -55,18 +58,36 @@ def export_minari(recording: Recording, out: str | Path, *, name: str | None = N
         raise UsageError("the recording has no whole episode with rewards and its last observation to convert")
     contract = last.policy.contract
     identity = f"rlservo/{contract.name}-v0"
-    with _datasets_in(new_folder(Path(out))), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # that there is no author and no environment
+    spaces = gym_space(contract.observation_space), gym_space(contract.action_space)
+    env = _environment(contract.provenance, spaces)
+    with new_path(Path(out)) as folder, _datasets_in(folder), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that there is no author, or no environment
+        folder.mkdir()
         minari.create_dataset_from_buffers(
             identity,
             buffers,
-            observation_space=gym_space(contract.observation_space),
-            action_space=gym_space(contract.action_space),
+            env=env,
+            observation_space=spaces[0],
+            action_space=spaces[1],
             algorithm_name=contract.provenance.algorithm,
             description=f"Recorded with rlservo from {last.policy.title}",
             data_format="arrow",
         )
-    return identity, len(buffers)
+    return identity, len(buffers), None if env is None else env.id
+
+
+def _environment(origin: Provenance, spaces: tuple[Any, Any]) -> Any:
+    """Return the Gymnasium specification of the training's environment, if it can be made and has these spaces."""
+    import gymnasium as gym
+
+    if origin.env_id not in gym.registry:  # and no "module:Env", which a recording shall not import
+        return None
+    try:
+        env = gym.make(origin.env_id, disable_env_checker=True, **origin.env_config)
+    except Exception:  # a constructor is anyone's code
+        return None
+    env.close()
+    return env.spec if (env.observation_space, env.action_space) == spaces else None
 
 
 def _is_whole(episode: Episode) -> bool:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.recording.conversion import episodes_of_one, optional_package
+from rlservo.serve_app.recording.conversion import episodes_of_one, new_path, optional_package
 from rlservo.serve_app.recording.episodes import Episode
 from rlservo.serve_app.recording.own_actions import own_actions
 from rlservo.serve_app.recording.reader import Recording
@@ -24,28 +24,16 @@ def export_parquet(recording: Recording, out: str | Path, *, name: str | None = 
     """
     pa = optional_package("pyarrow", "an export to Parquet")
     pq = optional_package("pyarrow.parquet", "an export to Parquet")
-    path = Path(out)
-    if path.exists():
-        raise UsageError(f"{path} exists: give a new file")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    writer: Any = None
     rows = 0
-    try:
+    with new_path(Path(out)) as part, ExitStack() as stack:
+        writer: Any = None
         for episode in episodes_of_one(recording, name):
             table = pa.table(dict(_columns(pa, episode)))
             if writer is None:
                 metadata = {"rlservo.contract": episode.policy.contract_document}
-                writer = pq.ParquetWriter(part, table.schema.with_metadata(metadata))
+                writer = stack.enter_context(pq.ParquetWriter(part, table.schema.with_metadata(metadata)))
             writer.write_table(table.cast(writer.schema))
             rows += len(table)
-    except BaseException:
-        if writer is not None:
-            writer.close()
-        part.unlink(missing_ok=True)
-        raise
-    writer.close()
-    part.replace(path)
     return rows
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import orjson
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Chunk, Message, Metadata
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from pydantic import ValidationError
 
@@ -102,6 +102,40 @@ class Recording:
         return policy
 
 
+def read_records(facts: FileFacts) -> Iterator[McapRecord]:
+    """Yield what is in the file `facts.path`, chunks taken apart, to its last whole chunk.
+
+    Sets `whole` and `damage` at the end. Raises RecordingError where it is no MCAP file.
+    """
+    path = facts.path
+
+    def damaged(error: Exception) -> None:
+        """A last chunk that is cut off is a missing end; anything before it is damage."""
+        if stream.tell() < path.stat().st_size:
+            facts.damage = f"damaged before byte {stream.tell()}, read up to there: {first_line(error)}"
+
+    with path.open("rb") as stream:
+        try:
+            for record in StreamReader(stream, emit_chunks=True, record_size_limit=LARGEST_RECORD).records:
+                if isinstance(record, Chunk):
+                    yield from breakup_chunk(record, validate_crc=True)
+                else:
+                    yield record
+            facts.whole = True  # the footer and the closing magic were there
+        except InvalidMagic:
+            if stream.tell() <= len(b"\x89MCAP0\r\n"):
+                raise RecordingError(f"{path} is no MCAP file") from None
+        except (EndOfFile, struct.error) as error:  # in the middle of a record
+            if stream.tell() < len(b"\x89MCAP0\r\n"):
+                raise RecordingError(f"{path} is no MCAP file, or empty") from error
+        except (McapError, CRCValidationError, ValueError, MemoryError, OverflowError) as error:
+            damaged(error)
+        except Exception as error:  # zstandard's and lz4's own errors share no base
+            if not type(error).__module__.startswith(("zstandard", "lz4", "builtins", "zstd")):
+                raise
+            damaged(error)
+
+
 class _FileReader:
     """One pass over one file."""
 
@@ -114,53 +148,32 @@ class _FileReader:
         self._offset_ns: int | None = None
 
     def entries(self) -> Iterator[Entry]:
-        facts = self._facts
-        with facts.path.open("rb") as stream:
+        for record in read_records(self._facts):
             try:
-                for record in StreamReader(stream, emit_chunks=True, record_size_limit=LARGEST_RECORD).records:
-                    if isinstance(record, Chunk):
-                        for inside in breakup_chunk(record, validate_crc=True):
-                            if isinstance(inside, Message):
-                                entry = self._entry(inside)
-                                if entry is not None:
-                                    yield entry
-                            elif isinstance(inside, Channel):
-                                self._add_channel(inside)
-                    elif isinstance(record, Channel):
-                        self._add_channel(record)
-                    elif isinstance(record, Message):
-                        entry = self._entry(record)
-                        if entry is not None:
-                            yield entry
-                    elif isinstance(record, Attachment):
-                        self._add_contract(record)
-                    elif isinstance(record, Metadata) and record.name == "rlservo":
-                        facts.metadata = dict(record.metadata)
-                facts.whole = True  # the footer and the closing magic were there
-            except InvalidMagic:
-                if stream.tell() <= len(b"\x89MCAP0\r\n"):
-                    raise RecordingError(f"{facts.path} is no MCAP file") from None
-            except (EndOfFile, struct.error) as error:  # in the middle of a record
-                if stream.tell() < len(b"\x89MCAP0\r\n"):
-                    raise RecordingError(f"{facts.path} is no MCAP file, or empty") from error
+                entry = self._take(record)
             except RecordingError:
                 raise
-            except (McapError, CRCValidationError, ValueError, MemoryError, OverflowError) as error:
-                self._damaged(error, stream.tell())
-            except Exception as error:  # zstandard's and lz4's own errors share no base
-                if not type(error).__module__.startswith(("zstandard", "lz4", "builtins", "zstd")):
-                    raise
-                self._damaged(error, stream.tell())
+            except Exception as error:  # a message that rlservo did not write
+                self._facts.damage = f"read up to a message that cannot be understood: {first_line(error)}"
+                break
+            if entry is not None:
+                yield entry
         if self._foreign and not self._channels:
             raise RecordingError(
-                f"{facts.path} holds no decisions of rlservo's policies: its topics are "
+                f"{self._facts.path} holds no decisions of rlservo's policies: its topics are "
                 f"{', '.join(sorted(self._foreign)[:5])}"
             )
 
-    def _damaged(self, error: Exception, place: int) -> None:
-        """A last chunk that is cut off is a missing end; anything before it is damage."""
-        if place < self._facts.path.stat().st_size:
-            self._facts.damage = f"damaged before byte {place}, read up to there: {first_line(error)}"
+    def _take(self, record: McapRecord) -> Entry | None:
+        if isinstance(record, Message):
+            return self._entry(record)
+        if isinstance(record, Channel):
+            self._add_channel(record)
+        elif isinstance(record, Attachment):
+            self._add_contract(record)
+        elif isinstance(record, Metadata) and record.name == "rlservo":
+            self._facts.metadata = dict(record.metadata)
+        return None
 
     def _entry(self, message: Message) -> Entry | None:
         policy, kind = self._channels.get(message.channel_id, (None, ""))

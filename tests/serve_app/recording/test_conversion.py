@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
+from command_line import rlservo_here
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.recording.episodes import episodes
 from rlservo.serve_app.recording.lerobot_export import export_lerobot
@@ -20,6 +23,8 @@ from rlservo.serve_app.recording.recorded_policy import WithRecording
 from rlservo.serve_app.recording.recorder import Recorder
 from rlservo.serve_app.recording.summary import summarise_recording
 from rlservo.serve_app.runtime.policy import Policy
+
+UR5 = "rlservo/EndEffectorPositioningURSim-v0"
 
 
 def record(policy: WithRecording, lengths: list[int], *, explore: bool = False) -> None:
@@ -105,10 +110,27 @@ def test_lerobot_dataset_has_the_documented_layout(run: Path, tmp_path: Path) ->
     assert stats["observation.state"]["count"] == [15] and len(stats["action"]["q99"]) == 6
 
 
+@pytest.mark.parametrize("first_has_rewards", [True, False])
+def test_lerobot_takes_no_episodes_with_and_without_rewards_and_leaves_nothing(
+    ur5: Path, tmp_path: Path, first_has_rewards: bool
+) -> None:
+    pytest.importorskip("pyarrow")
+    with WithRecording(Policy.load(ur5), tmp_path / "run.mcap") as policy:
+        for rewarded in (first_has_rewards, not first_has_rewards):
+            policy.reset()
+            policy.act(np.zeros(27, np.float32))
+            policy.outcome(1.0 if rewarded else None, terminated=True)
+    with pytest.raises(
+        UsageError, match=r"episode '\S+' (has|lacks) rewards, and the one before it (has|lacks) them: "
+    ):
+        export_lerobot(Recording(tmp_path / "run.mcap"), tmp_path / "made" / "set")
+    assert not list((tmp_path / "made").iterdir())
+
+
 def test_minari_loads_its_dataset(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     minari = pytest.importorskip("minari")
-    identity, count = export_minari(Recording(run), tmp_path / "sets")
-    assert count == 3
+    identity, count, env_id = export_minari(Recording(run), tmp_path / "sets")
+    assert (count, env_id) == (3, None)
     monkeypatch.setenv(PATH_VARIABLE, str(tmp_path / "sets"))
     dataset = minari.load_dataset(identity)
     assert (dataset.total_episodes, dataset.total_steps) == (3, 15)
@@ -117,6 +139,51 @@ def test_minari_loads_its_dataset(run: Path, tmp_path: Path, monkeypatch: pytest
         assert np.asarray(theirs.observations, np.float32)[:-1].tobytes() == ours.obs["obs"].tobytes()
         assert np.asarray(theirs.actions, np.float32).tobytes() == ours.action["action"].tobytes()
         assert len(theirs.observations) == len(ours) + 1 and theirs.terminations[-1]
+
+
+@pytest.mark.slow  # it exports a policy that was trained
+def test_minari_recovers_the_environment_of_the_training_and_combines_datasets(
+    shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    minari = pytest.importorskip("minari")
+    with WithRecording(Policy.load(shipped / "ur5"), tmp_path / "run.mcap") as policy:
+        record(policy, [5, 7, 3])
+    done = rlservo_here("log", "export", "run.mcap", "--to", "minari", "--out", "sets", cwd=tmp_path)
+    place = f"{PATH_VARIABLE}={tmp_path}/sets, then minari.load_dataset('rlservo/ur5-v0')"
+    assert done.stdout == f"written sets: 3 episodes of {UR5}; {place}\n", done.stderr
+    monkeypatch.setenv(PATH_VARIABLE, str(tmp_path / "sets"))
+    dataset = minari.load_dataset("rlservo/ur5-v0")
+    env = dataset.recover_environment()
+    assert env.spec is not None and env.spec.id == UR5 and env.spec.kwargs["ur_model"] == "ur5"
+    env.close()
+    minari.combine_datasets([dataset, dataset], "rlservo/twice-v0")
+    assert minari.load_dataset("rlservo/twice-v0").total_steps == 30
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7, 1.0])
+def test_a_repaired_recording_is_whole_to_every_reader(ur5: Path, tmp_path: Path, share: float) -> None:
+    with WithRecording(Policy.load(ur5), tmp_path / "run.mcap") as policy:
+        record(policy, [2000])
+    whole = (tmp_path / "run.mcap").read_bytes()
+    cut, repaired = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
+    cut.write_bytes(whole[: int(len(whole) * share)])
+    assert rlservo_here("log", "repair", cut, "--out", repaired).returncode == 0
+    before, after = Recording(cut), Recording(repaired)
+    for theirs, ours in zip(before.entries(), after.entries(), strict=True):
+        assert replace(theirs, policy=ours.policy) == ours and theirs.policy.key == ours.policy.key
+    assert after.files[0].whole and repaired.stat().st_mode & 0o777 == 0o600
+    with repaired.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and summary.statistics is not None
+    assert summary.statistics.message_count == after.files[0].messages > 0
+    assert cut.stat().st_size == int(len(whole) * share)
+
+
+def test_a_recording_that_is_none_is_not_repaired(tmp_path: Path) -> None:
+    (tmp_path / "text.mcap").write_text("hello, this is not a recording")
+    done = rlservo_here("log", "repair", "text.mcap", "--out", "whole.mcap", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (1, "rlservo: text.mcap is no MCAP file\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["text.mcap"]
 
 
 def test_conversion_of_several_policies_wants_a_name(policies: Path, tmp_path: Path) -> None:
