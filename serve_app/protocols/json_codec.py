@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping
+from itertools import islice
 from typing import Any
 
 import orjson
@@ -27,6 +28,7 @@ from rlservo.serve_app.protocols.http_endpoint import Body, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.json_messages import json_type, parse_json
 from rlservo.serve_app.protocols.media_types import check_media_type
+from rlservo.serve_app.server.content_bounds import SMALL, check_json
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
 from rlservo.serve_app.versions.policy_store import Decision
@@ -56,9 +58,11 @@ class JsonCodec:
     def parse(self, request: Request, content: Body) -> None:
         """Fill the request; the observation itself is the policy's to judge.
 
-        Raises RequestError when the body is not a JSON object of the known fields, ObservationError when it has no
-        `obs`.
+        Raises TooLargeError when the body holds more than `max_batch` observations can need, RequestError when it is
+        not a JSON object of the known fields, ObservationError when it has no `obs`.
         """
+        if len(content) > SMALL:
+            check_json(self._core.store(), request.policy, content, self._core.settings.max_batch)
         try:
             document = orjson.loads(content)
         except orjson.JSONDecodeError:
@@ -138,9 +142,9 @@ def parse_finite(
 
 
 def _check_fields(document: dict[str, Any]) -> None:
-    unknown = sorted(document.keys() - REQUEST_FIELDS)
+    unknown = [*islice((name for name in document if name not in REQUEST_FIELDS), 8)]
     if unknown:
-        shown = ", ".join(repr(name[:64]) for name in unknown[:8])
+        shown = ", ".join(repr(name[:64]) for name in unknown)
         known = sorted(REQUEST_FIELDS)
         raise RequestError(
             f"unknown field{'s' if len(unknown) > 1 else ''} {shown}: known are {', '.join(known)}", {"known": known}

@@ -17,6 +17,7 @@ from rlservo.export.contract.errors import RequestError, TooLargeError
 from rlservo.export.contract.spaces import DictSpec
 from rlservo.serve_app.episodes.request import REQUEST_FIELDS, Episode, Request
 from rlservo.serve_app.protocols.json_codec import parse_episode, parse_options
+from rlservo.serve_app.server.content_bounds import SMALL, check_length
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
 from rlservo.serve_app.versions.policy_store import Decision
@@ -37,7 +38,7 @@ class MsgpackCodec:
             raise RequestError("the message is a text frame: send msgpack in a binary one")
         if len(content) > self._max_bytes:
             raise TooLargeError(f"the message is larger than {self._max_bytes} bytes", {"max_bytes": self._max_bytes})
-        document = unpack(content)
+        document = unpack(content, most=self._most_values(request, content) if len(content) > SMALL else None)
         if type(document) is not dict:
             raise RequestError(f"the message must be a map such as {{'obs': ...}}, got {type(document).__name__}")
         if "obs" in document and type(document.get("seq")) is int:
@@ -54,9 +55,9 @@ class MsgpackCodec:
         else:
             request.obs = content["obs"]
             if len(content) > 1:
-                unknown = sorted(str(key)[:64] for key in content.keys() - REQUEST_FIELDS)
-                if unknown:
-                    raise RequestError(f"unknown field '{unknown[0]}': known are {', '.join(sorted(REQUEST_FIELDS))}")
+                unknown = next((str(key)[:64] for key in content if key not in REQUEST_FIELDS), None)
+                if unknown is not None:
+                    raise RequestError(f"unknown field '{unknown}': known are {', '.join(sorted(REQUEST_FIELDS))}")
                 parse_options(request, content)
                 request.episode = parse_episode(content)
 
@@ -66,6 +67,10 @@ class MsgpackCodec:
         fields["actions"] = _chunks(decision.action, batch=decision.batch is not None)
         fields["server_timing"] = {"infer_ms": fields.pop("infer_ms"), **(request.reply_options or {})}
         return pack(fields)
+
+    def _most_values(self, request: Request, content: bytes) -> int:
+        store, max_batch = self._core.store(), self._core.settings.max_batch
+        return max(bounds.values for bounds in check_length(store, request.policy, content, max_batch))
 
     def _names(self, request: Request, name: str) -> bool:
         """Whether an observation of the request's policy has a part or an element of that name."""

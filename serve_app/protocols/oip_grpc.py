@@ -42,6 +42,7 @@ from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
 from rlservo.serve_app.protocols.oip_tensors import DTYPES, as_datatype, check_form, check_size, datatype_of, from_bytes
 from rlservo.serve_app.server.access_checks import StreamKey, authorize, presented_key
 from rlservo.serve_app.server.api_keys import Access
+from rlservo.serve_app.server.content_bounds import SMALL, SPARE, check_length
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_path import BUG
 from rlservo.serve_app.versions.policy_store import Decision
@@ -249,6 +250,11 @@ class OipGrpcCodec:
         message = _parse(messages.ModelInferRequest, content)
         request.policy, request.version = message.model_name, message.model_version or None
         self._core.store().get(request.policy, request.version)
+        if len(content) > SMALL:
+            check_length(self._core.store(), request.policy, content, self._core.settings.max_batch)
+        for field in ("inputs", "outputs", "parameters", "raw_input_contents"):
+            if len(getattr(message, field)) > SPARE:
+                raise TooLargeError(f"the message has more than {SPARE} {field}")
         document = {
             "parameters": _parameters(message.parameters),
             "outputs": [

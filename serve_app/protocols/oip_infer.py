@@ -44,6 +44,7 @@ from rlservo.serve_app.protocols.oip_tensors import (
 )
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.access_checks import HEADERS
+from rlservo.serve_app.server.content_bounds import SMALL, check_json
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
 from rlservo.serve_app.versions.policy_store import Decision
@@ -150,6 +151,8 @@ class OipHttpCodec:
             document: dict[str, Any] = {}
             inputs = {contract.inputs[0].name: _raw_input(contract, view)}
         else:
+            if len(view) > SMALL:
+                check_json(self._core.store(), request.policy, view[:length], self._core.settings.max_batch)
             document, inputs, request.non_finite = _parse_document(view, length, request.policy)
         fill_request(self._core, request, document, inputs)
         request.reply_options.request_id = document.get("id")
@@ -246,13 +249,11 @@ def _parse_document(
         raise RequestError(f"Inference-Header-Content-Length is {length}, and the body has {len(view)} bytes")
     header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
     document, non_finite = parse_json(header, such_as=SUCH_AS)
-    unknown = sorted(document.keys() - REQUEST_FIELDS)
-    if unknown:
-        if document.get(MODEL_NAME) not in (None, model):
-            raise RequestError(f"'{MODEL_NAME}' is not '{model[:64]}', which the path names")
-        unknown = [field for field in unknown if field != MODEL_NAME]
-    if unknown:
-        raise RequestError(f"unknown field '{unknown[0][:64]}': known are {', '.join(sorted(REQUEST_FIELDS))}")
+    if document.pop(MODEL_NAME, None) not in (None, model):
+        raise RequestError(f"'{MODEL_NAME}' is not '{model[:64]}', which the path names")
+    unknown = next((field for field in document if field not in REQUEST_FIELDS), None)
+    if unknown is not None:
+        raise RequestError(f"unknown field '{unknown[:64]}': known are {', '.join(sorted(REQUEST_FIELDS))}")
     if document.get("id") is not None and type(document["id"]) is not str:
         raise RequestError(f"'id' must be a string, got {json_type(document['id'])}")
     if document.get("parameters") is not None and type(document["parameters"]) is not dict:

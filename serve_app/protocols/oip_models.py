@@ -16,6 +16,7 @@ from rlservo.export.contract.contract import TensorSpec
 from rlservo.serve_app.protocols.action_routes import PostRoute, post_routes
 from rlservo.serve_app.protocols.fastapi_routes import add_route
 from rlservo.serve_app.protocols.http_endpoint import HttpEndpoint
+from rlservo.serve_app.protocols.http_errors import too_large
 from rlservo.serve_app.protocols.json_messages import parse_json
 from rlservo.serve_app.protocols.oip_infer import (
     InferReply,
@@ -27,6 +28,7 @@ from rlservo.serve_app.protocols.oip_infer import (
 )
 from rlservo.serve_app.protocols.oip_tensors import datatype_of, parse_flag
 from rlservo.serve_app.server.api_keys import Access
+from rlservo.serve_app.server.content_bounds import SMALL
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.listing import states_of
 
@@ -143,6 +145,8 @@ def _add_models(app: FastAPI, core: Core) -> None:
     )
     async def index(request: Request) -> Response:
         body = await request.body()
+        if len(body) > SMALL:
+            raise too_large(SMALL)
         ready = False
         if body:
             document, _ = parse_json(body, such_as='{"ready": true}')

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rlservo.export.contract.errors import ObservationError, RequestError
 from rlservo.serve_app.protocols.json_messages import json_type
 from rlservo.serve_app.runtime.elements import NUMBER_KINDS, find_unfit, to_array
+from rlservo.serve_app.runtime.observation_error_text import describe, first_non_number
 
 DTYPES: dict[str, np.dtype[Any]] = {
     "BOOL": np.dtype("?"),
@@ -61,9 +62,9 @@ def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDAr
     if type(name) is not str:
         raise RequestError(f"an input's 'name' must be a string, got {json_type(name)}")
     label = name[:64]
-    unknown = sorted(document.keys() - TENSOR_FIELDS)
-    if unknown:
-        raise RequestError(f"input '{label}' has the unknown field '{unknown[0][:64]}': known are name, shape, ...")
+    unknown = next((field for field in document if field not in TENSOR_FIELDS), None)
+    if unknown is not None:
+        raise RequestError(f"input '{label}' has the unknown field '{unknown[:64]}': known are name, shape, ...")
     parameters = document.get("parameters") or {}
     if type(parameters) is not dict:
         raise RequestError(f"input '{label}': 'parameters' must be an object, got {json_type(parameters)}")
@@ -132,7 +133,9 @@ def _from_json(label: str, data: Any, shape: tuple[int, ...], dtype: np.dtype[An
     if array.size == 0:
         array = array.astype(dtype)
     if array.dtype.kind not in NUMBER_KINDS:
-        raise ObservationError(f"input '{label}': 'data' holds {_first_other(data)}, not only numbers")
+        found = first_non_number(data, ())
+        other = describe(found[1]) if found is not None else f"values of dtype {array.dtype}"
+        raise ObservationError(f"input '{label}': 'data' holds {other}, not only numbers")
     if array.shape != shape and not (array.ndim == 1 and array.size == math.prod(shape)):
         raise ObservationError(
             f"input '{label}': 'data' has the shape {list(array.shape)}, and 'shape' says {list(shape)}",
@@ -155,18 +158,6 @@ def as_datatype(label: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArra
         raise ObservationError(f"input '{label}': {array[unfit[0]].flat[0]} is {unfit[1]}")
     with np.errstate(over="ignore"):  # what becomes an infinity is refused with the observation, element and all
         return array.astype(dtype)
-
-
-def _first_other(data: Any) -> str:
-    """Describe the first leaf that is no number."""
-    for item in data:
-        if type(item) is list:
-            found = _first_other(item)
-            if found:
-                return found
-        elif type(item) not in (int, float, bool) or (type(item) is int and not -(2**63) <= item < 2**64):
-            return "an integer of more than 64 bits" if type(item) is int else json_type(item)
-    return ""
 
 
 def write_tensor(name: str, array: NDArray[Any], *, binary: bool) -> tuple[dict[str, Any], bytes]:

@@ -252,8 +252,9 @@ class LeafParser:
         )
 
     def _refuse_names(self, obs: Mapping[str, Any]) -> NoReturn:
+        known = set(self._names)
         missing = [name for name in self._names if name not in obs]
-        unknown = [str(name) for name in obs if name not in self._names]
+        unknown = [str(name) for name in obs if name not in known]
         parts = [f"missing {list_names(missing)}"] if missing else []
         parts += [f"unknown {list_names(unknown)}"] if unknown else []
         raise ObservationError(

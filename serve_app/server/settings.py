@@ -33,7 +33,8 @@ class ServerSettings(BaseModel):
     """onnxruntime threads per session; one is fastest for networks of kilobytes and keeps concurrent requests apart."""
 
     max_body_bytes: int = Field(4 << 20, ge=1024)
-    """A larger request body is refused with 413 before it is read to the end."""
+    """A larger request body is refused with 413 before it is read to the end; so is, unparsed, a request for actions
+    that is larger than `max_batch` observations of its policy can need."""
 
     max_batch: int = Field(4096, ge=1)
     """More observations in one request are refused with 413: the event loop computes a batch in one go."""

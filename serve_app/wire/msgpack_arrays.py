@@ -8,14 +8,14 @@ observation is taken for one. Source: github.com/Physical-Intelligence/openpi, p
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import ObservationError, RequestError
+from rlservo.export.contract.errors import ObservationError, RequestError, TooLargeError
 
 KINDS = ("b1", "u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f2", "f4", "f8")  # numbers; no objects, no records
 DTYPES = {order + kind: np.dtype(order + kind) for kind in KINDS for order in ("<", ">", "|", "=", "")}
@@ -28,13 +28,15 @@ def pack(document: Mapping[str, Any]) -> bytes:
     return bytes(packed)
 
 
-def unpack(content: bytes) -> Any:
+def unpack(content: bytes, *, most: int | None = None) -> Any:
     """Return the document in `content`, with arrays in it as numpy's (not writable: they are the message's memory).
 
-    Raises RequestError when it is not msgpack, ObservationError when an array in it does not add up.
+    Raises RequestError when it is not msgpack, ObservationError when an array in it does not add up, TooLargeError for
+    more than `most` lists, maps and entries of them.
     """
+    hooks = {"object_hook": _unpack_array} if most is None else _counting_hooks(most)
     try:
-        return msgpack.unpackb(content, object_hook=_unpack_array, strict_map_key=True)
+        return msgpack.unpackb(content, strict_map_key=True, **hooks)
     except (ValueError, TypeError, msgpack.exceptions.UnpackException, RecursionError) as error:
         raise RequestError(f"the message is not msgpack: {str(error)[:200] or type(error).__name__}") from None
 
@@ -61,6 +63,20 @@ def _unpack_array(document: dict[Any, Any]) -> Any:
             raise ObservationError(f"a numpy scalar in the message holds a {type(value).__name__}, not a number")
         return value
     return document
+
+
+def _counting_hooks(most: int) -> dict[str, Callable[[Any], Any]]:
+    """Return what is called for every map and list, and raises TooLargeError after `most` of what they hold."""
+    left = most
+
+    def count(value: Any) -> Any:
+        nonlocal left
+        left -= 1 + len(value)
+        if left < 0:
+            raise TooLargeError(f"the message holds more than {most} values: more than its policy can need")
+        return value
+
+    return {"list_hook": count, "object_hook": lambda document: _unpack_array(count(document))}
 
 
 def _are_sizes(shape: list[Any]) -> bool:

@@ -1,0 +1,120 @@
+"""Bounds of a request's content by what `max_batch` observations of its policy need, held before anything is parsed.
+
+A few megabytes of `[]` or of unknown fields take a parser seconds in which nothing else is answered. What separates
+values in JSON is counted in a millisecond.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import orjson
+
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import TooLargeError
+from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec, leaf_specs
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.versions.policy_store import PolicyStore
+
+SMALL = 1 << 14  # [bytes] content up to which no parser takes long
+SPARE = 1000  # values beside observations and states: options, tensors, names
+SPARE_BYTES = 1 << 16
+NUMBER_BYTES = 64  # of a number's text, with what separates and indents it
+LENGTH, ARRAYS = b"length", b"arrays"
+ARRAY_VALUES = 12  # of a map that is an array
+MARKS = {b",": "values", b"[": "lists", b"{": "maps", b":": "fields"}  # before each one, but for a list's first value
+
+
+@dataclass(frozen=True, slots=True)
+class ContentBounds:
+    """The most that one policy's content may hold."""
+
+    content_bytes: int
+    values: int
+    """Entries of lists and maps, and these once more, in msgpack, where arrays are maps."""
+    counts: Mapping[bytes, int]
+    """How often each of MARKS may stand in JSON."""
+    densities: Mapping[bytes, float]
+    """How often it may stand there per byte: small bodies of large observations have few lists, too."""
+
+    @classmethod
+    def of(cls, contract: Contract, max_batch: int) -> ContentBounds:
+        """Return the bounds for `max_batch` observations with all that can come with each."""
+        parts = [_need_of(contract.observation_space), _need_of(contract.action_space), _need_of_array(())]
+        parts += [_need_of_array(state.shape) for state in contract.state]
+        row = sum(parts, Counter[bytes]())
+        names = [
+            element.name for leaf in leaf_specs(contract.observation_space, "").values() for element in leaf.elements
+        ]
+        named = orjson.dumps(dict.fromkeys(names, 0))  # a batch may be a map from each name to a list
+        return cls(
+            SPARE_BYTES + len(named) + max_batch * (row[LENGTH] + NUMBER_BYTES * row[b","]),
+            SPARE
+            + len(names)
+            + max_batch * (row[b","] + row[b":"] + 2 * row[b"["] + 2 * row[b"{"] + ARRAY_VALUES * row[ARRAYS]),
+            {mark: SPARE + named.count(mark) + max_batch * row[mark] for mark in MARKS},
+            {mark: max(part[mark] / part[LENGTH] for part in parts) for mark in (b"[", b"{")},
+        )
+
+    def exceeded_by(self, content: bytes) -> str:
+        """Return what JSON holds more of than can be needed, '' where it holds no more."""
+        for mark, most in self.counts.items():
+            most = min(most, SPARE + int(self.densities.get(mark, 1.0) * len(content)))
+            if content.count(mark) > most:
+                return f"{most} {MARKS[mark]}"
+        return ""
+
+
+_bounds: WeakKeyDictionary[Policy, ContentBounds] = WeakKeyDictionary()
+
+
+def check_length(store: PolicyStore, name: str, content: Any, max_batch: int) -> list[ContentBounds]:
+    """Return the bounds of a policy's versions, of which a session or a state may be with any.
+
+    Raises TooLargeError where content is longer than `max_batch` observations of each need, and UnknownPolicyError.
+    """
+    policies = [store.get(name, version) for version in store.versions(name)]
+    for policy in policies:
+        if policy not in _bounds:
+            _bounds[policy] = ContentBounds.of(policy.contract, max_batch)
+    bounds = [_bounds[policy] for policy in policies]
+    most = max(each.content_bytes for each in bounds)
+    if len(content) > most:
+        raise _too_large(name, f"{most} bytes", max_batch)
+    return bounds
+
+
+def check_json(store: PolicyStore, name: str, content: Any, max_batch: int) -> None:
+    """Raise TooLargeError where JSON holds more than `max_batch` observations of any version need."""
+    text = bytes(content)
+    exceeded = [each.exceeded_by(text) for each in check_length(store, name, text, max_batch)]
+    if all(exceeded):
+        raise _too_large(name, exceeded[-1], max_batch)
+
+
+def _too_large(name: str, what: str, max_batch: int) -> TooLargeError:
+    return TooLargeError(
+        f"the request holds more than {what}: {max_batch} observations of policy '{name}' need fewer",
+        {"policy": name, "max_batch": max_batch},
+    )
+
+
+def _need_of(space: SpaceSpec) -> Counter[bytes]:
+    """Return how often each of MARKS stands in a value's shortest JSON and a comma behind it, and its LENGTH."""
+    if isinstance(space, DictSpec):
+        text = sum(len(key) + len('"":') for key in space.spaces)
+        own = Counter({b"{": 1, b":": len(space.spaces), b",": 1, LENGTH: text + len("{},")})
+        return sum(map(_need_of, space.spaces.values()), own)
+    if isinstance(space, TupleSpec):
+        return sum(map(_need_of, space.spaces), Counter({b"[": 1, b",": 1, LENGTH: len("[],")}))
+    return _need_of_array(space.shape)
+
+
+def _need_of_array(shape: Sequence[int]) -> Counter[bytes]:
+    numbers, lists = math.prod(shape), sum(math.prod(shape[:axis]) for axis in range(len(shape)))
+    return Counter({b",": numbers, b"[": lists, LENGTH: 2 * numbers + 2 * lists, ARRAYS: 1 + len(shape)})
