@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +38,11 @@ ONNX_TYPES = {
 LARGEST_MADE = 32 << 20
 """[bytes] of a graph that is made anew without its value head: nobody acts meanwhile, 0.6 ms for each megabyte."""
 
-Run = Callable[[Sequence[str], dict[str, NDArray[Any]]], Any]
+PROOF_S = 10.0
+"""[s] for the golden vectors, of which a policy's network computes thousands in a second: a graph can have loops."""
+
+Run = Callable[..., Any]
+"""onnxruntime's: output names, inputs by name and, if need be, its options, to arrays."""
 
 
 def check_contract(bundle: Bundle) -> None:
@@ -191,7 +196,9 @@ def check_golden_vectors(bundle: Bundle, run: Run, names: Sequence[str]) -> None
         raise BundleError(f"{bundle.path / GOLDEN_FILE} holds no samples of {', '.join(sorted(missing)) or 'a tensor'}")
     feed = {tensor.name: inputs[tensor.name] for tensor in bundle.contract.inputs}
     try:
-        computed = dict(zip(names, run(names, feed), strict=True))
+        computed = dict(zip(names, _run_in_time(bundle, run, names, feed), strict=True))
+    except BundleError:
+        raise
     except Exception as error:  # onnxruntime's own exceptions share no base but Exception
         raise BundleError(
             f"{bundle.path}: the graph does not run on its golden vectors: {first_line(error)}"
@@ -203,15 +210,39 @@ def check_golden_vectors(bundle: Bundle, run: Run, names: Sequence[str]) -> None
     logger.debug("%s: %d golden vectors reproduced", bundle.path, len(next(iter(recorded.values()))))
 
 
+def _run_in_time(bundle: Bundle, run: Run, names: Sequence[str], feed: dict[str, NDArray[Any]]) -> Sequence[Any]:
+    """Compute, or raise BundleError after PROOF_S: onnxruntime ends before the next operator, or turn of a loop."""
+    import onnxruntime
+
+    options = onnxruntime.RunOptions()
+    options.log_severity_level = 4  # what goes wrong arrives as an exception
+    end = threading.Timer(PROOF_S, setattr, (options, "terminate", True))
+    end.daemon = True
+    end.start()
+    try:
+        return run(names, feed, options)  # type: ignore[no-any-return]
+    except Exception:
+        if not options.terminate:
+            raise
+        raise BundleError(
+            f"{bundle.path}: the graph did not come to an end within {PROOF_S:g} s on its golden vectors"
+        ) from None
+    finally:
+        end.cancel()
+
+
 def check_rows(bundle: Bundle, run: Run) -> None:
     """Refuse to compute observations together where that is something else than one by one. Raises BundleError."""
     inputs, _ = bundle.golden()
     names = acting_outputs(bundle.contract)
     rows = {tensor.name: np.resize(inputs[tensor.name], (3, *inputs[tensor.name].shape[1:]))
             for tensor in bundle.contract.inputs}  # fmt: skip
-    one_by_one = [run(names, {name: array[row : row + 1] for name, array in rows.items()}) for row in range(3)]
     try:
-        together = dict(zip(names, run(names, rows), strict=True))
+        one_by_one = [
+            _run_in_time(bundle, run, names, {name: array[row : row + 1] for name, array in rows.items()})
+            for row in range(3)
+        ]
+        together = dict(zip(names, _run_in_time(bundle, run, names, rows), strict=True))
         singly = {name: np.concatenate([each[index] for each in one_by_one]) for index, name in enumerate(names)}
         for name in names:
             _compare(bundle, name, together, singly, GOLDEN_RTOL, GOLDEN_ATOL)

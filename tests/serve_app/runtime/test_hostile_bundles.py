@@ -229,6 +229,56 @@ def test_a_contract_that_asks_for_all_the_memory_is_refused(root: Path, rewrite_
         Policy.load(folder)
 
 
+LOOP = """import sys, time
+from rlservo.export.contract.errors import BundleError
+from rlservo.serve_app.runtime import loading
+from rlservo.serve_app.runtime.policy import Policy
+loading.PROOF_S = 0.5
+try:
+    Policy.load(sys.argv[1])
+except BundleError as error:
+    print(error)
+time.sleep(0.3)
+began = time.process_time()
+time.sleep(1.0)
+print("%.2f" % (time.process_time() - began))
+"""
+
+
+def test_a_graph_that_does_not_come_to_an_end_is_given_up_and_computes_no_further(
+    box_policy: Callable[..., Path], tmp_path: Path
+) -> None:
+    folder = box_policy(tmp_path)
+    model = onnx.load(folder / bundle_files.ONNX_FILE)
+    tensors = {"value": onnx.TensorProto.FLOAT, "go_on": onnx.TensorProto.BOOL, "turn": onnx.TensorProto.INT64}
+    infos = {
+        name + end: helper.make_tensor_value_info(name + end, kind, None if name == "value" else [])
+        for name, kind in tensors.items()
+        for end in ("", "_out")
+    }
+    body = helper.make_graph(
+        [
+            helper.make_node("Identity", ["go_on"], ["go_on_out"]),
+            helper.make_node("Abs", ["value"], ["value_out"]),
+        ],
+        "body",
+        [infos["turn"], infos["go_on"], infos["value"]],
+        [infos["go_on_out"], infos["value_out"]],
+    )
+    turns = numpy_helper.from_array(np.array(2**60), "turns")
+    always = numpy_helper.from_array(np.array(True), "always")
+    model.graph.initializer.extend([turns, always])
+    model.graph.node.insert(0, helper.make_node("Loop", ["turns", "always", "obs"], ["looped"], body=body))
+    gemm = next(node for node in model.graph.node if node.op_type == "Gemm")
+    gemm.input[0] = "looped"
+    onnx.save(model, folder / bundle_files.ONNX_FILE)
+    bundle_files.write_contract(folder, read_contract(folder))  # with the hashes of what is there now
+    done = subprocess.run([sys.executable, "-c", LOOP, folder], capture_output=True, text=True, timeout=120)
+    sentence, busy = done.stdout.splitlines()
+    assert "did not come to an end within 0.5 s" in sentence, done.stderr
+    assert float(busy) < 0.5 and not done.stderr
+
+
 @pytest.mark.parametrize("name", ["policy.onnx", "golden.npz"])
 def test_what_is_loaded_is_what_was_hashed(root: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = root / "ur5" / "2"
