@@ -23,20 +23,33 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+ESCAPES = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"}
+"""Control characters, which a bundle's or a policy's names may hold, as they are shown."""
+
+
+def _console(*, stderr: bool) -> Console:
+    """Return a console that shows the control characters of what it prints instead of sending them."""
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.segment import Segment
+
+    class EscapingConsole(Console):
+        def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+            for segment in super().render(renderable, options):
+                yield segment if segment.control else Segment(segment.text.translate(ESCAPES), segment.style)
+
+    return EscapingConsole(stderr=stderr)
+
+
 @cache
 def output() -> Console:
     """Return the console for results."""
-    from rich.console import Console
-
-    return Console()
+    return _console(stderr=False)
 
 
 @cache
 def errors() -> Console:
     """Return the console for errors, progress and notes, which a program that reads our output should not see."""
-    from rich.console import Console
-
-    return Console(stderr=True)
+    return _console(stderr=True)
 
 
 @contextmanager

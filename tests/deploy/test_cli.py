@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ import pytest
 
 from command_line import rlservo, rlservo_here
 from rlservo.deploy.serve_commands import parse_env_arguments
-from rlservo.export.contract.bundle import load_bundle
+from rlservo.export.contract.bundle import load_bundle, read_contract
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.spaces import BoxSpec, Element
 from rlservo.serve_app.runtime.policy import Policy
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,6 +104,20 @@ def test_inspect_shows_names_units_and_proof(policies: Path) -> None:
         assert text in done.stdout
     document = json.loads(rlservo_here("inspect", policies, "--json").stdout)
     assert document["name"] == "ur5"
+
+
+def test_control_characters_of_names_do_not_reach_the_terminal(
+    box_policy: Callable[..., Path], rewrite_contract: Callable[..., None], tmp_path: Path
+) -> None:
+    bundle = box_policy(tmp_path)
+    space = read_contract(bundle).observation_space
+    assert isinstance(space, BoxSpec)
+    first = Element(name="\x1b]0;owned\x07\x1b[2J\x9b31m", unit="rad\x1b[8m")
+    elements = (first, *space.elements[1:])
+    rewrite_contract(bundle, observation_space=space.model_copy(update={"elements": elements}))
+    shown = rlservo_here("inspect", bundle).stdout
+    assert "\\x1b]0;owned" in shown
+    assert not set(shown) & {chr(code) for code in (*range(10), *range(11, 32), *range(127, 160))}
 
 
 def test_verify_proves_the_bundle_again(policies: Path) -> None:
