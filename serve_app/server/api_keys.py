@@ -34,6 +34,7 @@ LINE = re.compile(
     r"(?:\s+rate=(?P<rate>[0-9]{1,6}(?:\.[0-9]{1,3})?)(?:\s+burst=(?P<burst>[1-9][0-9]{0,5}))?)?"
 )
 KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets can tell what they found
+A_KEY = re.compile(re.escape(KEY_PREFIX) + r"[A-Za-z0-9_-]{16,}")
 KEY_BYTES = 32
 LONGEST_FILE = 1 << 20  # [bytes] of the key file: some ten thousand keys
 SCHEMES = (b"bearer", b"api-key")  # the second is what openpi's clients say
@@ -144,6 +145,11 @@ class Keys:
             )
         digest = settings.operator_key.removeprefix("sha256:")
         return cls(tuple(keys), Key("operator", Role.admin, bytes.fromhex(digest)) if digest else None)
+
+
+def without_keys(text: str) -> str:
+    """Return a client's text with dots in place of the keys in it."""
+    return A_KEY.sub(f"{KEY_PREFIX}...", text)
 
 
 def new_key(label: str, *, admin: bool = False, rate: float | None = None, burst: int | None = None) -> tuple[str, str]:

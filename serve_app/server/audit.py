@@ -5,18 +5,16 @@ Lines go to the logger `rlservo.administration`, whatever the log's level is, an
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Any
 
-from rlservo.serve_app.server.api_keys import KEY_PREFIX
+from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.request_log import FIELDS, LONGEST_ID, administration
 
 AUDIT = "rlservo.audit"  # in a connection's scope: its entry
 OK = "ok"
 UNANSWERED = "unanswered"  # its client went, or the replica ended: a change may or may not have been made
 LONGEST = 256  # characters of what a client chose
-A_KEY = re.compile(re.escape(KEY_PREFIX) + r"[A-Za-z0-9_-]{16,}")
 
 
 @dataclass
@@ -63,4 +61,4 @@ class AuditEntry:
 
 def _safe(text: str) -> str:
     """Return a client's text, shortened; who sends a key in the wrong place does not find it in the log."""
-    return A_KEY.sub(f"{KEY_PREFIX}...", text[:LONGEST])
+    return without_keys(text[:LONGEST])

@@ -14,6 +14,7 @@ from typing import Any
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision
 
@@ -120,4 +121,4 @@ def _fields(request: Request, policy: str, version: str | None, code: str, secon
 
 
 def _shorten(request_id: str | None) -> str | None:
-    return request_id and request_id[:LONGEST_ID]
+    return request_id and without_keys(request_id[:LONGEST_ID])

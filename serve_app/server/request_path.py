@@ -31,9 +31,10 @@ from rlservo.export.contract.errors import (
     UnavailableError,
 )
 from rlservo.serve_app.episodes.episodes import Episodes
-from rlservo.serve_app.episodes.request import Request, check_deadline
+from rlservo.serve_app.episodes.request import Episode, Request, check_deadline
 from rlservo.serve_app.episodes.sessions import Session
 from rlservo.serve_app.runtime.network_memory import NetworkDroppedError
+from rlservo.serve_app.server.api_keys import A_KEY
 from rlservo.serve_app.server.loop_clock import LoopClock
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
 from rlservo.serve_app.server.request_metrics import Metrics
@@ -180,6 +181,8 @@ class RequestPath:
             self._admit(request)
             self.store()  # not ready comes before any fault of the request
             codec.parse(request, content)
+            if request.label is not None or request.episode is not None:
+                _check_names(request)
             if request.non_finite:
                 decision = await self._decide_non_finite(request)
             else:
@@ -377,6 +380,16 @@ class RequestPath:
         rows = count_rows(store.get(request.policy, request.version).contract.observation_space, request.obs)
         if rows > self._max_batch:
             raise TooLargeError(f"a batch of {rows} observations is too large: at most {self._max_batch}")
+
+
+def _check_names(request: Request) -> None:
+    """Refuse a key where an episode's name or end belongs: recordings, metrics and logs would have it."""
+    episode = request.episode or Episode()
+    said = {"x-session-id": request.label, "session_id": episode.session_id, "final_status": episode.final_status}
+    for name, text in said.items():
+        if type(text) is str and A_KEY.search(text):
+            request.label = request.episode = None
+            raise RequestError(f"'{name}' holds an API key, which would be recorded: send a name of your own")
 
 
 def _check_again(request: Request, since: float, limit_s: float) -> None:

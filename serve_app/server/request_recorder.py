@@ -25,6 +25,7 @@ from rlservo.serve_app.episodes.request import Episode, Request, shorten_label
 from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
 from rlservo.serve_app.runtime.exploration import Draw
 from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.row_count import count_rows
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
@@ -199,7 +200,7 @@ def _session_of(request: Request) -> str | None:
 
 
 def _request_id(request: Request) -> str | None:
-    return None if request.request_id is None else request.request_id[:LONGEST_REQUEST_ID]
+    return None if request.request_id is None else without_keys(request.request_id[:LONGEST_REQUEST_ID])
 
 
 def _numbers(reward: Any, rows: int) -> NDArray[np.float64] | None:

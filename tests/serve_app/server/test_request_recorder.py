@@ -28,6 +28,7 @@ from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.replay.replay import replay
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server import request_recorder
+from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.request_recorder import RequestRecorder
 from rlservo.serve_app.server.settings import ServerSettings
@@ -455,3 +456,28 @@ def test_limits_that_count_from_an_altered_state_replay(start: Callable[..., Ser
     assert len(episode) == 5
     report = replay(Recording(server.folder), ur5)
     assert (report.compared, report.identical, report.changed) == (5, 5, 0)
+
+
+def test_a_key_in_the_place_of_a_name_is_refused_and_in_no_recording(
+    start: Callable[..., Server], caplog: pytest.LogCaptureFixture
+) -> None:
+    server, (key, _) = start(log_requests=True), new_key("robot")
+    caplog.set_level("INFO", "rlservo")
+    obs = {"obs": arms(1)[0]}
+    for body in ({"session_id": key, "reset": True}, {"session_id": f"cell {key}", "reset": True}):
+        status, reply = server.act("lstm_box", {**obs, **body})
+        assert status == 400 and "'session_id' holds an API key" in reply["error"] and key not in reply["error"]
+    body = {"inputs": [{"name": "obs", "shape": [1, 3], "datatype": "FP32", "data": obs["obs"]}]}
+    status, reply = server.post(
+        "/v2/models/lstm_box/infer", {**body, "parameters": {"sequence_id": key, "sequence_start": True}}
+    )
+    assert status == 400 and "API key" in reply["error"]
+    arm = {"obs": [0.0] * 27}
+    assert server.act("ur5", arm, **{"x-session-id": key})[0] == 400
+    assert server.act("ur5", {**arm, "session_id": "cell", "final_status": key})[0] == 400
+    assert server.act("ur5", arm, **{"x-request-id": key})[0] == 200
+    assert server.act("lstm_box", {**obs, "session_id": "cell-7", "reset": True})[0] == 200
+    assert [episode.id for episode in server.recorded()] == ["", "cell-7"]
+    assert server.recorder.recorder.dropped == 0
+    assert all(key.encode() not in file.read_bytes() for file in server.folder.iterdir())
+    assert caplog.records and all(key not in str(record.__dict__) for record in caplog.records)
