@@ -1,6 +1,7 @@
 """MessagePack as openpi's policy server speaks it: frame to `Request`, decision to a frame.
 
 A request is `{"obs": ...}` with the JSON protocol's options, or the observation map itself, from element name to value.
+What openpi's clients send beside observations (`prompt`) is taken and ignored, unless it is an element's name.
 `actions` in the reply is a chunk of one action, `(1, ...)`, as openpi's clients expect; a batch of observations gets
 one chunk each.
 """
@@ -22,6 +23,9 @@ from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.reply import reply_fields
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+
+IGNORED = frozenset({"prompt", "env_id"})
+"""What openpi's clients send for policies that read a task, or act for several robots; without effect here."""
 
 
 class MsgpackCodec:
@@ -47,6 +51,8 @@ class MsgpackCodec:
 
     def parse(self, request: Request, content: Mapping[Any, Any]) -> None:
         """Fill the request. Raises RequestError."""
+        if not IGNORED.isdisjoint(content):
+            content = {key: value for key, value in content.items() if key not in IGNORED or self._names(request, key)}
         if "obs" not in content:  # element names and values
             request.obs = content
             if type(content.get("reset")) is bool and not self._names(request, "reset"):
@@ -90,6 +96,7 @@ def encode_metadata(contract: Contract) -> bytes:
             "policy": contract.name,
             "version": contract.version,
             "control_rate_hz": contract.control_rate_hz,
+            "action_horizon": 1,  # steps in a chunk, as `actions` of a reply are
             "contract": contract.model_dump(mode="json"),
         }
     )

@@ -2,7 +2,8 @@
 
 An array is `{b"__ndarray__": True, b"data": bytes, b"dtype": dtype.str, b"shape": shape}`, a numpy scalar
 `{b"__npgeneric__": True, b"data": item, b"dtype": dtype.str}`; the marker keys are bytes, so that no name of an
-observation is taken for one. Source: github.com/Physical-Intelligence/openpi, packages/openpi-client.
+observation is taken for one. Source: github.com/Physical-Intelligence/openpi, packages/openpi-client. Arrays are also
+read, not written, as PyPI's msgpack-numpy writes them (github.com/lebedov/msgpack-numpy).
 """
 
 from __future__ import annotations
@@ -57,6 +58,8 @@ def _pack_array(value: Any) -> dict[bytes, Any]:
 def _unpack_array(document: dict[Any, Any]) -> Any:
     if b"__ndarray__" in document:
         return _array(document)
+    if b"nd" in document and b"type" in document:
+        return _array_of_msgpack_numpy(document)
     if b"__npgeneric__" in document:
         value = document.get(b"data")
         if not isinstance(value, bool | int | float):
@@ -84,6 +87,14 @@ def _are_sizes(shape: list[Any]) -> bool:
         if type(size) is not int or not 0 <= size < 2**31:
             return False
     return True
+
+
+def _array_of_msgpack_numpy(document: Mapping[Any, Any]) -> NDArray[Any]:
+    kind = document.get(b"kind", b"")
+    if kind not in (b"", ""):  # records, and pickled objects
+        raise ObservationError(f"an array in the message, by msgpack-numpy, is of kind {kind!r:.16}: send numbers")
+    shape = document.get(b"shape") if document[b"nd"] is True else []  # a scalar has none
+    return _array({b"data": document.get(b"data"), b"dtype": document[b"type"], b"shape": shape})
 
 
 def _array(document: Mapping[Any, Any]) -> NDArray[Any]:

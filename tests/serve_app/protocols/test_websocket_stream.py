@@ -149,6 +149,46 @@ def test_observations_come_as_named_elements_lists_batches_and_other_dtypes(port
         np.testing.assert_array_equal(actions[:, 0], expected(store, batch))
 
 
+def test_what_openpis_examples_send_beside_observations_is_ignored(port: int, store: PolicyStore) -> None:
+    named = {f"element_{i}": value for i, value in enumerate(OBS)}
+    beside = {"prompt": "pick up the block", "env_id": 3}
+    with OpenpiClient(port) as client:
+        assert client.metadata["action_horizon"] == 1
+        for request in ({"obs": OBS, **beside}, {"obs": named, **beside, "seq": 1}, {**named, **beside, "reset": True}):
+            np.testing.assert_array_equal(client.infer(request)["actions"][0], expected(store))
+    with OpenpiClient(port) as client, pytest.raises(RuntimeError, match="unknown 'language'"):
+        client.infer({**named, "language": "pick up the block"})
+
+
+def as_msgpack_numpy(array: Any, **changes: Any) -> dict[bytes, Any]:
+    """Return an array as PyPI's msgpack-numpy 0.4.8 packs it."""
+    document = {b"nd": True, b"type": array.dtype.str, b"kind": b"", b"shape": array.shape, b"data": array.tobytes()}
+    return {**document, **{key.encode(): value for key, value in changes.items()}}
+
+
+def test_arrays_of_msgpack_numpy_are_read_as_data(port: int, store: PolicyStore) -> None:
+    with OpenpiClient(port) as client:
+        reply = client.infer({"obs": as_msgpack_numpy(OBS)})
+        np.testing.assert_array_equal(reply["actions"][0], expected(store))
+        named = {
+            f"element_{i}": {b"nd": False, b"type": "<f4", b"data": value.tobytes()} for i, value in enumerate(OBS)
+        }
+        np.testing.assert_array_equal(client.infer({"obs": named})["actions"][0], expected(store))
+    for changes in ({"kind": b"O"}, {"kind": b"V"}, {"type": "|O"}, {"type": 7}, {"shape": [28]}, {"data": "x"}):
+        with OpenpiClient(port) as client, pytest.raises(RuntimeError, match="an array in the message"):
+            client.infer({"obs": as_msgpack_numpy(OBS, **changes)})
+
+
+def test_a_message_beyond_what_a_connection_takes_is_told_by_a_close_code(port: int) -> None:
+    with websockets.sync.client.connect(f"ws://127.0.0.1:{port}/", compression=None) as socket:
+        socket.recv()
+        with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
+            for _ in range(2):
+                socket.send(b"\0" * (17 << 20))
+                socket.recv()
+        assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
+
+
 def test_a_reset_is_taken_where_nothing_is_remembered(port: int, store: PolicyStore) -> None:
     named = {f"element_{i}": value for i, value in enumerate(OBS)}
     with OpenpiClient(port) as client:
