@@ -7,6 +7,7 @@ sentences name what a robot's programmer got wrong.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -142,15 +143,25 @@ def encode_json(document: Mapping[str, Any]) -> bytes:
 
 
 def _parse_lenient(body: bytes, error: orjson.JSONDecodeError, such_as: str) -> Any:
-    """Parse what only Python's own parser takes: NaN, Infinity and numbers too large for a double.
+    """Parse NaN, Infinity and numbers too large for a double, which Python's own parser takes.
 
-    A policy's client that sends them has a broken sensor or a division by zero; "invalid JSON" would not help it.
+    A policy's client that sends them has a broken sensor or a division by zero; "invalid JSON" would not help it. What
+    else Python's parser takes (half a surrogate pair) is no JSON.
     """
+    non_finite = False
+
+    def number(text: str) -> int | float:
+        nonlocal non_finite
+        non_finite = non_finite or not math.isfinite(float(text))
+        return int(text) if text.lstrip("-").isdigit() else float(text)
+
     if len(body) <= LONGEST_LENIENT_BODY:
         try:
-            return json.loads(body)
+            document = json.loads(body, parse_float=number, parse_int=number, parse_constant=number)
         except (ValueError, RecursionError):
-            pass
+            document = None
+        if non_finite and document is not None:
+            return document
     if not body.strip():
         raise RequestError(f"the request body is empty: send a JSON object such as {such_as}") from error
     raise RequestError(f"the request body is not JSON: {error}") from error

@@ -151,6 +151,8 @@ def test_exploring_is_repeatable_by_seed(ask: Ask) -> None:
         (b"", 400, "bad-request", "the request body is empty"),
         (b"{", 400, "bad-request", "the request body is not JSON"),
         (b"[" * 10_000, 400, "bad-request", "not JSON"),
+        (b'{"obs": [1], "session_id": "\\ud800"}', 400, "bad-request", "not JSON: no low surrogate in string"),
+        (b'{"obs": "\\ud800"}', 400, "bad-request", "not JSON: no low surrogate in string"),
         (b"[" * 100_000, 413, "too-large", "more than 1128 lists"),
         ({"obs": [OBS] * 65}, 413, "too-large", "at most 64"),
         (b" " * 200_001, 413, "too-large", "larger than 200000 bytes"),
