@@ -52,6 +52,7 @@ def create_app(
         is_behind_serve=is_behind_serve,
         title="rlservo",
         description=DESCRIPTION,
+        servers=[{"url": "."}],  # the paths are beside the document, under whatever prefix a proxy takes off
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,

@@ -68,7 +68,13 @@ def add_docs(app: FastAPI) -> None:
 
     def openapi() -> dict[str, Any]:
         if app.openapi_schema is None:
-            document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+            document = get_openapi(
+                title=app.title,
+                version=app.version,
+                description=app.description,
+                routes=app.routes,
+                servers=app.servers,
+            )
             app.openapi_schema = {**to_openapi_30(document), "openapi": OPENAPI_VERSION}
         return app.openapi_schema
 

@@ -7,7 +7,9 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
+from urllib.parse import urljoin
 
+import httpx
 import pytest
 
 from browser import Browser
@@ -26,12 +28,41 @@ def test_the_page_names_no_other_host() -> None:
     assert not [address for address in addresses if address.startswith(("/", "http"))]
 
 
-def test_the_documentation_is_drawn_and_tried_out_without_the_internet(
-    browser: Browser, policies: Path, served: Callable[[Any], AbstractContextManager[int]]
+class BehindPrefix:
+    """An application behind a proxy that takes a prefix off and says nothing of it, as nginx does."""
+
+    def __init__(self, app: Any, prefix: str) -> None:
+        self._app, self._prefix = app, prefix
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] != "lifespan":
+            assert scope["path"].startswith(self._prefix)
+            path = scope["path"][len(self._prefix) :]
+            scope = {**scope, "path": path, "raw_path": path.encode()}
+        await self._app(scope, receive, send)
+
+
+@pytest.mark.parametrize("docs", [True, False])
+def test_the_document_says_that_its_paths_are_beside_it(
+    policies: Path, served: Callable[[Any], AbstractContextManager[int]], docs: bool
 ) -> None:
     store = load_store(policies)
-    with served(create_app(lambda: store, ServerSettings())) as port, browser.tab() as tab:
-        tab.visit(f"http://127.0.0.1:{port}/docs")
+    app = create_app(lambda: store, ServerSettings(docs=docs))
+    with served(BehindPrefix(app, "/robots")) as port:
+        address = f"http://127.0.0.1:{port}/robots/openapi.json"
+        (server,) = httpx.get(address, trust_env=False).json()["servers"]
+        url = urljoin(address, server["url"]).rstrip("/") + "/healthz"
+        assert httpx.get(url, trust_env=False).text == "OK"
+
+
+@pytest.mark.parametrize("prefix", ["", "/robots"])
+def test_the_documentation_is_drawn_and_tried_out_without_the_internet(
+    browser: Browser, policies: Path, served: Callable[[Any], AbstractContextManager[int]], prefix: str
+) -> None:
+    store = load_store(policies)
+    app = BehindPrefix(create_app(lambda: store, ServerSettings()), prefix)
+    with served(app) as port, browser.tab() as tab:
+        tab.visit(f"http://127.0.0.1:{port}{prefix}/docs")
         drawn = tab.wait_for(  # what Swagger UI makes of /openapi.json
             "(drawn => drawn.length > 3 && drawn.map(path => path.dataset.path))"
             "([...document.querySelectorAll('[data-path]')])"
@@ -43,7 +74,7 @@ def test_the_documentation_is_drawn_and_tried_out_without_the_internet(
         # A page of the server's own may also ask for actions.
         body = "JSON.stringify({obs: Array(27).fill(0)})"
         act = f"{{method: 'POST', headers: {{'content-type': 'application/json'}}, body: {body}}}"
-        assert tab.evaluate(f"fetch('/v1/policies/ur5/act', {act}).then(reply => reply.status)") == 200
+        assert tab.evaluate(f"fetch('{prefix}/v1/policies/ur5/act', {act}).then(reply => reply.status)") == 200
         asked = {request.url for request in tab.requests.values() if not request.url.startswith("data:")}
         assert {address.split("/")[2] for address in asked} == {f"127.0.0.1:{port}"}
         assert tab.complaints == []  # nothing that it needs is forbidden by its security policy
