@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from rlservo.export.contract.errors import ObservationError, RequestError, RlservoError, UnknownPolicyError, UsageError
 from rlservo.serve_app.episodes.request import Episode, Request, shorten_label
 from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
+from rlservo.serve_app.runtime.elements import parse_array
 from rlservo.serve_app.runtime.exploration import Draw
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import without_keys
@@ -206,8 +207,8 @@ def _request_id(request: Request) -> str | None:
 def _numbers(reward: Any, rows: int) -> NDArray[np.float64] | None:
     """Return a request's reward, or one a row; None for what is none."""
     try:
-        numbers = np.ravel(np.asarray(reward, np.float64))
-    except (ValueError, TypeError, OverflowError):
+        numbers = parse_array(reward, "float64", "the reward").ravel()
+    except RequestError:
         return None
     return numbers if len(numbers) in (1, rows) and np.isfinite(numbers).all() else None
 

@@ -27,6 +27,8 @@ from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_grpc import FIELDS, OipGrpcCodec
 from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.runtime.elements import parse_array
+from rlservo.serve_app.runtime.observations import ObservationParser
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
@@ -242,6 +244,42 @@ def test_a_last_action_is_read_as_an_observation_is(tmp_path: Path, discrete_pol
         value = np.array(2**40 + 10**6, np.int64)
     with pytest.raises(RequestError, match="last_action"):
         policy.step(2, last_action=value)
+
+
+@pytest.mark.parametrize("text", ["1", "\N{ARABIC-INDIC DIGIT THREE}", b"1"])
+def test_digits_in_a_text_are_no_number_wherever_they_are_sent(leaky_policy: Any, tmp_path: Path, text: Any) -> None:
+    policy = Policy.load(leaky_policy(tmp_path))
+    for given in (
+        {"obs": [text, 0, 0]},
+        {"obs": [0, 0, 0], "state": {"h": [text, 0]}},
+        {"obs": [0, 0, 0], "state": {"h": [0, 0]}, "last_action": [text, 0]},
+    ):
+        with pytest.raises((RequestError, ObservationError), match=r"the string|a bytes"):
+            policy.step(given.pop("obs"), **given)  # type: ignore[arg-type]
+    with pytest.raises(RequestError, match=r"the string|a bytes"):
+        parse_array(text, "float32", "the reward")
+
+
+@pytest.mark.parametrize(
+    ("dtype", "sent", "used"),
+    [
+        ("float32", 1e-40, 1e-40),
+        ("float32", 1e-46, 0.0),
+        ("float32", 2**24 + 1, 2.0**24),
+        ("float32", 0.1, 0.1),
+        ("float64", 2**53 + 1, 2.0**53),
+        ("float64", 5e-324, 5e-324),
+        ("float16", 65519.0, 65504.0),
+        ("float16", 6e-8, 6e-8),
+    ],
+)
+def test_a_float_is_the_nearest_one_that_its_space_has(dtype: str, sent: float, used: float) -> None:
+    parser = ObservationParser("p", BoxSpec(shape=(2,), dtype=dtype, low=None, high=None))
+    for obs in ([sent, 1], np.array([sent, 1], np.float64), [[sent, 1], [1, 1]]):
+        found = parser.parse(obs).arrays["obs"]
+        assert found.dtype == dtype and found[0, 0] == np.dtype(dtype).type(used)
+    with pytest.raises(ObservationError, match=r"too large|not a finite"):
+        parser.parse([{"float16": 65520.0, "float32": 3.5e38, "float64": float("inf")}[dtype], 1])
 
 
 def test_clipping_one_element_leaves_the_others_as_they_are(tmp_path: Path, rewrite_contract: Any) -> None:
