@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import socket
 import time
 import traceback
@@ -16,7 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ray.exceptions import RayError
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.callbacks.callbacks import RLlibCallback
 
 FILE = "failures.txt"
 SAMPLED = "num_env_steps_sampled_lifetime"
@@ -25,42 +28,44 @@ TRAINED = "learners/__all_modules__/num_env_steps_trained_lifetime"
 PATIENCE_S, PATIENCE = 180.0, 3  # no step for so long and in so many iterations: the training fails
 MADE_AT_MOST = 100  # environments for one sample, where those that crash are made again
 PRINT_EVERY_S = 10.0  # while more of them fail
+BUILT_S = 60.0  # after an env runner failed to start
+EXCEPTION = re.compile(r"[\w.]+(Error|Exception|Exit): \S")  # a traceback's last line
+LOST = re.compile(r"\), taking actor \d+ out of service\.$")  # what RLlib writes behind one
 HEAD = "--- "  # begins the line that names a failure; its traceback follows
 
 
 def watch(config: AlgorithmConfig, folder: Path) -> None:
-    """Let env runners write their failures into `folder`, and the training fail when nothing is sampled any more."""
+    """Let a training's processes write failures into `folder`; it fails when nothing is sampled any more."""
     file = folder / FILE
-    sampling, evaluating = Drought("sampled", file), Drought("evaluated", file)
-    made = {"environments": 0}  # of each process: callbacks are pickled into it
 
-    def on_environment_created(**_: Any) -> None:
-        _write_errors(file)
-        made["environments"] += 1
-        if made["environments"] > MADE_AT_MOST:
-            raise RuntimeError(f"an environment crashed {MADE_AT_MOST} times without a sample{_last_words(file)}")
+    class Watch(RLlibCallback):
+        """Each process makes its own, before it makes an environment."""
 
-    def on_sample_end(**_: Any) -> None:
-        made["environments"] = 0
+        def __init__(self) -> None:
+            super().__init__()
+            _write_errors(file)
+            self._sampling, self._evaluating = Drought("sampled", file), Drought("evaluated", file)
+            self._made = 0
 
-    def on_evaluate_end(**_: Any) -> None:
-        evaluating.is_due = True
+        def on_environment_created(self, **_: Any) -> None:
+            self._made += 1
+            if self._made > MADE_AT_MOST:
+                raise RuntimeError(f"an environment crashed {MADE_AT_MOST} times without a sample{_last_words(file)}")
 
-    def on_train_result(*, result: dict[str, Any], **_: Any) -> None:
-        sampling.is_due = True
-        sampling.check(metric(result, SAMPLED))
-        evaluating.check(metric(result, EVALUATED))
-        if evaluating.empty:  # RLlib repeats the results of the evaluation before
-            result["evaluation"]["env_runners"] = {}
+        def on_sample_end(self, **_: Any) -> None:
+            self._made = 0
 
-    for name, callback in (
-        ("on_environment_created", on_environment_created),
-        ("on_sample_end", on_sample_end),
-        ("on_evaluate_end", on_evaluate_end),
-        ("on_train_result", on_train_result),
-    ):
-        others = getattr(config, f"callbacks_{name}") or []
-        config.callbacks(**{name: [callback, *(others if isinstance(others, list) else [others])]})
+        def on_evaluate_end(self, **_: Any) -> None:
+            self._evaluating.is_due = True
+
+        def on_train_result(self, *, result: dict[str, Any], **_: Any) -> None:
+            self._sampling.is_due = True
+            self._sampling.check(metric(result, SAMPLED))
+            self._evaluating.check(metric(result, EVALUATED))
+            if self._evaluating.empty:  # RLlib repeats the results of the evaluation before
+                result["evaluation"]["env_runners"] = {}
+
+    config.callbacks(callbacks_class=Watch)
 
 
 def metric(result: Mapping[str, Any], name: str) -> float:
@@ -129,16 +134,15 @@ def read(file: Path) -> tuple[int, str]:
     return len(heads), heads[-1].split(": ", 1)[1] if heads else ""
 
 
-def in_a_line(error: BaseException) -> str:
-    """Return the exception at the root, an environment's own."""
-    root = _root(error)
-    return " ".join(f"{type(root).__name__}: {root}".split())
-
-
-def _root(error: BaseException) -> BaseException:
-    while error.__cause__ is not None:  # RLlib raises a RuntimeError without words from it
-        error = error.__cause__
-    return error
+def in_a_line(error: object) -> str:
+    """Return the exception at the root, an environment's own, of an exception or of a traceback's text."""
+    if isinstance(error, BaseException) and not isinstance(error, RayError):  # whose text is a traceback
+        while error.__cause__ is not None:  # RLlib raises a RuntimeError without words from it
+            error = error.__cause__
+        return " ".join(f"{type(error).__name__}: {error}".split())
+    lines = [line for line in str(error).splitlines() if line and not line.startswith((" ", "\t", "Traceback"))]
+    told = [line for line in lines if EXCEPTION.match(line)]  # RLlib raises some without words
+    return (told or lines or [type(error).__name__])[-1]
 
 
 def _write_errors(file: Path) -> None:
@@ -156,13 +160,19 @@ class _ErrorWriter(logging.Handler):
         super().__init__(logging.ERROR)
         self.set_name(str(file))
         self._file = file
-        self._last: BaseException | None = None
+        self._last = ""
 
     def emit(self, record: logging.LogRecord) -> None:
-        cause = _root(record.exc_info[1]) if record.exc_info and record.exc_info[1] else None
-        if cause is None or cause is self._last:  # it is logged where it is caught, and where the process ends
+        if record.exc_info and record.exc_info[1]:
+            words, text = in_a_line(record.exc_info[1]), "".join(traceback.format_exception(record.exc_info[1]))
+        else:  # where an environment cannot be made in its process, RLlib logs that process's traceback, as a text
+            text = LOST.sub("", record.getMessage())
+            words = in_a_line(text)
+            if not EXCEPTION.match(words):
+                return
+        if words == self._last:  # it is logged where it is caught, and where the process ends
             return
-        self._last = cause
+        self._last = words
         place = f"{time.strftime('%Y-%m-%d %H.%M.%S')}, process {record.process} on {socket.gethostname()}"
         with self._file.open("a", encoding="utf-8") as out:
-            out.write(f"{HEAD}{place}: {in_a_line(cause)}\n{''.join(traceback.format_exception(cause))}\n")
+            out.write(f"{HEAD}{place}: {words}\n{text}\n\n")

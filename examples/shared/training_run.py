@@ -16,7 +16,6 @@ import json
 import logging
 import math
 import os
-import re
 import secrets
 import shutil
 import signal
@@ -332,15 +331,18 @@ class ProgressTable(tune.Callback):
         self._reached: set[str] = set()  # trials
         self._failures = folder / failures.FILE
         self._failed, _ = failures.read(self._failures)
-        self._told_at = -math.inf
+        self._told_at = time.monotonic()
 
     def on_step_end(self, iteration: int, trials: Any, **info: Any) -> None:
-        if time.monotonic() - self._told_at < failures.PRINT_EVERY_S:
+        if self._failed and time.monotonic() - self._told_at < failures.PRINT_EVERY_S:
             return
         count, last = failures.read(self._failures)
         if count > self._failed:
             self._failed, self._told_at = count, time.monotonic()
             print(f"failed in sampling, {count} so far: {last} (all of them: {self._failures})", flush=True)
+        waited_s = time.monotonic() - self._told_at
+        if count and waited_s > failures.BUILT_S and all(trial.status == "PENDING" for trial in trials):
+            raise RuntimeError(f"{last}, after which the algorithm was not built")  # RLlib sometimes waits for good
 
     def on_trial_result(self, iteration: int, trials: Any, trial: Any, result: dict[str, Any], **info: Any) -> None:
         if self._rows % 25 == 0:
@@ -501,7 +503,7 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
     except KeyboardInterrupt:
         raise InterruptError(folder) from None
     except Exception as error:  # before a trial has begun, or Tune's own; a trial's are in the results
-        raise errors.RlservoError(f"training failed: {_cause(error)}") from error
+        raise errors.RlservoError(f"training failed: {failures.in_a_line(error)}") from error
     trials, failed, unfinished = [], [], False
     for result in (results[index] for index in range(len(results))):
         if result.error is not None:
@@ -512,8 +514,12 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
     if unfinished or not trials:
         raise InterruptError(folder)
     if len(failed) == len(trials):
+        cause = failures.in_a_line(str(failed[0].error))
+        _, last = failures.read(folder / failures.FILE)
+        if last and last not in cause:
+            cause += f", after an env runner's {last}"
         raise errors.RlservoError(
-            f"training failed: {_cause(failed[0].error)}; all of it is in {failed[0].path}/error.txt, and "
+            f"training failed: {cause}; all of it is in {failed[0].path}/error.txt, and "
             f"--resume {folder} goes on from the last checkpoint"
         )
     if not any(trial.trained_steps for trial in trials):
@@ -553,15 +559,6 @@ def _trial(result: Any, run: Run, swept: Sequence[str]) -> Trial:
 def _first_line(error: BaseException) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
-
-
-def _cause(error: BaseException | None) -> str:
-    """Return the line that names the exception at the bottom of a Ray error, which is a traceback in itself."""
-    lines = [line for line in str(error).splitlines() if line and not line.startswith((" ", "\t", "Traceback"))]
-    told = [
-        line for line in lines if re.match(r"[\w.]+(Error|Exception|Exit): \S", line)
-    ]  # RLlib raises some without words
-    return (told or lines or [type(error).__name__])[-1]
 
 
 def best_checkpoint_of(outcome: Outcome) -> Path:

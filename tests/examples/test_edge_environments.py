@@ -63,6 +63,7 @@ def test_crash_in_the_driver_without_the_flag_ends_the_training_with_its_cause(e
     [
         ("Failing", "no step was sampled: RuntimeError: the gripper is not calibrated .*failures.txt"),
         ("Failing remade", "crashed 100 times without a sample: RuntimeError: the gripper is not calibrated"),
+        ("Failing unmade", "training failed: .*RuntimeError: no licence for this process"),
         ("Failing evaluation", "no step was evaluated: RuntimeError: the gripper is not calibrated"),
         ("Float64 unlearned", "nothing was learned: .* the training stopped before the learner took any"),
     ],

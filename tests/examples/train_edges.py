@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ RUNS = {
     "Crashing for good": ["--stop-iters", "50"],
     "Failing": ["--num-cpus", "1", *ON_ONE_CORE],
     "Failing remade": ["--restart-failed-sub-environments"],
+    "Failing unmade": ["--num-cpus", "1", *ON_ONE_CORE, "--env-arg", f"only_in={os.getpid()}"],
     "Failing evaluation": [
         "--env-arg", "fails=false", "--evaluation-interval", "1", "--evaluation-num-env-runners", "1", *ON_ONE_CORE,
     ],
@@ -42,7 +44,8 @@ RUNS = {
 
 # What Tune makes of no return, of a trial that fails, and of nothing learned.
 TUNED = (
-    "Endless", "Crashing for good", "Failing", "Failing remade", "Failing evaluation", "Float64 unlearned",
+    "Endless", "Crashing for good", "Failing", "Failing remade", "Failing unmade", "Failing evaluation",
+    "Float64 unlearned",
 )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -68,9 +69,11 @@ class Endless(Float64):
 
 
 class Failing(Promises32):
-    """Fails in every sample, or only where the policy is evaluated."""
+    """Fails in every sample, only where the policy is evaluated, or already when made outside a process."""
 
-    def __init__(self, fails: bool = True) -> None:
+    def __init__(self, fails: bool = True, only_in: int | None = None) -> None:
+        if only_in not in (None, os.getpid()):
+            raise RuntimeError("no licence for this process")
         self._fails = fails
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
