@@ -1,6 +1,6 @@
 """Run UR5 end-effector positioning with the policy of a checkpoint, or with its export.
 
-python examples/policy_from_cp_ur.py examples/checkpoints/ur5_positioning
+python examples/policy_from_cp_ur.py examples/checkpoints/ur_positioning
 python examples/policy_from_cp_ur.py --bundle policies/ur5
 """
 

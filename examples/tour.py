@@ -27,7 +27,7 @@ from shared.training_run import RETURN, STEPS, Run
 from rlservo import Policy, rollout
 
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
-SHIPPED = Path(__file__).resolve().parent / "checkpoints" / "ur5_positioning"
+SHIPPED = Path(__file__).resolve().parent / "checkpoints" / "ur_positioning"
 ARROWS = "←↓→↑"  # FrozenLake's actions
 EXPLORATION_STEPS = 5_000  # steps on FrozenLake, after which it hardly explores any more
 
@@ -309,7 +309,7 @@ def frozen_lake(settings: Settings) -> None:
     film(settings, bundle, env_id, **arguments)
 
 
-# The UR5: the policy that ships, which took twenty minutes to train.
+# The UR5: the policy that ships for all UR arms, which took half an hour to train.
 
 
 def ur5(settings: Settings) -> None:
@@ -319,7 +319,7 @@ def ur5(settings: Settings) -> None:
     look_at(UR5, **arguments)
     random_baseline(UR5, 2 if settings.quick else 10, **arguments)
 
-    heading("UR5: export the policy that ships, run it (its training: training_inference_ur.py)")
+    heading("UR5: export the policy that ships, run it (its training: train_shipped.py)")
     bundle = training_run.export_and_run(
         SHIPPED, settings.out / "bundles", env_id=UR5, env_config=arguments, episodes=5 if settings.quick else 20
     )

@@ -1,6 +1,6 @@
 """The bare loop: a UR5 simulator driven by a policy that is served somewhere.
 
-    rlservo export examples/checkpoints/ur5_positioning --out policies --name ur5
+    rlservo export examples/checkpoints/ur_positioning --out policies --name ur5
     rlservo serve policies
     python examples/ur5_client.py --url http://127.0.0.1:8000 --policy ur5
 

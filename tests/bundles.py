@@ -373,7 +373,7 @@ def exported() -> Callable[..., ExportResult]:
 
 RECURRENT = ("lstm_box", "lstm_previous", "act_nested")
 SHIPPED = {  # by the name they are served under
-    "ur5": "ur5_positioning",
+    "ur5": "ur_positioning",
     "mir100": "mir100_navigation",
     "mir100_obstacle_avoidance": "mir100_obstacle_avoidance_waiting",
 }

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 CHECKPOINTS = Path(__file__).resolve().parents[2] / "examples" / "checkpoints"
-ROBOTS = [("policy_from_cp_ur.py", "ur5_positioning"), ("policy_from_cp_mir.py", "mir100_navigation")]
+ROBOTS = [("policy_from_cp_ur.py", "ur_positioning"), ("policy_from_cp_mir.py", "mir100_navigation")]
 
 
 def returns(ended: Any) -> list[str]:

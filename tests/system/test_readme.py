@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -12,6 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from bundles import SHIPPED
+from command_line import rlservo_here
+from rlservo.deploy.demo.demo import ROBOTS
 from servers import free_ports
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -19,6 +23,25 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+
+
+def test_readme_and_demo_have_the_same_policies_under_the_same_names() -> None:
+    documents = "".join((ROOT / name).read_text() for name in ("README.md", "examples/robo_gym.md", "docs/bundle.md"))
+    exports = re.findall(r"rlservo export examples/checkpoints/(\w+) --out policies --name (\w+)", documents)
+    demo = {robot.policy: robot.checkpoint for robot in ROBOTS}
+    assert ("ur_positioning", "ur5") in exports
+    assert {checkpoint for checkpoint, name in exports if name in demo} <= set(demo.values())
+    assert {name: SHIPPED[name] for name in demo} == demo  # what the tests take for it
+
+
+def test_readmes_policy_bears_readmes_disturbance(shipped: Path) -> None:
+    disturbance = re.search(r"`--disturb\s+(\S+)`", (ROOT / "README.md").read_text())
+    assert disturbance is not None
+    done = rlservo_here(
+        "rollout", "rlservo/EndEffectorPositioningURSim-v0", "--bundle", shipped / "ur5",
+        "--disturb", disturbance[1], "--episodes", 20, "--json",
+    )  # fmt: skip
+    assert json.loads(done.stdout)["successes"] >= 18, done
 
 
 @pytest.fixture
