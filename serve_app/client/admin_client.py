@@ -14,7 +14,7 @@ from rlservo.serve_app.wire.admin_key_file import key_file, read_key
 from rlservo.serve_app.wire.loopback import is_loopback
 
 KEY_VARIABLE = "RLSERVO_ADMIN_KEY"
-COUNTS_TIMEOUT_S = 10.0  # it only reads what replicas have in memory
+LOOK_TIMEOUT_S = 10.0  # nothing is loaded for it
 TIMEOUT_S = 90.0  # every replica loads and proves a version before the server answers
 
 
@@ -31,12 +31,14 @@ class AdminClient(Closeable):
         listings: list[dict[str, Any]] = self._transport.get("v1", "admin", "policies")
         return listings
 
-    def counts(self, name: str) -> list[dict[str, Any]]:
-        """Return what every replica serves of a policy, and has counted of it since its start."""
-        replies: list[dict[str, Any]] = self._transport.get(
-            "v1", "admin", "policies", name, "counts", timeout_s=COUNTS_TIMEOUT_S
-        )
-        return replies
+    def listing(self) -> dict[str, Any]:
+        """Return what the process that answers serves, as `GET /v1/policies`."""
+        listing: dict[str, Any] = self._transport.get("v1", "policies", timeout_s=LOOK_TIMEOUT_S)
+        return listing
+
+    def metrics(self) -> str:
+        """Return the metrics as Prometheus reads them."""
+        return self._transport.get_text("metrics", timeout_s=LOOK_TIMEOUT_S)
 
     def load(self, name: str, version: str | None = None) -> dict[str, Any]:
         """Load and prove a version; None is the repository's newest."""

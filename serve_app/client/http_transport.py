@@ -105,11 +105,16 @@ class Transport:
 
     def get(self, *path: str, timeout_s: float | None = None, retries: int | None = None) -> Any:
         """Return the JSON at `/path[0]/path[1]/...`."""
-        return self._call("GET", path, None, timeout_s, retries)
+        return self._parse(*self._call("GET", path, None, timeout_s, retries))
+
+    def get_text(self, *path: str, timeout_s: float | None = None) -> str:
+        """Return the text at `/path[0]/path[1]/...`."""
+        content, *_ = self._call("GET", path, None, timeout_s, None)
+        return content.decode("utf-8", "replace")
 
     def post(self, *path: str, body: bytes, timeout_s: float | None = None) -> Any:
         """Send a JSON document and return the JSON answer."""
-        return self._call("POST", path, body, timeout_s, None)
+        return self._parse(*self._call("POST", path, body, timeout_s, None))
 
     def close(self) -> None:
         """Close the connections. A call after that raises UsageError."""
@@ -118,8 +123,8 @@ class Transport:
 
     def _call(
         self, method: str, path: tuple[str, ...], body: bytes | None, timeout_s: float | None, retries: int | None
-    ) -> Any:
-        """Try until answered, out of time or out of retries.
+    ) -> tuple[bytes, str, int]:
+        """Try until answered, out of time or out of retries; return the content, its address and the status.
 
         Raises DeadlineError when the answer did not come in time (never retried: the server may still be at work),
         UnavailableError when the server cannot be reached or stays at 503, and else the error the server names.
@@ -142,7 +147,7 @@ class Transport:
                     wait = 0.0  # a server that closed an idle connection is probably there
             else:
                 if status < 300:
-                    return self._parse(content, url, status)
+                    return content, url, status
                 refusal = decode_error(url, status, content)
                 if status != 503:
                     raise refusal

@@ -6,110 +6,70 @@ import contextlib
 import fcntl
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from rlservo.export.contract.errors import UsageError
 
-START, STARTED, CHECK, DECISION, END = "start", "started", "check", "decision", "end"
-LARGEST = 256 << 20  # [bytes] beyond which a file is no log of ours
-
-Entry = dict[str, Any]
+START, CHECK, DECISION, END = "start", "check", "decision", "end"
 
 
 class PromotionLog:
     """A file that one process at a time appends to."""
 
-    def __init__(self, file: Path, descriptor: int, entries: list[Entry], *, is_torn: bool) -> None:
-        self.file = file
-        self._descriptor = descriptor
-        self._entries = entries
-        self._is_torn = is_torn
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        """Read the promotion that has not ended. Raises UsageError for another kind of file."""
+        self.path = path
+        self.entries: dict[str, dict[str, Any]] = {}  # the newest of each event, of the promotion that has not ended
+        self._file = file
+        *lines, torn = file.read().split(b"\n")
+        self._is_torn = bool(torn)  # by a process that was killed while it wrote
+        for number, line in enumerate(lines):
+            try:
+                entry = json.loads(line)
+                self._add({**entry, "seconds": datetime.fromisoformat(entry["time"]).timestamp()})
+            except (ValueError, KeyError, TypeError):
+                if not number:
+                    raise UsageError(f"{path} is no promotion's log: name another --log") from None
 
     @classmethod
     @contextlib.contextmanager
-    def open(cls, file: Path) -> Iterator[PromotionLog]:
+    def open(cls, path: Path) -> Iterator[PromotionLog]:
         """Open a log, made if it is not there. Raises UsageError where it is no log or another process writes it."""
-        flags, is_new = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, not file.exists()
         try:
-            descriptor = os.open(file, flags, 0o644)
+            file = path.open("a+b", buffering=0)
         except OSError as error:
-            raise UsageError(f"the log {file} cannot be written: {error.strerror}") from None
-        try:
+            raise UsageError(f"the log {path} cannot be written: {error.strerror}") from None
+        with file:
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                raise UsageError(f"another 'rlservo policy promote' writes {file}: wait for it, or end it") from None
-            entries, is_torn = _read(file, descriptor)
+                raise UsageError(f"another 'rlservo policy promote' writes {path}: wait for it, or end it") from None
+            file.seek(0)
             try:
-                yield cls(file, descriptor, entries, is_torn=is_torn)
+                yield cls(path, file)
             finally:
-                if is_new and not os.fstat(descriptor).st_size:  # nothing was begun
-                    file.unlink(missing_ok=True)
-        finally:
-            os.close(descriptor)
+                if not os.fstat(file.fileno()).st_size:  # nothing was begun
+                    path.unlink(missing_ok=True)
 
-    def write(self, event: str, **fields: Any) -> Entry:
+    def write(self, event: str, **fields: Any) -> None:
         """Append an entry, and have the disk keep it: what follows may not be undone. Raises UsageError."""
-        entry = {"time": datetime.now(timezone.utc).isoformat(timespec="milliseconds"), "event": event, **fields}
-        line = json.dumps(entry, allow_nan=False, default=str).encode() + b"\n"
-        # A process that was killed may have left half a line.
-        content = b"\n" + line if self._is_torn else line
+        now = datetime.now(timezone.utc)
+        entry = {"time": now.isoformat(timespec="milliseconds"), "event": event, **fields}
+        content = b"\n" * self._is_torn + json.dumps(entry).encode() + b"\n"
         try:
             while content:
-                content = content[os.write(self._descriptor, content) :]
+                content = content[self._file.write(content) :]
                 self._is_torn = bool(content)
+            os.fsync(self._file)
         except OSError as error:  # the disk is full, say
-            raise UsageError(f"the log {self.file} cannot be written: {error.strerror}") from None
-        with contextlib.suppress(OSError):  # a pipe, say
-            os.fsync(self._descriptor)
-        self._entries.append(entry)
-        return entry
+            raise UsageError(f"the log {self.path} cannot be written: {error.strerror}") from None
+        self._add({**entry, "seconds": now.timestamp()})
 
-    def unfinished(self) -> list[Entry]:
-        """Return the entries of the promotion that has not ended; none where there is none."""
-        since: list[Entry] = []
-        for entry in self._entries:
-            if entry["event"] == START:
-                since = []
-            since.append(entry)
-            if entry["event"] == END:
-                since = []
-        return since if since and since[0]["event"] == START else []
-
-
-def newest(entries: list[Entry], event: str) -> Entry | None:
-    """Return the last entry of a kind."""
-    return next((entry for entry in reversed(entries) if entry["event"] == event), None)
-
-
-def seconds_of(entry: Mapping[str, Any]) -> float:
-    """Return when an entry was written, in seconds since 1970. Raises UsageError."""
-    try:
-        return datetime.fromisoformat(str(entry["time"])).timestamp()
-    except ValueError:
-        raise UsageError(f"the log has an entry of {str(entry['time'])[:40]!r}, which is no time") from None
-
-
-def _read(file: Path, descriptor: int) -> tuple[list[Entry], bool]:
-    size = os.fstat(descriptor).st_size
-    if size > LARGEST:
-        raise UsageError(f"{file} is larger than {LARGEST >> 20} MiB: name another --log")
-    content = b""
-    while len(content) < size and (part := os.pread(descriptor, 1 << 20, len(content))):  # a device has no size
-        content += part
-    entries = []
-    *lines, rest = content.split(b"\n")
-    for number, line in enumerate(lines, start=1):
-        try:
-            entry = json.loads(line)
-            if not isinstance(entry, dict) or not {"event", "time"} <= entry.keys():
-                raise ValueError
-        except ValueError:
-            if number > 1 and line:  # half a line of a process that was killed, which the next one has ended
-                continue
-            raise UsageError(f"{file}, line {number}, is none of a promotion's log: name another --log") from None
-        entries.append(entry)
-    return entries, bool(rest)
+    def _add(self, entry: dict[str, Any]) -> None:
+        if entry["event"] in (START, END):
+            self.entries.clear()
+        if entry["event"] == START or self.entries:
+            self.entries[entry["event"]] = entry

@@ -31,6 +31,7 @@ from rlservo.serve_app.engines.ports import BACKLOG, listen
 from rlservo.serve_app.engines.serving import Serving
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure
+from rlservo.serve_app.server.metrics import shared_by_workers
 from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
@@ -286,7 +287,7 @@ def _run_workers(
     with contextlib.closing(load_served(server.places, ServedConfig.parse(server.served), server.settings)) as store:
         policies = tuple((name, store.default(name)) for name in store.names)
     UVICORN.setLevel(logging.INFO)
-    with _stop_signals(lambda: None):  # put back what the supervisor takes over
+    with _stop_signals(lambda: None), shared_by_workers():  # the first puts back what the supervisor takes over
         supervisor = _Supervisor(server.config(), [listener], lambda: ready(policies), on_stop)
         supervisor.run()
     if not supervisor.is_asked_to_stop:

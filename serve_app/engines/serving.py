@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.server.sampled_metrics import keep_sampled
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import version_loader
 from rlservo.serve_app.versions.plan_ledger import MemoryLedger
@@ -43,6 +44,8 @@ class Serving:
         await self.control.configure(served)
         self.core.admission.loop_clock.start()
         self._tasks.append(asyncio.create_task(self.control.poll_ledger()))
+        if self.core.metrics.is_shared:
+            self._tasks.append(asyncio.create_task(keep_sampled(self.core)))
         if self.settings.poll_s is not None:
             self._tasks.append(asyncio.create_task(self.control.poll_repository(self.settings.poll_s)))
         # What is loaded by now stays: a collection that walks it would hold requests up.

@@ -115,20 +115,6 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
         replies = [listing.describe(core)] if control.gather is None else await control.gather()
         return Response(orjson.dumps(replies), media_type="application/json")
 
-    @add_route(
-        app,
-        Access.admin,
-        "GET",
-        "/v1/admin/policies/{name}/counts",
-        "admin",
-        "What every replica serves of a policy, and has counted of it since its start",
-        *STATUSES,
-        response_model=list[listing.PolicyCounts],
-    )
-    async def counts(name: str) -> Response:
-        replies = [listing.count(core, name)] if control.gather is None else await control.gather(name)
-        return Response(orjson.dumps([reply for reply in replies if reply]), media_type="application/json")
-
     @command("load", "Load a version, prove it, and keep it ready: not in use until an alias leads to it")
     async def load(request: Request, name: str, given: LoadCommand) -> Response:
         what = f"load {name} {given.version or 'newest'}"

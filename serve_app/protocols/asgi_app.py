@@ -20,8 +20,8 @@ from rlservo.serve_app.server.access_checks import AccessChecks, Hosts
 from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.audit import AUDIT
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.gauges import exposition
 from rlservo.serve_app.server.request_path import StoreProvider
+from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 
@@ -87,7 +87,7 @@ def _add_health(app: FastAPI, core: Core) -> None:
 
     @add_route(app, Access.act, "GET", "/metrics", "health", counted, response_class=Response)
     async def metrics() -> Response:
-        return Response(exposition(core), media_type=CONTENT_TYPE_LATEST)
+        return Response(await exposition(core), media_type=CONTENT_TYPE_LATEST)
 
 
 # Errors of the routes that FastAPI runs; `http_errors.py` has the table.

@@ -24,7 +24,7 @@ from rlservo.serve_app.protocols.oip_tensors import datatype_of
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_metrics import Totals
+from rlservo.serve_app.server.metrics import Totals
 
 BACKEND = "onnxruntime"
 LARGEST_INT32 = 2**31 - 1

@@ -45,7 +45,7 @@ from rlservo.serve_app.server.access_checks import (
     presented_key,
 )
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_metrics import IDLE
+from rlservo.serve_app.server.metrics import IDLE
 
 logger = logging.getLogger(__name__)
 

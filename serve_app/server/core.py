@@ -1,6 +1,6 @@
 """Core of the server, which all protocols share: the request path, the API keys, and what is served.
 
-What describes the server (`listing.py`, `gauges.py`) reads it.
+What describes the server (`listing.py`, `sampled_metrics.py`) reads it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Core(RequestPath):
 
         With a `control` what is served can change while the server runs.
         """
-        super().__init__(store_provider, settings)
+        super().__init__(store_provider, settings, replica)
         self.control = control
         self.replica = replica
         self.keys = CurrentKeys(settings)

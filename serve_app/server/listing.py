@@ -5,16 +5,13 @@ The models describe the wire. The documents are this replica's own; `/v1/admin/p
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 from pydantic import BaseModel, Field
 
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_metrics import SECONDS, VersionCounts
-from rlservo.serve_app.versions.plan import Canary, PolicyPlan, Refusal
+from rlservo.serve_app.versions.plan import Canary, Refusal
 from rlservo.serve_app.versions.replica_versions import VersionState
-from rlservo.serve_app.versions.shadow import BOUNDS
 
 
 class VersionStatus(BaseModel):
@@ -62,53 +59,6 @@ class PolicyList(BaseModel):
     changed_by: str | None
     refused: Refusal | None = Field(description="The last change, if it was refused: what ran before goes on.")
     behind: list[str] = Field(description="What this replica could not follow, a sentence each; usually empty.")
-
-
-class PolicyCounts(BaseModel):
-    """What a replica serves of a policy and has counted of it since its start."""
-
-    replica: str
-    generation: int
-    changed_at: str | None
-    changed_by: str | None
-    behind: list[str]
-    is_served: bool
-    versions: list[str]
-    aliases: dict[str, str]
-    canary: Canary | None
-    shadow: str | None
-    latency_bounds: list[float] = Field(description="[s] Upper bounds of `latency`, whose last count has none.")
-    difference_bounds: list[float] = Field(description="Upper bounds of `differences`, whose last count has none.")
-    counts: dict[str, VersionCounts] = Field(description="By version.")
-    comparisons: list[dict[str, Any]] = Field(description="By version in use and shadow.")
-
-
-def count(core: Core, name: str) -> dict[str, Any]:
-    """Return what `GET /v1/admin/policies/NAME/counts` has of each replica, as `PolicyCounts`."""
-    control = core.control
-    plan = control.plan if control is not None else None
-    policy = plan.policies.get(name) if plan is not None else None
-    policy = policy or PolicyPlan(versions={})
-    return {
-        "replica": core.replica,
-        "generation": plan.generation if plan is not None else 0,
-        "changed_at": plan and plan.changed_at,
-        "changed_by": plan and plan.changed_by,
-        "behind": [
-            f"version {version}: {state.reason}"
-            for version, state in states_of(core).get(name, {}).items()
-            if state.state == "failed" and version in policy.versions
-        ],
-        "is_served": bool(policy.versions),
-        "versions": list(policy.versions),
-        "aliases": policy.aliases,
-        "canary": policy.canary and policy.canary.model_dump(),
-        "shadow": policy.shadow,
-        "latency_bounds": list(SECONDS),
-        "difference_bounds": list(BOUNDS),
-        "counts": {version: asdict(counts) for version, counts in core.metrics.counts(name).items()},
-        "comparisons": core.shadows.counts(name),
-    }
 
 
 def describe(core: Core) -> dict[str, Any]:

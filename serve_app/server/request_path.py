@@ -36,8 +36,8 @@ from rlservo.serve_app.episodes.sessions import Session
 from rlservo.serve_app.runtime.network_memory import NetworkDroppedError
 from rlservo.serve_app.server.api_keys import A_KEY
 from rlservo.serve_app.server.loop_clock import LoopClock
+from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
-from rlservo.serve_app.server.request_metrics import Metrics
 from rlservo.serve_app.server.row_count import count_rows, most_rows
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.network_restorer import NetworkRestorer
@@ -151,16 +151,16 @@ class Admission:
 class RequestPath:
     """Answers requests, and is the one place that admits, counts, logs and times them."""
 
-    def __init__(self, store_provider: StoreProvider, settings: ServerSettings) -> None:
+    def __init__(self, store_provider: StoreProvider, settings: ServerSettings, replica: str = "") -> None:
         """`store_provider` gives None for as long as the policies are being loaded."""
         self._store_provider = store_provider
         self._max_batch = settings.max_batch
         self.settings = settings
         self.admission = Admission(settings)
         self.episodes = Episodes(max_sessions=settings.max_sessions, idle_s=settings.session_idle_s)
-        self.metrics = Metrics()
+        self.metrics = Metrics(replica)
         self.log = RequestLog(settings)
-        self.shadows = Shadows()
+        self.shadows = Shadows(self.metrics.record_differences)
         self._restorer = NetworkRestorer()
         self.recorder: RequestRecorder | None = None
 

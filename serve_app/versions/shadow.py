@@ -10,13 +10,11 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from prometheus_client.core import CounterMetricFamily, HistogramMetricFamily
-from prometheus_client.metrics_core import Metric
 
 from rlservo.export.contract.errors import RlservoError
 from rlservo.serve_app.runtime.network_memory import NetworkDroppedError
@@ -26,16 +24,17 @@ from rlservo.serve_app.versions.policy_store import Decision, Shadow
 logger = logging.getLogger(__name__)
 
 WAITING = 64  # requests at most, so that a slow candidate costs neither memory nor the default version's time
-BOUNDS = (1e-6, 1e-5, 1e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+
+Record = Callable[[str, str, str, Iterable[float]], None]
+"""Takes the differences between the actions of a policy's version and its shadow: (policy, version, shadow, ...)."""
 
 
 class _Series:
     """Differences and counts of one candidate beside one default version."""
 
     def __init__(self) -> None:
-        self.counts = np.zeros(len(BOUNDS) + 1, np.int64)
+        self.compared = 0
         self.total = 0.0
-        self.squares = 0.0
         self.largest = 0.0
         self.failed = 0
         self.left_out = 0
@@ -44,7 +43,8 @@ class _Series:
 class Shadows:
     """Compares the candidates' actions with those that were sent."""
 
-    def __init__(self) -> None:
+    def __init__(self, record: Record) -> None:
+        self._record = record
         self._waiting: queue.Queue[tuple[Shadow, Any, Decision]] = queue.Queue(WAITING)
         self._thread: threading.Thread | None = None
         self._series: dict[tuple[str, str, str], _Series] = {}
@@ -68,51 +68,20 @@ class Shadows:
     def describe(self, policy: str, version: str, shadow: str) -> dict[str, Any]:
         """Return how the candidate compares so far, on this replica."""
         series = self._series.get((policy, version, shadow)) or _Series()
-        compared = int(series.counts.sum())
         return {
             "version": shadow,
-            "compared": compared,
-            "mean_difference": series.total / compared if compared else None,
-            "largest_difference": series.largest if compared else None,
+            "compared": series.compared,
+            "mean_difference": series.total / series.compared if series.compared else None,
+            "largest_difference": series.largest if series.compared else None,
             "failed": series.failed,
             "left_out": series.left_out,
         }
 
-    def counts(self, policy: str) -> list[dict[str, Any]]:
-        """Return all that was counted of each pair of versions of a policy since the start."""
-        return [
-            {
-                "version": version,
-                "shadow": shadow,
-                "differences": series.counts.tolist(),
-                "total": series.total,
-                "squares": series.squares,
-                "failed": series.failed,
-                "left_out": series.left_out,
-            }
-            for (name, version, shadow), series in list(self._series.items())
-            if name == policy
-        ]
-
-    def families(self, replica: str) -> Iterator[Metric]:
-        """Yield the metrics as they are now."""
-        names = ["replica", "policy", "version", "shadow"]
-        difference = HistogramMetricFamily(
-            "rlservo_shadow_difference",
-            "Largest difference between a shadow's action and the one sent, over the elements, in their own units",
-            labels=names,
-        )
-        missed = CounterMetricFamily(
-            "rlservo_shadow_missed", "Actions without a comparison, by reason", labels=[*names, "reason"]
-        )
+    def missed(self) -> Iterator[tuple[str, str, str, str, int]]:
+        """Yield (policy, version, shadow, reason, count) of the actions that were not compared."""
         for key, series in list(self._series.items()):
-            labels = [replica, *key]
-            cumulative = zip([*map(repr, BOUNDS), "+Inf"], series.counts.cumsum().astype(float), strict=True)
-            difference.add_metric(labels, list(cumulative), series.total)
-            missed.add_metric([*labels, "failed"], series.failed)
-            missed.add_metric([*labels, "left-out"], series.left_out)
-        yield difference
-        yield missed
+            yield (*key, "failed", series.failed)
+            yield (*key, "left-out", series.left_out)
 
     def _run(self) -> None:
         while True:
@@ -127,9 +96,9 @@ class Shadows:
                 logger.exception("shadow %s of policy '%s' failed", shadow.version, decision.name)
                 series.failed += 1
                 continue
-            np.add.at(series.counts, np.searchsorted(BOUNDS, differences), 1)
+            self._record(decision.name, decision.version, shadow.version, differences.tolist())
+            series.compared += len(differences)
             series.total += float(differences.sum())
-            series.squares += float(np.square(differences).sum())
             series.largest = max(series.largest, float(differences.max(initial=0.0)))
 
     def _series_of(self, shadow: Shadow, decision: Decision) -> _Series:

@@ -332,3 +332,26 @@ def test_key_makes_a_key_and_the_line_that_the_server_accepts_it_by() -> None:
     plain = rlservo_here("key", "cell-7").stdout.split("\n")
     assert plain[0].startswith("rlservo_") and plain[1].startswith("cell-7 act sha256:")
     refused(rlservo_here("key", "two words"), 2, "label 'two words': expected 1 to 64 letters")
+
+
+@pytest.mark.parametrize(
+    ("words", "fragment"),
+    [
+        ((), "nothing limits it: give --max-error-rate, --max-p99"),
+        (("--max-error-rate", "0.1"), "--max-error-rate '0.1': expected a number with its unit, such as 0.1%"),
+        (("--max-error-rate", "101%"), "at most 100%"),
+        (("--max-p99", "20"), "--max-p99 '20': expected a number with its unit, such as 20ms"),
+        (("--max-p99", "2s"), "at most 1 s"),
+        (("--max-success-drop", "-1%"), "--max-success-drop '-1%'"),
+        (("--max-p99", "20ms", "--canary", "0"), "--canary and --for: expected more than 0"),
+        (("--max-p99", "20ms", "--canary", "110%"), "--canary '110%'"),
+        (("--max-p99", "20ms", "--for", "31d"), "--for '31d'"),
+        (("--max-p99", "20ms", "--url", "http://127.0.0.1:9"), "http://127.0.0.1:9 cannot be reached"),
+    ],
+)
+def test_a_promotion_that_cannot_begin_exits_with_2_and_leaves_no_log(
+    words: tuple[str, ...], fragment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RLSERVO_ADMIN_KEY", "x")
+    refused(rlservo_here("policy", "promote", "ur5", "2", *words, cwd=tmp_path), 2, fragment)
+    assert list(tmp_path.iterdir()) == []

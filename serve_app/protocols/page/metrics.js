@@ -47,7 +47,22 @@ export function sumBy(samples, name, label, wanted) {
   return sums;
 }
 
-/** Looks at the metrics of several replicas, of which each answer holds one's. */
+/** Return the samples of each replica in a text's. */
+function byReplica(samples) {
+  const replicas = new Map();
+  for (const [name, all] of samples) {
+    for (const sample of all) {
+      const replica = sample.labels.get("replica") ?? "";
+      if (!replicas.has(replica)) replicas.set(replica, new Map());
+      const own = replicas.get(replica);
+      if (!own.has(name)) own.set(name, []);
+      own.get(name).push(sample);
+    }
+  }
+  return replicas;
+}
+
+/** Looks at the metrics of several replicas, of which each answer holds one's, or those of a server's workers. */
 export class Looks {
   #replicas = new Map(); // replica -> looks, the oldest first
   #windowS;
@@ -60,14 +75,15 @@ export class Looks {
   }
 
   /** Add an answer's samples, seen at a time in seconds. */
-  add(samples, at) {
-    const replica = (samples.get("rlservo_api_keys_current") ?? [])[0]?.labels.get("replica") ?? "";
-    const looks = this.#replicas.get(replica) ?? [];
-    looks.push({ at, samples });
-    // One look at least as old as the window stays, to compare with.
-    while (looks.length > 2 && looks[1].at <= at - this.#windowS) looks.shift();
-    while (looks[0].at < at - this.#keptS) looks.shift();
-    this.#replicas.set(replica, looks);
+  add(answer, at) {
+    for (const [replica, samples] of byReplica(answer)) {
+      const looks = this.#replicas.get(replica) ?? [];
+      looks.push({ at, samples });
+      // One look at least as old as the window stays, to compare with.
+      while (looks.length > 2 && looks[1].at <= at - this.#windowS) looks.shift();
+      while (looks[0].at < at - this.#keptS) looks.shift();
+      this.#replicas.set(replica, looks);
+    }
     for (const [name, others] of this.#replicas) if (others.at(-1).at < at - this.#keptS) this.#replicas.delete(name);
   }
 

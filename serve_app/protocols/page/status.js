@@ -201,8 +201,6 @@ function warningsOf({ refused, behind }) {
 function factsOf({ generation, changed_at: changedAt, changed_by: changedBy }) {
   const replicas = looks.replicas.filter(Boolean);
   const refusals = [...looks.totalBy("rlservo_requests_total", "code", { version: "" })];
-  const turnedAway = looks.total("rlservo_turned_away_total");
-  if (turnedAway) refusals.push(["over capacity", turnedAway]);
   const several = "the figures are the sum of what these said within the last minute, each since its start";
   const change = changedAt && `${new Date(changedAt).toLocaleString()}: ${clip(changedBy ?? "", 200)}`;
   const waited = looks.newest.map((samples) => samples.get("rlservo_queue_longest")?.[0]?.value ?? 0);

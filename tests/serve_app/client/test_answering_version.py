@@ -59,7 +59,8 @@ class Server:
 
     def ends(self, name: str) -> dict[str, list[int]]:
         assert self.core is not None
-        return {version: list(counts.ends) for version, counts in self.core.metrics.counts(name).items()}
+        counts, versions = self.core.metrics.ends, {policy.contract.version for policy in self.policies}
+        return {version: [counts.get((name, version, each), 0) for each in (True, False)] for version in versions}
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ OBS = b'{"obs": [0]}'
 COMMANDS = ("load", "unload", "alias", "rollback", "canary", "shadow")
 ADMIN_PATHS = (
     "/v1/admin/policies",
-    *(f"/v1/admin/policies/{{name}}/{command}" for command in (*COMMANDS, "counts")),
+    *(f"/v1/admin/policies/{{name}}/{command}" for command in COMMANDS),
     "/v2/repository/models/{name}/load",
     "/v2/repository/models/{name}/unload",
 )

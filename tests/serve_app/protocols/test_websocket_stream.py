@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from rlservo.export.contract.contract import Contract
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.gauges import exposition
+from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from stores import load_store
@@ -317,7 +317,7 @@ def test_a_client_that_goes_while_it_is_answered_is_no_failure_of_the_server(
     asyncio.run(app(scope, receive, send))
     assert sent == ["websocket.accept", "websocket.send", "websocket.send"]
     assert not [record for record in caplog.records if record.levelname == "ERROR"]
-    assert b'code="internal"' not in exposition(app.state.core)
+    assert b'code="internal"' not in asyncio.run(exposition(app.state.core))
 
 
 def test_many_robots_stream_at_once_and_none_gets_anothers_action(port: int, store: PolicyStore) -> None:

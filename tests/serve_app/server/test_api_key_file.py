@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import logging
@@ -25,7 +26,7 @@ from rlservo.serve_app.server import api_key_file
 from rlservo.serve_app.server.access_checks import find_key
 from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Keys, new_key
-from rlservo.serve_app.server.gauges import exposition
+from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from stores import load_store
@@ -218,11 +219,11 @@ def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
             assert hanging.wait(10)
             assert status(port, OLD) == 200
             time.sleep(0.2)
-            assert b'rlservo_api_keys_current{replica=""} 0.0' in exposition(app.state.core)
+            assert b'rlservo_api_keys_current{replica=""} 0.0' in asyncio.run(exposition(app.state.core))
     finally:
         go_on.set()
     monkeypatch.setattr(api_key_file, "STALE_S", 10.0)
-    wait_for(lambda: b'rlservo_api_keys_current{replica=""} 1.0' in exposition(app.state.core))
+    wait_for(lambda: b'rlservo_api_keys_current{replica=""} 1.0' in asyncio.run(exposition(app.state.core)))
 
 
 def test_the_watching_ends_with_the_application(file: Path) -> None:

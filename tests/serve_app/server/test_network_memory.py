@@ -22,7 +22,7 @@ from rlservo.serve_app.runtime.network_memory import DroppableNetwork
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.gauges import exposition
+from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions.plan import ServedConfig
@@ -114,7 +114,7 @@ def test_every_action_is_the_policys_own_while_networks_come_and_go(core: Core, 
     asyncio.run(run())
     restores = sum(network_of(core, name).restores for name in NAMES)
     assert restores >= len(NAMES) - FITTING and in_memory(core) <= FITTING
-    text = exposition(core).decode()
+    text = asyncio.run(exposition(core)).decode()
     assert f'rlservo_networks_in_memory{{replica=""}} {in_memory(core)}.0' in text
     shown = [float(line.split()[-1]) for line in text.splitlines() if line.startswith("rlservo_network_restores_total")]
     assert len(shown) == len(NAMES) + 1 and sum(shown) >= restores
@@ -141,7 +141,7 @@ def test_without_the_bound_a_policy_has_onnxruntimes_own_run(folder: Path) -> No
     store = load_served([folder / "a", folder / "b"], ServedConfig(), ServerSettings())
     policy = store.get("a")
     assert policy.droppable is None and type(policy._run.__self__).__name__ == "InferenceSession"  # type: ignore[attr-defined]
-    assert "rlservo_network" not in exposition(Core(lambda: store, ServerSettings())).decode()
+    assert "rlservo_network" not in asyncio.run(exposition(Core(lambda: store, ServerSettings()))).decode()
 
 
 def test_a_network_that_cannot_be_opened_again_is_a_sentence_and_others_go_on(

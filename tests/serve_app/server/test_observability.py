@@ -205,7 +205,8 @@ def test_the_dashboard_asks_for_metrics_that_exist(
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27, "session_id": "s", "reset": True})[0] == 200
         end = {"obs": [0.0] * 27, "session_id": "s", "final_status": "success"}
         assert post(port, "/v1/policies/ur5/act", end)[0] == 200
-        exposed = {name for name, *_ in scrape(port)} | {"rlservo_streams"}  # that one needs a stream
+        # These need a stream and an administered server.
+        exposed = {name for name, *_ in scrape(port)} | {"rlservo_streams", "rlservo_plan_generation"}
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
         connection.request("GET", "/metrics")
         labels = set(re.findall(r"(\w+)=\"", connection.getresponse().read().decode()))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,11 @@ import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
 
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.request_metrics import Histogram
+from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.metrics import Metrics
+from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions import plan_changes
 from stores import load_store
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
@@ -91,9 +96,29 @@ def test_requests_are_counted_by_policy_version_protocol_and_outcome(
         connection.close()
 
 
-def test_a_value_on_a_bound_is_within_it_and_buckets_are_cumulative() -> None:
-    histogram = Histogram((1.0, 2.0))
-    for value in (0.5, 1.0, 1.5, 2.0, 9.0):
-        histogram.add(value)
-    assert histogram.cumulative() == [("1.0", 2.0), ("2.0", 4.0), ("+Inf", 5.0)]
-    assert histogram.total == 14.0
+def test_a_version_that_is_unloaded_disappears_and_the_plan_is_numbered(
+    box_policy: Any, controlled: Any, tmp_path: Path
+) -> None:
+    for version in ("1", "2"):
+        box_policy(tmp_path, version=version)
+    with controlled(tmp_path, config={"policies": {"ur5": {"aliases": {"production": "1"}}}}) as control:
+        core = Core(lambda: control.store, ServerSettings(), replica="r", control=control)
+
+        def loaded() -> dict[str, float]:
+            text = asyncio.run(exposition(core)).decode()
+            families = {family.name: family for family in text_string_to_metric_families(text)}
+            assert families["rlservo_plan_generation"].samples[0].value == control.plan.generation
+            return {each.labels["version"]: each.value for each in families["rlservo_policy_loaded"].samples}
+
+        assert loaded() == {"1": 1.0, "2": 0.0}
+        asyncio.run(control.change(partial(plan_changes.unload, name="ur5", version="2"), what="unload"))
+        assert loaded() == {"1": 1.0}
+        asyncio.run(control.load("ur5", "2", what="load"))
+        assert loaded() == {"1": 1.0, "2": 0.0}
+
+
+def test_a_counter_whose_source_begins_again_goes_on() -> None:
+    metrics = Metrics("r")
+    for total in (0, 3, 3, 5, 2, 4):
+        metrics.sampled.counter("rlservo_looks", "Looks", total, policy="ur5")
+    assert b'rlservo_looks_total{policy="ur5",replica="r"} 9.0' in metrics.text()

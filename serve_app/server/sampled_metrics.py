@@ -1,0 +1,144 @@
+"""Counters and gauges sampled from the server's own numbers: requests, plan, queue, sessions, keys, recording, drift.
+
+They are sampled when Prometheus asks and, where several workers share their metrics, every second.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+import numpy as np
+
+from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.metrics import SUCCESS
+
+EVERY_S = 1.0
+MAX_ELEMENTS = 128  # an image's pixels are no series each: only the largest is shown
+LARGEST = "largest"
+
+logger = logging.getLogger(__name__)
+
+
+async def exposition(core: Core) -> bytes:
+    """Return all metrics as Prometheus reads them."""
+    sample(core)
+    return await asyncio.to_thread(core.metrics.text)  # thousands of series take a while
+
+
+async def keep_sampled(core: Core) -> None:
+    """Sample until it is cancelled, for the other workers to read."""
+    while True:
+        try:
+            sample(core)
+        except Exception:  # a fault in one metric must not freeze all others
+            logger.exception("the metrics could not be sampled")
+        await asyncio.sleep(EVERY_S)
+
+
+def sample(core: Core) -> None:
+    """Bring all counters and gauges up to date."""
+    for part in (requests, versions, networks, queue, keys, recording, sessions, shadows):
+        part(core)
+    core.metrics.sampled.end_round()
+
+
+def requests(core: Core) -> None:
+    """Sample what was counted of requests, streams and episodes."""
+    metrics, show = core.metrics, core.metrics.sampled
+    outcomes = {(*key, "ok"): answers.count for key, answers in metrics.answers.items()} | metrics.failures
+    for (policy, version, protocol, code), count in outcomes.items():
+        which = {"policy": policy, "version": version, "protocol": protocol, "code": code}
+        show.counter("rlservo_requests", "Requests by outcome", count, **which)
+    for policy, count in metrics.streams.items():
+        show.gauge("rlservo_streams", "Open WebSockets", count, policy=policy)
+    for (policy, version, succeeded), count in metrics.ends.items():
+        which = {"policy": policy, "version": version, "outcome": SUCCESS if succeeded else "other"}
+        show.counter("rlservo_episode_ends", "Episodes whose end clients reported (`final_status`)", count, **which)
+
+
+def versions(core: Core) -> None:
+    """Sample the plan that this process follows, and of each version whether it is the default, batches and drift."""
+    show = core.metrics.sampled
+    if core.control is not None and core.control.plan is not None:
+        show.gauge("rlservo_plan_generation", "Plan that this process follows", core.control.plan.generation)
+    for name, version, policy in core.policies():
+        which, is_default = {"policy": name, "version": version}, version == core.store().default(name)
+        show.gauge("rlservo_policy_loaded", "1 for the default version, 0 for the others", is_default, **which)
+        batcher = core.store().batcher_of(policy)
+        if batcher is not None:
+            runs = "Runs of the network for single observations"
+            show.counter("rlservo_micro_batch_runs", runs, batcher.runs, **which)
+            computed = "Single observations computed in those runs"
+            show.counter("rlservo_micro_batch_observations", computed, batcher.observations, **which)
+        drift = policy.drift
+        if drift is None:
+            continue
+        show.counter("rlservo_observation_looks", "Observations looked at for drift", drift.looks, **which)
+        elements, moved, varied = drift.elements if drift.looks else (), drift.shift, drift.spread
+        if len(elements) > MAX_ELEMENTS:
+            elements, moved, varied = (LARGEST,), moved[[np.argmax(np.abs(moved))]], varied[[np.argmax(varied)]]
+        for element, mean, deviation in zip(elements, moved.tolist(), varied.tolist()):  # noqa: B905 - none before a look
+            shift = "Mean of an observation's element, from its mean in training, in training's standard deviations"
+            show.gauge("rlservo_observation_shift", shift, mean, **which, element=element)
+            spread = "Standard deviation of an observation's element, relative to training"
+            show.gauge("rlservo_observation_spread", spread, deviation, **which, element=element)
+
+
+def networks(core: Core) -> None:
+    """Sample how many networks are in memory, and how often one was opened again, where there is a bound."""
+    show, bounded = core.metrics.sampled, [each for each in core.policies() if each[2].droppable is not None]
+    for name, version, policy in bounded:
+        opened = "Networks that had been dropped from memory and were opened again"
+        restores = 0 if policy.droppable is None else policy.droppable.restores
+        show.counter("rlservo_network_restores", opened, restores, policy=name, version=version)
+    if bounded:
+        in_memory = sum(policy.droppable is not None and policy.droppable.is_in_memory for _, _, policy in bounded)
+        show.gauge("rlservo_networks_in_memory", "Networks in memory, of all that are loaded", in_memory)
+
+
+def queue(core: Core) -> None:
+    """Sample what waits for this process."""
+    admission, show = core.admission, core.metrics.sampled
+    waited = "Most requests that waited for the processor at once, since the start"
+    show.gauge("rlservo_queue_longest", waited, admission.longest)
+    show.gauge("rlservo_requests_incoming", "Requests whose body is on its way", admission.incoming)
+
+
+def keys(core: Core) -> None:
+    """Sample whether the API keys in use are those of their file, and the refusals by rate."""
+    show = core.metrics.sampled
+    current = "1 while the API keys in use are those of their file; 0: the file cannot be used, and older keys stay"
+    show.gauge("rlservo_api_keys_current", current, core.keys.current)
+    for label, count in core.keys.limits.refused.items():
+        show.counter("rlservo_rate_limited", "Requests refused because their key asked too often", count, key=label)
+
+
+def recording(core: Core) -> None:
+    """Sample what is recorded and what is missing, where a recording was asked for."""
+    if core.recorder is None:
+        return
+    recorder, show = core.recorder.recorder, core.metrics.sampled
+    goes_on = "1 while decisions are recorded; 0: the folder could not be written to"
+    show.gauge("rlservo_recording", goes_on, recorder.failure is None)
+    show.counter("rlservo_records_written", "Decisions, and what came of them, in the recording", recorder.written)
+    show.counter("rlservo_records_dropped", "Decisions that the recording's buffer had no room for", recorder.dropped)
+
+
+def sessions(core: Core) -> None:
+    """Sample the episodes in memory."""
+    kept, show = core.episodes.sessions, core.metrics.sampled
+    now = kept.count()
+    for name in sorted({*now, *kept.begun, *kept.lost}):
+        show.gauge("rlservo_sessions", "Sessions kept under an id", now[name], policy=name)
+        show.counter("rlservo_sessions_begun", "Sessions begun under an id", kept.begun[name], policy=name)
+        show.counter("rlservo_sessions_evicted", "Sessions forgotten when idle", kept.evicted[name], policy=name)
+        show.counter("rlservo_sessions_lost", "Requests whose session is not here", kept.lost[name], policy=name)
+    show.gauge("rlservo_episodes_remembered", "Episodes in memory, in sessions and on streams", kept.rows)
+
+
+def shadows(core: Core) -> None:
+    """Sample the actions that shadows are not compared by."""
+    for policy, version, shadow, reason, count in core.shadows.missed():
+        which = {"policy": policy, "version": version, "shadow": shadow, "reason": reason}
+        core.metrics.sampled.counter("rlservo_shadow_missed", "Actions without a comparison", count, **which)
