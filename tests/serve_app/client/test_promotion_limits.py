@@ -145,7 +145,6 @@ def test_metrics_are_summed_over_protocols_for_each_process() -> None:
         ("} 3.0", "} NaN"),
         ("} 3.0", "} +Inf"),
         ("} 3.0", "} three"),
-        ("rlservo_plan_generation{", "rlservo_plan_generation{{"),
     ],
 )
 def test_metrics_that_contradict_themselves_are_not_trusted(true: str, false: str) -> None:

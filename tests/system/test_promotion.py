@@ -1,0 +1,190 @@
+"""`rlservo policy promote` against `rlservo serve` under load: killed, interrupted, and with another operator."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rlservo.export.contract.errors import RlservoError
+from rlservo.serve_app.client.admin_client import AdminClient
+from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.client.promotion_counts import read_metrics
+from servers import Run, free_ports, running, wait_until_served
+
+pytestmark = [pytest.mark.serve, pytest.mark.slow]
+
+OBS = np.full(27, 0.5, np.float32)
+PATIENCE_S = 60
+WORKERS = 1
+
+
+@dataclass
+class Server:
+    """ur5 in 1, 2 (the same network) and 3 (its actions leave the space)."""
+
+    run: Run
+    key_file: Path
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.run.port}"
+
+    @contextlib.contextmanager
+    def admin(self) -> Iterator[AdminClient]:
+        with AdminClient(self.url, api_key=self.key_file.read_text().strip()) as client:
+            yield client
+
+    def served(self) -> tuple[str, Any]:
+        """Return the version in production and the canary."""
+        with self.admin() as admin:
+            (policy,) = admin.listing()["policies"]
+        return policy["version"], policy["canary"] and policy["canary"]["version"]
+
+
+@contextlib.contextmanager
+def started(folder: Path, runtime: Path) -> Iterator[Server]:
+    (port,) = free_ports(1)
+    command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(folder), "--workers", str(WORKERS)]
+    with running([*command, "--port", str(port)], port, XDG_RUNTIME_DIR=str(runtime)) as run:
+        assert run.process.stdout is not None
+        threading.Thread(target=list, args=(run.process.stdout,), daemon=True).start()  # so that the pipe never fills
+        wait_until_served(run)
+        (key_file,) = runtime.rglob("*.key")
+        yield Server(run, key_file)
+
+
+@pytest.fixture
+def server(box_policy: Callable[..., Path], tmp_path: Path) -> Iterator[Server]:
+    for version, scale in (("1", 1.0), ("2", 1.0), ("3", 400.0)):
+        box_policy(tmp_path / "policies", version=version, action_scale=scale)
+    (tmp_path / "runtime").mkdir()
+    with started(tmp_path / "policies", tmp_path / "runtime") as server:
+        with server.admin() as admin:
+            admin.alias("ur5", "production", "1")
+        yield server
+
+
+@dataclass
+class Load:
+    """Answers that clients got."""
+
+    versions: Counter[str] = field(default_factory=Counter)
+    failures: list[str] = field(default_factory=list)
+
+
+@contextlib.contextmanager
+def loaded(server: Server, clients: int = 3) -> Iterator[Load]:
+    """Ask without end, each client one short episode after the other."""
+    load, stop = Load(), threading.Event()
+
+    def ask() -> None:
+        with PolicyClient(server.url, "ur5", timeout_s=5.0) as client:
+            while not stop.wait(0.01):
+                try:
+                    client.reset()
+                    client.act(OBS)
+                    load.versions[client.last_reply["version"]] += 1
+                except RlservoError as error:
+                    load.failures.append(error.code)
+
+    threads = [threading.Thread(target=ask) for _ in range(clients)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield load
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+
+
+@contextlib.contextmanager
+def promoting(server: Server, log: Path, version: str, *words: str) -> Iterator[subprocess.Popen[str]]:
+    """Run `rlservo policy promote`, and end it where the test has not."""
+    command = [sys.executable, "-m", "rlservo.deploy.cli", "policy", "promote", "ur5", version, "--log", str(log),
+               "--canary", "50%", "--max-error-rate", "5%", "--max-p99", "1s", "--every", "0.5", "--min-requests", "30",
+               "--url", server.url, "--key-file", str(server.key_file), *words]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def checks_of(log: Path) -> list[dict[str, Any]]:
+    lines = log.read_text().splitlines() if log.exists() else []
+    return [entry for line in lines if line.endswith("}") and (entry := json.loads(line))["event"] == "check"]
+
+
+def wait_for_checks(process: subprocess.Popen[str], log: Path, count: int) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while len(checks_of(log)) < count:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def outcome_of(process: subprocess.Popen[str]) -> tuple[int, str]:
+    said, _ = process.communicate(timeout=3 * PATIENCE_S)
+    return process.returncode, said
+
+
+def test_killed_half_way_and_started_again_it_promotes_and_no_client_sees_it(server: Server, tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    with loaded(server) as load:
+        with promoting(server, log, "2", "--for", "8s") as process:
+            wait_for_checks(process, log, 3)
+            process.kill()
+            process.wait()
+        assert server.served() == ("1", "2")
+        with promoting(server, log, "2", "--for", "8s") as process:
+            code, said = outcome_of(process)
+    assert code == 0 and said.startswith("promoted: version 2 of 'ur5': failed requests: 0 of"), said
+    assert server.served() == ("2", None)
+    assert load.failures == [] and load.versions["1"] > 30 < load.versions["2"]
+
+
+def test_a_bad_canary_is_rolled_back_at_once(server: Server, tmp_path: Path) -> None:
+    with loaded(server) as load, promoting(server, tmp_path / "log.jsonl", "3", "--for", "10m") as process:
+        code, said = outcome_of(process)
+    assert code == 1 and "failed requests (unsafe-action)" in said, said
+    assert server.served() == ("1", None)
+    assert set(load.failures) == {"unsafe-action"} and load.versions.keys() == {"1"}
+
+
+def test_it_stops_when_another_operator_moves_the_alias(server: Server, tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    with loaded(server), promoting(server, log, "2", "--for", "10m") as process:
+        wait_for_checks(process, log, 2)
+        with server.admin() as admin:
+            admin.alias("ur5", "production", "3")
+        code, said = outcome_of(process)
+    assert code == 4 and "'production' leads to 3 and no longer to 1" in said, said
+    assert server.served() == ("3", None)
+
+
+def test_ctrl_c_ends_the_canary_and_sigterm_leaves_it(server: Server, tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    for number, code, left in ((signal.SIGTERM, 143, ("1", "2")), (signal.SIGINT, 130, ("1", None))):
+        with promoting(server, log, "2", "--for", "10m") as process:
+            wait_for_checks(process, log, len(checks_of(log)) + 1)
+            process.send_signal(number)
+            assert outcome_of(process)[0] == code
+        assert server.served() == left
+    with server.admin() as admin:  # what it read is what Prometheus reads
+        assert len(read_metrics(admin.metrics(), "ur5")) == WORKERS
