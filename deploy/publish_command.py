@@ -16,9 +16,7 @@ def publish(
     bundle: Annotated[
         Path, typer.Argument(help="Bundle, policy folder (its newest version) or one-policy repository.")
     ],
-    uri: Annotated[
-        str, typer.Argument(metavar="URI", help="s3://bucket/policies, gs://, az://, any fsspec URI, or a folder.")
-    ],
+    uri: Annotated[str, typer.Argument(metavar="URI", help="s3://bucket/policies, or a folder.")],
     version: Annotated[
         str | None,
         typer.Option(metavar="N|next", help="Another number than the bundle's own, or the next one that is free."),
@@ -27,8 +25,8 @@ def publish(
 ) -> None:
     """Publish a bundle for `rlservo serve URI`. A published version never changes.
 
-    The bundle is proven first. Its files are written before its manifest, without which nobody sees the version; one
-    that is there is never overwritten. Credentials come from the environment (AWS_..., as the provider's tools).
+    The bundle is proven first. Its files are written before its line in the index, without which nobody sees the
+    version; one that is there is never overwritten. Credentials come from the environment (AWS_...).
 
     Example: `rlservo publish policies/ur5 s3://bucket/policies`
     """
@@ -50,7 +48,7 @@ def publish(
         place = publish_bundle(chosen, uri, progress=terminal.note)
     contract = chosen.contract
     if as_json:
-        print_json({"name": contract.name, "version": contract.version, "sha256": chosen.digest, "manifest": place})
+        print_json({"name": contract.name, "version": contract.version, "sha256": chosen.digest, "place": place})
         return
     terminal.output().print(
         f"{contract.name} version {contract.version} is published: {place}",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -37,7 +38,7 @@ from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, Element
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
-from stores import MemoryLedger
+from stores import plan_files
 
 if TYPE_CHECKING:
     from rlservo.export.commands.export import ExportResult
@@ -429,8 +430,9 @@ def controlled() -> Callable[..., AbstractContextManager[ReplicaVersions]]:
     @contextlib.contextmanager
     def control_of(*folders: Path, config: Any = None, **loader: Any) -> Iterator[ReplicaVersions]:
         loads = VersionLoader(Repository(list(folders)), **loader)
-        control = ReplicaVersions(loads, MemoryLedger(), replica="only")
-        asyncio.run(control.configure({} if config is None else config))
-        yield control
+        with tempfile.TemporaryDirectory() as plans:
+            control = ReplicaVersions(loads, plan_files(Path(plans)), replica="only")
+            asyncio.run(control.configure({} if config is None else config))
+            yield control
 
     return control_of

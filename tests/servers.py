@@ -126,7 +126,9 @@ def served_in_thread(dirs: Sequence[Path], **options: Any) -> Iterator[int]:
 
     def serve() -> None:
         try:
-            serve_policies(dirs, port=port, on_ready=lambda _: ready.set(), stop=stop, **options)
+            with tempfile.TemporaryDirectory() as plans:
+                options["settings"] = {"plan": plans, **options.get("settings", {})}
+                serve_policies(dirs, port=port, on_ready=lambda _: ready.set(), stop=stop, **options)
         except BaseException as error:
             failures.append(error)
 
@@ -221,7 +223,8 @@ def running(arguments: Sequence[str], port: int, **environment: str) -> Iterator
     temporary = _folder(run_id)
     temporary.mkdir()
     variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    variables.update({RUN_ID: run_id, "TMPDIR": str(temporary), **environment})
+    plans = tempfile.mkdtemp()  # the folder of policies may be shared, and its plan would outlive this program
+    variables.update({RUN_ID: run_id, "TMPDIR": str(temporary), "RLSERVO_PLAN": plans, **environment})
     process = subprocess.Popen(
         [*HEEDING_CTRL_C, *arguments],
         stdout=subprocess.PIPE,
@@ -240,6 +243,7 @@ def running(arguments: Sequence[str], port: int, **environment: str) -> Iterator
         assert process.stdout is not None
         process.stdout.close()
         shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(plans)
 
 
 @contextlib.contextmanager

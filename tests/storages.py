@@ -34,6 +34,10 @@ class Cut(bytes):
     """A reply's body of which three quarters come: then the connection breaks."""
 
 
+class Drip(bytes):
+    """A reply's body that comes byte by byte, ten in a second: no read of it ever waits for long."""
+
+
 @dataclass
 class Storage:
     """One bucket, reached through a proxy whose `lie` a test may set."""
@@ -99,7 +103,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self.send_header("content-length", str(len(body)))
             self.end_headers()
             self.close_connection = isinstance(body, Cut)
-            self.wfile.write(body[: len(body) * 3 // 4] if isinstance(body, Cut) else body)
+            if isinstance(body, Drip):
+                for number in range(len(body)):
+                    self.wfile.write(body[number : number + 1])
+                    time.sleep(0.1)
+            else:
+                self.wfile.write(body[: len(body) * 3 // 4] if isinstance(body, Cut) else body)
             return
         self.close_connection = True  # which is the only end of such a reply
         self.end_headers()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,14 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions.plan import PRODUCTION, PolicyPlan, ServedConfig
+from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.policy_store import PolicyStore
 
 
 def load_store(*folders: Path, options: Mapping[str, PolicyOptions] | None = None) -> PolicyStore:
     """Load what a server of these folders would start with."""
-    return load_served(folders, ServedConfig(), ServerSettings(policy_options=dict(options or {})))
+    with tempfile.TemporaryDirectory() as plans:
+        return load_served(folders, ServedConfig(), ServerSettings(policy_options=dict(options or {}), plan=plans))
 
 
 def store_of(*policies: Policy, **given: Any) -> PolicyStore:
@@ -30,17 +33,6 @@ def store_of(*policies: Policy, **given: Any) -> PolicyStore:
     return PolicyStore(policies, plans, **given)
 
 
-class MemoryLedger:
-    """The plans of one process, without Ray; the ledger in Ray is tested with Ray."""
-
-    def __init__(self) -> None:
-        self.plans: dict[int, bytes] = {}
-
-    def newest(self) -> int:
-        return max(self.plans, default=0)
-
-    def fetch(self, generation: int) -> bytes | None:
-        return self.plans.get(generation)
-
-    def append(self, generation: int, content: bytes) -> bool:
-        return self.plans.setdefault(generation, content) is content
+def plan_files(folder: Path, **given: Any) -> PlanFiles:
+    """Plans in a folder of their own."""
+    return PlanFiles([folder], root=str(folder), **given)

@@ -143,7 +143,7 @@ def load_bundle(path: str | Path, limits: BundleLimits = DEFAULT_LIMITS) -> Bund
     BundleTamperedError when a file differs from its recorded hash.
     """
     folder = resolve_bundle(path)
-    digest, sums = _read_sums(folder)
+    digest, sums = read_sums(folder)
     for name in (ONNX_FILE, TORCHSCRIPT_FILE, CONTRACT_FILE, GOLDEN_FILE):
         if name not in sums:
             raise BundleError(f"{folder / SUMS_FILE} does not list {name}: the bundle is incomplete")
@@ -219,11 +219,11 @@ def _parse_contract(file: Path, content: bytes) -> Contract:
 
 def digest_of(folder: Path) -> str:
     """Return what tells a bundle from every other: the hash of its hashes. Raises BundleError."""
-    return _read_sums(folder)[0]
+    return read_sums(folder)[0]
 
 
-def _read_sums(folder: Path) -> tuple[str, dict[str, str]]:
-    """Return (the hash of SHA256SUMS, what it records by file name)."""
+def read_sums(folder: Path) -> tuple[str, dict[str, str]]:
+    """Return (the hash of SHA256SUMS, what it records by file name: no path, no leading dot). Raises BundleError."""
     file = folder / SUMS_FILE
     content = b"".join(_blocks(file, MAX_SUMS_BYTES))
     try:
@@ -232,7 +232,7 @@ def _read_sums(folder: Path) -> tuple[str, dict[str, str]]:
         raise BundleError(f"{file} cannot be read: {error}") from error
     sums: dict[str, str] = {}
     for number, line in enumerate(lines, start=1):
-        match = re.fullmatch(r"([0-9a-f]{64})  ([A-Za-z0-9._-]+)", line)
+        match = re.fullmatch(r"([0-9a-f]{64})  ([A-Za-z0-9_-][A-Za-z0-9._-]*)", line)
         if match is None:
             raise BundleError(f"{file}, line {number}: expected '<sha256>  <file name>'")
         sums[match[2]] = match[1]

@@ -25,11 +25,9 @@ them to exit codes.
     ├── SessionError              session-conflict         a session's requests contradict each other
     │   └── SessionLostError      session-lost             the server has no such session (any more)
     ├── UnavailableError          unavailable              not ready, or the server cannot be reached
-    │   ├── NetworkAwayError      network-away             a version's network is not in memory, nor soon enough
     │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
     │   ├── RateLimitError        rate-limited             the API key asked more often than it may
     │   ├── LateError             late                     the observation waited too long: send a newer one
-    │   └── PartlyAppliedError    partly-applied           a change that some replicas could not follow
     ├── InternalError             internal                 the server's own fault: its log says more
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
 """
@@ -189,12 +187,6 @@ class UnavailableError(RlservoError):
     retry_after_s: float | None = None  # [s] after which the server wants to be asked again, where it said so
 
 
-class NetworkAwayError(UnavailableError):
-    """The network of the version that was asked is not in memory, and was not opened, or not in time."""
-
-    code = "network-away"
-
-
 class OverloadedError(UnavailableError):
     """The server has as much work as it takes on; nothing was computed."""
 
@@ -216,12 +208,6 @@ class LateError(UnavailableError):
     """The observation waited longer than the server answers as fresh; nothing was computed."""
 
     code = "late"
-
-
-class PartlyAppliedError(UnavailableError):
-    """A change was accepted, and some replicas have not followed it."""
-
-    code = "partly-applied"
 
 
 class ConflictError(RlservoError):

@@ -42,35 +42,34 @@ class AdminClient(Closeable):
 
     def load(self, name: str, version: str | None = None) -> dict[str, Any]:
         """Load and prove a version; None is the repository's newest."""
-        return self._command(name, "load", {"version": version})
+        return self.command(name, "load", {"version": version})
 
     def unload(self, name: str, version: str | None = None) -> dict[str, Any]:
         """Drop a version, or with None the policy."""
-        return self._command(name, "unload", {"version": version})
+        return self.command(name, "unload", {"version": version})
 
     def alias(self, name: str, alias: str, version: str | None, *, expected: str | None = None) -> dict[str, Any]:
         """Let an alias lead to a loaded version, or with None remove it; unless it no longer leads to `expected`."""
-        return self._command(name, "alias", {"alias": alias, "version": version, "expected": expected})
+        return self.command(name, "alias", {"alias": alias, "version": version, "expected": expected})
 
     def rollback(self, name: str, alias: str) -> dict[str, Any]:
-        """Let an alias lead where it led before; once, even if the proxy should send the command twice."""
-        policies = [policy for replica in self.replicas() for policy in replica["policies"] if policy["name"] == name]
-        expected = policies[0]["aliases"].get(alias) if policies else None
-        return self._command(name, "rollback", {"alias": alias, "expected": expected})
+        """Let an alias lead where it led before."""
+        return self.command(name, "rollback", {"alias": alias})
 
     def canary(self, name: str, version: str | None, share: float | None = None) -> dict[str, Any]:
         """Send a share of the sessions to a version, or with None end that."""
-        return self._command(name, "canary", {"version": version, "share": share})
+        return self.command(name, "canary", {"version": version, "share": share})
 
     def shadow(self, name: str, version: str | None) -> dict[str, Any]:
         """Let a version compute along, or with None end that."""
-        return self._command(name, "shadow", {"version": version})
+        return self.command(name, "shadow", {"version": version})
 
     def close(self) -> None:
         """Close the connection."""
         self._transport.close()
 
-    def _command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
+    def command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
+        """Give a command (`load`, `unload`, `alias`, `rollback`, `canary`, `shadow`); return what is served then."""
         reply: dict[str, Any] = self._transport.post("v1", "admin", "policies", name, command, body=encode(document))
         return reply
 

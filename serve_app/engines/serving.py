@@ -11,8 +11,7 @@ from typing import Any
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.sampled_metrics import keep_sampled
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.server.start_check import version_loader
-from rlservo.serve_app.versions.plan_ledger import MemoryLedger
+from rlservo.serve_app.server.start_check import plan_files, version_loader
 from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 
 
@@ -27,7 +26,8 @@ class Serving:
         Nothing is loaded yet. Raises UsageError.
         """
         self.settings = settings
-        self.control = ReplicaVersions(version_loader(places, settings), MemoryLedger(), replica=replica)
+        loader, files = version_loader(places, settings), plan_files(places, settings)
+        self.control = ReplicaVersions(loader, files, replica=replica)
         self.app = create_app(
             lambda: self.control.store,
             settings,
@@ -40,7 +40,10 @@ class Serving:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self, served: Any) -> None:
-        """Load and prove what `served` (ServedConfig) says. Raises UsageError, BundleError and UnavailableError."""
+        """Load and prove what the plan says, or where there is none `served` (ServedConfig).
+
+        Raises UsageError, BundleError and UnavailableError.
+        """
         await self.control.configure(served)
         self.core.admission.loop_clock.start()
         self._tasks.append(asyncio.create_task(self.control.poll_ledger()))

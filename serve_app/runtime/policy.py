@@ -38,7 +38,6 @@ from rlservo.serve_app.runtime.loading import (
     leaves_value_out,
     open_graph,
 )
-from rlservo.serve_app.runtime.network_memory import DroppableNetwork, NetworkMemory
 from rlservo.serve_app.runtime.observations import ObservationParser, Observed
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.recurrent_state import State, StateTensors
@@ -108,7 +107,7 @@ class Policy(Closeable):
     def __init__(
         self,
         bundle: Bundle,
-        ort_session: onnxruntime.InferenceSession | DroppableNetwork,
+        ort_session: onnxruntime.InferenceSession,
         options: PolicyOptions = DEFAULT_OPTIONS,
         *,
         graph_hash: str = "",
@@ -120,7 +119,7 @@ class Policy(Closeable):
         self.identity = f"{contract.name}/{contract.version}#{graph_hash[:SHOWN_HASH]}"
         """Name, version and graph, the same wherever it is loaded: a recurrent state goes to the policy of its own."""
         self._contract = contract
-        self._ort_session: onnxruntime.InferenceSession | DroppableNetwork | None = ort_session
+        self._ort_session: onnxruntime.InferenceSession | None = ort_session
         self._run: Run = ort_session.run
         self._run_whole: Run | None = None  # with the value head, once that is asked for
         self._rng = np.random.default_rng()
@@ -165,15 +164,13 @@ class Policy(Closeable):
         check_golden: bool = True,
         options: PolicyOptions = DEFAULT_OPTIONS,
         limits: BundleLimits = DEFAULT_LIMITS,
-        memory: NetworkMemory | None = None,
     ) -> Self:
         """Load the bundle at `path` (a bundle, a policy folder or a repository with one policy).
 
         Checks hashes, the graph against the contract and, unless `check_golden` is off, that this machine reproduces
         the golden vectors. `threads` is onnxruntime's intra-op thread count; one is fastest for networks of this size.
 
-        `options` say how strict it is at its edges, `limits` how large the bundle's files may be. With a `memory` the
-        network is in memory only while it fits into that bound; who asks it then gets NetworkDroppedError.
+        `options` say how strict it is at its edges, `limits` how large the bundle's files may be.
 
         Raises BundleError, BundleTamperedError or GoldenMismatchError, and UsageError where the options do not fit.
         """
@@ -192,8 +189,7 @@ class Policy(Closeable):
             ort_session = open_graph(bundle, threads, acts_only=True)
             if check_golden:
                 check_golden_vectors(bundle, ort_session.run, acting_outputs(bundle.contract))
-        network = ort_session if memory is None else memory.add(bundle, ort_session, threads)
-        return cls(bundle, network, options, graph_hash=bundle.sums[ONNX_FILE])
+        return cls(bundle, ort_session, options, graph_hash=bundle.sums[ONNX_FILE])
 
     @property
     def contract(self) -> Contract:
@@ -208,11 +204,6 @@ class Policy(Closeable):
     def graph_hash(self) -> str:
         """SHA-256 of the graph file, in hexadecimal digits."""
         return self._graph_hash
-
-    @property
-    def droppable(self) -> DroppableNetwork | None:
-        """The network where it is in memory within a bound; None where it is always, and of a closed policy."""
-        return self._ort_session if isinstance(self._ort_session, DroppableNetwork) else None
 
     @property
     def digest(self) -> str:
@@ -360,8 +351,7 @@ class Policy(Closeable):
 
     def check_rows(self) -> None:
         """Raise BundleError where the network computes several observations otherwise than each by itself."""
-        network = self._open()
-        check_rows(self._bundle, (network.restore() if isinstance(network, DroppableNetwork) else network).run)
+        check_rows(self._bundle, self._open().run)
 
     def fingerprint(self, inputs: Mapping[str, NDArray[Any]]) -> bytes:
         """Return a hash of the observation in the network's inputs (`parse`, `Step.inputs`)."""
@@ -383,7 +373,7 @@ class Policy(Closeable):
         self._run = self._run_whole = _refuse_closed
         self._ort_session = None
 
-    def _open(self) -> onnxruntime.InferenceSession | DroppableNetwork:
+    def _open(self) -> onnxruntime.InferenceSession:
         if self._ort_session is None:
             _refuse_closed([], {})
         return self._ort_session

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.versions.plan import Canary, Refusal
+from rlservo.serve_app.versions.plan import Canary
 from rlservo.serve_app.versions.replica_versions import VersionState
 
 
@@ -57,8 +57,7 @@ class PolicyList(BaseModel):
     generation: int = Field(description="Counts the changes of what is served; the same number, the same policies.")
     changed_at: str | None
     changed_by: str | None
-    refused: Refusal | None = Field(description="The last change, if it was refused: what ran before goes on.")
-    behind: list[str] = Field(description="What this replica could not follow, a sentence each; usually empty.")
+    behind: list[str] = Field(description="What this process could not follow, a sentence each; usually empty.")
 
 
 def describe(core: Core) -> dict[str, Any]:
@@ -103,8 +102,7 @@ def describe(core: Core) -> dict[str, Any]:
         "generation": plan.generation if plan is not None else 0,
         "changed_at": plan and plan.changed_at,
         "changed_by": plan and plan.changed_by,
-        "refused": plan and plan.refused and plan.refused.model_dump(),
-        "behind": list(control.progress().behind) if control is not None else [],
+        "behind": list(control.behind) if control is not None else [],
     }
 
 

@@ -26,22 +26,19 @@ from rlservo.export.contract.errors import (
     OverloadedError,
     RequestError,
     RlservoError,
-    SessionError,
     TooLargeError,
     UnavailableError,
 )
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import Episode, Request, check_deadline
 from rlservo.serve_app.episodes.sessions import Session
-from rlservo.serve_app.runtime.network_memory import NetworkDroppedError
 from rlservo.serve_app.server.api_keys import A_KEY
 from rlservo.serve_app.server.loop_clock import LoopClock
 from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
 from rlservo.serve_app.server.row_count import count_rows, most_rows
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.network_restorer import NetworkRestorer
-from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blame, blamed_version
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blamed_version
 from rlservo.serve_app.versions.shadow import Shadows
 
 if TYPE_CHECKING:
@@ -161,7 +158,6 @@ class RequestPath:
         self.metrics = Metrics(replica)
         self.log = RequestLog(settings)
         self.shadows = Shadows(self.metrics.record_differences)
-        self._restorer = NetworkRestorer()
         self.recorder: RequestRecorder | None = None
 
     def store(self) -> PolicyStore:
@@ -210,7 +206,7 @@ class RequestPath:
         return reply
 
     async def decide(self, request: Request) -> Decision:
-        """Decide, unless its deadline has passed; a network that was dropped from memory is opened again first.
+        """Decide, unless its deadline has passed.
 
         Raises DeadlineError, LateError, SessionError, TooLargeError, UnavailableError and what `PolicyStore.act` and
         `Episodes.act` raise.
@@ -223,52 +219,19 @@ class RequestPath:
             self._check_batch(store, request)
         if request.episode is not None and request.episode.session_id is not None:
             await self._check_client(store, request)
-        began, version = time.perf_counter(), request.version
-        while True:
-            try:
-                if request.episode is not None or request.stream is not None:
-                    decision = self.episodes.act(store, request)
-                elif store.batches and not request.explore:
-                    check = partial(_check_again, request, began, self.admission.max_wait_s)
-                    decision = await store.act_together(name, version, obs, label=request.label, check=check)
-                else:
-                    decision = store.act(
-                        name, version, obs, explore=request.explore, seed=request.seed, label=request.label
-                    )
-                break
-            except NetworkDroppedError as dropped:  # nothing was computed, and nobody's state has moved on
-                await self._restore(dropped, request, self.admission.max_wait_s)
-                before, store = store, self.store()
-                # A canary is not drawn again: it would lose most of its requests whenever it was dropped.
-                version = dropped.network.version if store is before else request.version
+        if request.episode is not None or request.stream is not None:
+            decision = self.episodes.act(store, request)
+        elif store.batches and not request.explore:
+            check = partial(_check_again, request, time.perf_counter(), self.admission.max_wait_s)
+            decision = await store.act_together(name, request.version, obs, label=request.label, check=check)
+        else:
+            decision = store.act(
+                name, request.version, obs, explore=request.explore, seed=request.seed, label=request.label
+            )
         shadow = store.shadow(name)
         if shadow is not None and decision.version == shadow.of and not request.explore:
             self.shadows.offer(shadow, obs, decision)
         return decision
-
-    async def _restore(self, dropped: NetworkDroppedError, request: Request, wait_s: float) -> None:
-        """Wait for a network that was dropped, until `wait_s` after the request came.
-
-        Raises UnavailableError, DeadlineError, and SessionError where its session went on meanwhile: a client that gave
-        up and asked again would have moved the memory twice.
-        """
-        left_s = wait_s - (time.perf_counter() - request.received)
-        session = self._session_of(request)
-        steps = 0 if session is None else session.steps
-        try:
-            await self._restorer.restore(dropped.network, max(left_s, 0.0))
-        except Exception as error:
-            blame(error, dropped.network.version)
-            raise
-        if request.deadline_ms is not None:
-            check_deadline(request)
-        if session is None or request.seq is not None:
-            return
-        if self._session_of(request) is not session or session.steps != steps:
-            raise SessionError(
-                "while this request waited for its network, another one of its session was answered: wait for each "
-                "answer, or number the requests ('seq')"
-            )
 
     async def _check_client(self, store: PolicyStore, request: Request) -> None:
         """Raise ClientGoneError where a session's client gave its request up: its next episode may have begun."""

@@ -38,7 +38,7 @@ async def keep_sampled(core: Core) -> None:
 
 def sample(core: Core) -> None:
     """Bring all counters and gauges up to date."""
-    for part in (requests, versions, networks, queue, keys, recording, sessions, shadows):
+    for part in (requests, versions, queue, keys, recording, sessions, shadows):
         part(core)
     core.metrics.sampled.end_round()
 
@@ -83,18 +83,6 @@ def versions(core: Core) -> None:
             show.gauge("rlservo_observation_shift", shift, mean, **which, element=element)
             spread = "Standard deviation of an observation's element, relative to training"
             show.gauge("rlservo_observation_spread", spread, deviation, **which, element=element)
-
-
-def networks(core: Core) -> None:
-    """Sample how many networks are in memory, and how often one was opened again, where there is a bound."""
-    show, bounded = core.metrics.sampled, [each for each in core.policies() if each[2].droppable is not None]
-    for name, version, policy in bounded:
-        opened = "Networks that had been dropped from memory and were opened again"
-        restores = 0 if policy.droppable is None else policy.droppable.restores
-        show.counter("rlservo_network_restores", opened, restores, policy=name, version=version)
-    if bounded:
-        in_memory = sum(policy.droppable is not None and policy.droppable.is_in_memory for _, _, policy in bounded)
-        show.gauge("rlservo_networks_in_memory", "Networks in memory, of all that are loaded", in_memory)
 
 
 def queue(core: Core) -> None:

@@ -129,23 +129,21 @@ class ServerSettings(BaseModel):
     max_policy_bytes: int = Field(512 << 20, ge=1024)
     """A larger policy.onnx (or policy.ts) is refused before it is read. Loading takes about twice its size."""
 
-    network_bytes: int | None = Field(None, ge=1)
-    """Bytes of policy.onnx whose networks a replica keeps in memory at most, at up to twice their size. All policies
-    are loaded and proven at the start all the same; the network used longest ago is dropped for another, and opened
-    again when a request asks for it. Without it all are kept."""
-
     max_golden_bytes: int = Field(512 << 20, ge=1024)
     """A larger golden.npz, packed or unpacked, is refused before it is read."""
 
     max_contract_bytes: int = Field(16 << 20, ge=1024)
     """A larger contract.json is refused before it is read."""
 
+    plan: str | None = None
+    """Folder or URI in whose `.plan` the aliases, canaries and shadows stand. By default the first of the places of
+    policies that can be written, else the user's state folder (`$XDG_STATE_HOME/rlservo`)."""
+
     scan_timeout_s: float = Field(10.0, gt=0, allow_inf_nan=False)
     """[s] A look through the policies' folders that takes longer is given up: a file system may hang."""
 
     load_timeout_s: float = Field(30.0, gt=0, allow_inf_nan=False)
-    """[s] Loading and proving one version that takes longer is given up. Below 45, within which every replica has to
-    follow a change."""
+    """[s] Loading and proving one version that takes longer is given up."""
 
     cache: str | None = None
     """Folder of this machine into which versions of remote repositories (`rlservo serve s3://...`) are fetched;
@@ -160,7 +158,8 @@ class ServerSettings(BaseModel):
 
     poll_s: float | None = Field(None, ge=1, allow_inf_nan=False)
     """[s] Look through the places of policies this often, and load versions that are newer than those known, as
-    `rlservo policy load` does: ready, not in use. Off by default. `rlservo serve --poll` sets it, too."""
+    `rlservo policy load` does: ready, not in use. Off by default. `rlservo serve --poll` sets it, too. The plan is read
+    twice a second, in object storage every 5 s, or this often where that is more often."""
 
     docs: bool = True
     """Serve web pages, from files that come with the server: what runs at `/`, the API's documentation at /docs."""

@@ -3,38 +3,39 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
-from rlservo.export.contract.errors import BundleError, RlservoError
-from rlservo.serve_app.runtime.network_memory import NetworkMemory
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.export.contract.errors import UnavailableError
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan import ServedConfig
-from rlservo.serve_app.versions.plan_changes import plan_of
+from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.policy_store import PolicyStore, load_policy
-from rlservo.serve_app.versions.repository import Repository, raise_all
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
 
 
 def load_served(
-    paths: Iterable[str | Path], config: ServedConfig, settings: ServerSettings | None = None
+    paths: Sequence[str | Path], config: ServedConfig, settings: ServerSettings | None = None
 ) -> PolicyStore:
-    """Load and prove what a server of these folders would start with.
+    """Load and prove what a server of these folders starts with; a repository without a plan gets its first one.
 
     Raises UsageError or BundleError, and UnavailableError where a file system or storage does not answer.
     """
-    loader = version_loader(paths, settings or ServerSettings.from_environment(environment={}))
-    return asyncio.run(_load_all(loader, config))
+    settings = settings or ServerSettings.from_environment(environment={})
+    control = ReplicaVersions(version_loader(paths, settings), plan_files(paths, settings))
+    asyncio.run(control.configure(config.model_dump(exclude_unset=True)))
+    if control.store is None:
+        raise UnavailableError("no policies were loaded")
+    return control.store
 
 
 def version_loader(places: Iterable[str | Path], settings: ServerSettings) -> VersionLoader:
     """Return what loads the versions of these folders and URIs as the settings say. Raises UsageError."""
     limits = settings.bundle_limits
-    memory = None if settings.network_bytes is None else NetworkMemory(settings.network_bytes)
-    options = settings.policy_options
-    load = partial(load_policy, threads=settings.threads, options=options, limits=limits, memory=memory)
+    load = partial(load_policy, threads=settings.threads, options=settings.policy_options, limits=limits)
     repository = Repository(
         places,
         limits,
@@ -50,15 +51,12 @@ def version_loader(places: Iterable[str | Path], settings: ServerSettings) -> Ve
     )
 
 
-async def _load_all(loader: VersionLoader, config: ServedConfig) -> PolicyStore:
-    plans = plan_of(config, await loader.available(config), None)
-    policies: list[Policy] = []
-    errors: list[RlservoError] = []
-    for name, plan in plans.items():
-        for version, digest in plan.versions.items():
-            try:
-                policies.append(await loader.load(name, version, digest))
-            except BundleError as error:
-                errors.append(error)
-    raise_all(errors)
-    return PolicyStore(policies, plans)
+def plan_files(places: Sequence[str | Path], settings: ServerSettings) -> PlanFiles:
+    """Return where the plan of these folders and URIs is kept, as the settings say. Raises UsageError."""
+    return PlanFiles(
+        places,
+        root=settings.plan,
+        cache=settings.cache,
+        timeout_s=settings.storage_timeout_s,
+        poll_s=settings.poll_s,
+    )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -17,6 +18,9 @@ from typing import Any, TypeVar
 
 from rlservo.export.contract.errors import UnavailableError
 
+logger = logging.getLogger(__name__)
+
+SILENCE_S = 10.0  # [s] after which it is said what is waited for
 LIMIT = 4  # threads at once, those that were given up included
 
 Result = TypeVar("Result")
@@ -44,8 +48,12 @@ class BlockingCalls:
             ) from None
         returned = asyncio.wrap_future(self._start(function, arguments))
         try:
-            left_s = None if timeout_s is None else timeout_s - (time.monotonic() - began)
-            done, _ = await asyncio.wait([returned], timeout=left_s)
+            done: set[asyncio.Future[Result]] = set()
+            while not done and (timeout_s is None or time.monotonic() - began < timeout_s):
+                left_s = SILENCE_S if timeout_s is None else timeout_s - (time.monotonic() - began)
+                done, _ = await asyncio.wait([returned], timeout=min(SILENCE_S, left_s))
+                if not done and left_s >= SILENCE_S:
+                    logger.warning("waiting for %s (%.0f s)", what, time.monotonic() - began)
         finally:
             returned.cancel()  # if it has not returned: nobody waits for it any more
         if not done:

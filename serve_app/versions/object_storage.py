@@ -1,36 +1,27 @@
-"""Objects below one URI in any storage that fsspec reads: s3://, gs://, az://, http(s)://, memory:// ...
+"""Objects below one URI: s3:// (Amazon's, and every storage of that protocol), and http(s)://, which is only read.
 
-Every call ends by itself: what takes longer than the time-out is an error, and an error is one sentence that names the
-object. Credentials come from the environment and the provider's own chain, never from a URI. What a storage says of its
-objects (sizes, ETags) is believed for nothing but looking again.
+botocore finds credentials, region and endpoint as Amazon's own tools do, and signs a URL for each call; the calls
+themselves are `bounded_http.py`'s, so that a storage which sends too much or too slowly is refused.
 """
 
 from __future__ import annotations
 
-import contextlib
-import logging
+import io
 import re
-import threading
-from collections.abc import Callable, Iterator, Sequence
+import time
 from pathlib import Path
-from typing import Any
-from urllib.parse import unquote, urlsplit
+from typing import Any, BinaryIO
+from urllib.parse import quote, unquote, urlsplit
 
 from rlservo.export.contract.errors import BundleError, UnavailableError, UsageError, first_line
-from rlservo.serve_app.versions.reply_bound import bound_aiohttp, bounded_replies
+from rlservo.serve_app.versions.bounded_http import Reply, TooLongReplyError, request
 
-logger = logging.getLogger(__name__)
-
-BESIDE = 1 << 16  # [bytes] that a call's replies may bring beside what was asked for: metadata, errors
-LISTING = 32 << 20  # [bytes] of a folder's list: S3 sends some 324 for each version of a policy
-BLOCK = 8 << 20  # [bytes] asked for at once; each has the time-out for itself
-SLOWEST = 256 << 10  # [bytes/s] by which a larger block may take longer than the time-out
-SILENCE_S = 10.0  # [s] after which it is said what is waited for
-READ_ONLY = ("http", "https")
+PAGE = 2 << 20  # [bytes] of a list: 1,000 names of at most 1,024 bytes
+MOST_PAGES = 100
+RETRY_AFTER_S = 0.2
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.:-]+://")  # two letters and more: C:// would be a drive
-_SECRETS = re.compile(
-    r"[A-Za-z0-9+/=_.~%-]{32,}|\b(AKIA|ASIA)[A-Z0-9]+"
-)  # tokens and signatures that a storage repeats
+_SECRETS = re.compile(r"[A-Za-z0-9+/=_.~%-]{32,}|\b(AKIA|ASIA)[A-Z0-9]+")  # which a storage may repeat
+_CONDITIONS = {"IfNoneMatch": "If-None-Match", "IfMatch": "If-Match"}
 
 
 def is_uri(place: str | Path) -> bool:
@@ -42,174 +33,153 @@ def place_of(place: str | Path) -> str:
     """Return an absolute folder (`file://` is one, too) or a URI that holds no secret. Raises UsageError."""
     if not is_uri(place):
         return str(Path(place).expanduser().absolute())
-    uri = str(place).rstrip("/")
-    parts = urlsplit(uri)
-    if parts.password is not None:
-        shown = uri.replace(parts.netloc, f"...@{parts.netloc.rpartition('@')[2]}")
-        raise UsageError(f"{shown} holds a password: credentials come from the environment, never from the URI")
-    if parts.query or parts.fragment:
-        raise UsageError(
-            f"{uri.partition('?')[0].partition('#')[0]}: a query or fragment may hold a secret: leave it out"
-        )
-    if "::" in uri:
-        raise UsageError(f"{uri}: expected one protocol, such as s3://bucket/policies")
-    if parts.scheme == "file":
-        if parts.netloc not in ("", "localhost"):
-            raise UsageError(f"{uri}: expected file:///absolute/path")
+    parts = urlsplit(str(place).rstrip("/"))
+    if parts.scheme == "file" and parts.netloc in ("", "localhost"):
         return unquote(parts.path) or "/"
-    return uri
+    if parts.scheme not in ("s3", "http", "https") or not parts.hostname or "@" in parts.netloc or parts.query:
+        shown = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
+        raise UsageError(
+            f"{shown}: expected s3://bucket/policies, https://host/policies or file:///policies; a password or query "
+            "may be a secret, and credentials come from the environment"
+        )
+    return parts.geturl()
 
 
 class ObjectStorage:
     """Objects below one URI."""
 
     def __init__(self, uri: str, *, timeout_s: float = 15.0) -> None:
+        """Nothing is asked yet. Each call may take `timeout_s`, with a large object longer. Raises UsageError."""
         self.uri = place_of(uri)
         self.timeout_s = timeout_s
-        self._opened: tuple[Any, str] | None = None
+        self.is_read_only = not self.uri.startswith("s3://")
+        self._bucket, self._prefix = urlsplit(self.uri).netloc, urlsplit(self.uri).path.strip("/")
+        self._client: Any = None
 
-    @property
-    def is_read_only(self) -> bool:
-        """Whether nothing can be written there."""
-        return self.uri.partition("://")[0] in READ_ONLY
+    def read(self, name: str, most: int) -> tuple[bytes, str]:
+        """Return an object and its tag for `replace`.
 
-    def entries(self, name: str = "") -> dict[str, Any]:
-        """Return what is directly below a folder, by name: for a file what changes with it (None: unknown), for a
-        folder False. Empty where there is no such folder. Raises UnavailableError.
+        Raises FileNotFoundError, UnavailableError, and BundleError beyond `most` bytes.
         """
-        filesystem, _ = self._open()
-        filesystem.invalidate_cache()
-        try:
-            entries = self._call(name, "ls", self._path(name) + "/" * self.is_read_only, detail=True, most=LISTING)
-        except FileNotFoundError:
-            return {}
-        return {entry["name"].rstrip("/").rpartition("/")[2]: _stamp(entry) for entry in entries}
+        content = io.BytesIO()
+        reply = self.copy(name, most, content)
+        return content.getvalue(), reply.headers.get("etag", "")
 
-    def read(self, name: str, most: int) -> bytes:
-        """Return at most `most` bytes of an object.
-
-        Raises FileNotFoundError, UnavailableError, and BundleError where the storage sends more.
-        """
-        content: bytes = self._call(name, "cat_file", self._path(name), start=0, end=most, size=most, most=most)
-        return content[:most]
-
-    def blocks(self, name: str, size: int) -> Iterator[bytes]:
-        """Yield the `size` bytes that an object should have.
-
-        Raises FileNotFoundError, UnavailableError, and BundleError where the storage sends more.
-        """
-        done = 0
-        while done < size:
-            wanted = min(BLOCK, size - done)
-            most = wanted if done else size  # a server that knows no ranges sends all of it at once
-            block = self._call(
-                name, "cat_file", self._path(name), start=done, end=done + wanted, size=wanted, most=most
-            )
-            if done == 0 and len(block) >= size:
-                block = block[:size]
-            elif len(block) != wanted:
-                raise UnavailableError(f"{self.uri}/{name} ends after {done + len(block):,} of {size:,} bytes")
-            done += len(block)
-            yield block
+    def copy(self, name: str, most: int, into: BinaryIO) -> Reply:
+        """Copy an object into an empty file. Raises what `read` raises."""
+        reply = self._call("get_object", name, {}, into=into, most=most)
+        if reply.status == 404:
+            raise FileNotFoundError(f"{self.uri}/{name}")
+        return self._succeeded(reply, name)
 
     def create(self, name: str, content: bytes) -> bool:
-        """Write an object that is not there; return False where the storage says that it is.
+        """Write an object unless there is one; return whether it holds this content now, whoever wrote it.
 
-        A storage without conditional writes may overwrite it: whoever needs to know reads it again. Raises
-        UnavailableError.
+        Raises UnavailableError, also where the storage does not keep what it was given.
         """
-        try:
-            self._call(name, "pipe_file", self._path(name), content, mode="create", size=len(content))
-        except FileExistsError:
+        return self._write(name, content, {"IfNoneMatch": "*"})
+
+    def replace(self, name: str, content: bytes, tag: str) -> bool:
+        """Write an object that has not changed since it was read; return and raise what `create` does."""
+        return self._write(name, content, {"IfMatch": tag})
+
+    def names(self, folder: str) -> list[str]:
+        """Return the names of all objects below a folder. Raises UnavailableError."""
+        prefix = f"{self._prefix}/{folder}/".lstrip("/")
+        found: list[str] = []
+        for _ in range(MOST_PAGES):
+            page = io.BytesIO()
+            given = {"Prefix": prefix, "StartAfter": prefix + found[-1] if found else ""}
+            self._succeeded(self._call("list_objects_v2", folder, given, into=page, most=PAGE), folder)
+            text = page.getvalue().decode(errors="replace")
+            if "<ListBucketResult" not in text:
+                raise UnavailableError(f"{self.uri}/{folder}: what the storage sent is no list of objects")
+            found += [key.removeprefix(prefix) for key in re.findall(r"<Key>([^<]+)</Key>", text)]
+            if "<IsTruncated>true" not in text:
+                return found
+        raise UnavailableError(f"{self.uri}/{folder} has more than {len(found):,} objects")
+
+    def _write(self, name: str, content: bytes, condition: dict[str, str]) -> bool:
+        reply = self._call("put_object", name, condition, content)
+        if reply.status not in (409, 412):  # there is one, or another write was under way
+            self._succeeded(reply, name)
+        try:  # it may be ours: the reply to a first attempt was lost; and a storage may keep something else
+            return self.read(name, len(content))[0] == content
+        except BundleError:
             return False
-        except FileNotFoundError as error:  # the bucket, say
-            raise UnavailableError(f"{self.uri}/{name} cannot be written: {first_line(error)}") from None
-        return True
+        except FileNotFoundError:
+            raise UnavailableError(f"{self.uri}/{name} is not there after it was written") from None
 
-    def _path(self, name: str) -> str:
-        _, root = self._open()
-        return f"{root}/{name}" if name else root
-
-    def _open(self) -> tuple[Any, str]:
-        """Return the file system and the root's path on it. Nothing is asked yet."""
-        if self._opened is None:
-            options: dict[str, Any] = {"skip_instance_cache": True, "use_listings_cache": False}
-            if self.uri.startswith("s3://"):  # botocore would try for longer than anybody waits, and not say why
-                options["config_kwargs"] = {"connect_timeout": self.timeout_s / 2, "retries": {"max_attempts": 1}}
+    def _call(
+        self,
+        method: str,
+        name: str,
+        given: dict[str, str],
+        body: bytes = b"",
+        *,
+        into: BinaryIO | None = None,
+        most: int = 0,
+    ) -> Reply:
+        """Send a request, and once more where the connection breaks or the storage is busy."""
+        place, timeout_s = f"{self.uri}/{name}", self.timeout_s
+        headers = {header: given[key] for key, header in _CONDITIONS.items() if key in given}
+        reason = ""
+        for _ in range(2):
+            verb, url = self._signed(method, name, given)
+            into = into or io.BytesIO()
+            into.seek(0)
+            into.truncate()
             try:
-                import fsspec
-
-                filesystem, root = fsspec.core.url_to_fs(self.uri, **options)
-            except (ImportError, ValueError) as error:
-                raise UsageError(
-                    f"{self.uri} cannot be opened here: pip install 'rlservo[remote]' for s3:// and http(s)://; other "
-                    f"protocols need fsspec's package for them ({first_line(error)})"
-                ) from None
-            bound_aiohttp()
-            self._opened = filesystem, root.rstrip("/")
-        return self._opened
-
-    def _call(self, name: str, method: str, *arguments: Any, size: int = 0, most: int = 0, **options: Any) -> Any:
-        """Call the file system, which may send or get `size` bytes and read `most`."""
-        filesystem, _ = self._open()
-        timeout_s = self.timeout_s + size / SLOWEST
-        if filesystem.async_impl:
-            options["timeout"] = timeout_s
-        place = f"{self.uri}/{name}".rstrip("/")
-        with bounded_replies(most + BESIDE, of_all=method == "ls") as bound:  # of which pages may come without end
-            try:
-                reply = getattr(filesystem, method)(*arguments, **options)
-            except (FileNotFoundError, FileExistsError):
-                if not bound.is_exceeded:
-                    raise
-            except Exception as error:  # each file system has errors of its own
-                if not bound.is_exceeded:
-                    raise UnavailableError(f"{place} {_reason(error, timeout_s)}") from None
+                reply = request(verb, url, headers, body, into=into, most=most, timeout_s=timeout_s)
+            except TooLongReplyError:
+                kind = UnavailableError if method == "list_objects_v2" else BundleError
+                raise kind(f"{place}: the storage sends more than the {most:,} bytes that it may") from None
+            except TimeoutError:
+                raise UnavailableError(f"{place} gave no answer within {timeout_s:.0f} s, or too slow a one") from None
+            except ConnectionError as error:
+                reason = _hidden(str(error))
             else:
-                if not bound.is_exceeded:
+                if reply.status < 429:
                     return reply
-        kind = BundleError if method == "cat_file" else UnavailableError
-        raise kind(f"{place}: the storage sends more than the {most:,} bytes that it may")
+                reason = _said(reply)
+            time.sleep(RETRY_AFTER_S)
+        raise UnavailableError(f"{place} cannot be reached or read: {reason}")
+
+    def _signed(self, method: str, name: str, given: dict[str, str]) -> tuple[str, str]:
+        if self.is_read_only:
+            return "GET", f"{self.uri}/{quote(name)}"
+        key = {} if "Prefix" in given else {"Key": f"{self._prefix}/{name}".lstrip("/")}
+        try:
+            if self._client is None:
+                from botocore.config import Config
+                from botocore.session import get_session
+
+                self._client = get_session().create_client("s3", config=Config(signature_version="s3v4"))
+            url = self._client.generate_presigned_url(method, Params={"Bucket": self._bucket, **key, **given})
+        except ImportError:
+            raise UsageError(f"{self.uri} cannot be opened here: pip install 'rlservo[remote]'") from None
+        except Exception as error:  # botocore has a class for each thing that credentials may lack
+            raise UnavailableError(f"{self.uri} cannot be signed for: {_hidden(first_line(error))}") from None
+        return "PUT" if method == "put_object" else "GET", url
+
+    def _succeeded(self, reply: Reply, name: str) -> Reply:
+        if 200 <= reply.status < 300:
+            return reply
+        said = f"cannot be reached or read: {_said(reply)}"
+        if reply.status in (401, 403):
+            said = f"is refused with the credentials of this process's environment ({_said(reply)})"
+        elif reply.status < 400:
+            place = reply.headers.get("x-amz-bucket-region") or reply.headers.get("location", "").partition("?")[0]
+            said = f"is redirected to {_hidden(place)}, which is not followed"
+        raise UnavailableError(f"{self.uri}/{name} {said}")
 
 
-def _reason(error: Exception, timeout_s: float) -> str:
-    if "Timeout" in type(error).__name__:
-        return f"gave no answer within {timeout_s:.0f} s"
-    said = _SECRETS.sub("...", first_line(error))[:200]
-    if isinstance(error, PermissionError) or "Credential" in type(error).__name__:
-        return f"is refused with the credentials of this process's environment ({said})"
-    if isinstance(error, NotImplementedError):
-        return "is in a storage that is only read here"
-    return f"cannot be reached or read: {said}"
+def _said(reply: Reply) -> str:
+    """Return what a storage says of its refusal, without secrets."""
+    text = reply.refusal.decode(errors="replace")
+    parts = [found[1] for tag in ("Code", "Message") if (found := re.search(f"<{tag}>([^<]+)</{tag}>", text))]
+    return _hidden(": ".join(parts)) or f"status {reply.status}"
 
 
-def _stamp(entry: dict[str, Any]) -> Any:
-    if entry["type"] == "directory":
-        return False
-    stamps = [
-        entry.get(key) for key in ("ETag", "etag", "md5Hash", "LastModified", "last_modified", "mtime", "created")
-    ]
-    return (entry.get("size"), *map(str, stamps)) if any(stamps) else None
-
-
-@contextlib.contextmanager
-def announced(what: Callable[[], str], period_s: float = SILENCE_S) -> Iterator[None]:
-    """Log what is waited for, as `what` says it then, for as long as the inside takes."""
-    done = threading.Event()
-
-    def announce() -> None:
-        waited_s = 0.0
-        while not done.wait(period_s):
-            waited_s += period_s
-            logger.warning("waiting for %s (%.0f s)", what(), waited_s)
-
-    threading.Thread(target=announce, name="announcement", daemon=True).start()
-    try:
-        yield
-    finally:
-        done.set()
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names for a sentence: the first few of many."""
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+def _hidden(text: str) -> str:
+    return _SECRETS.sub("...", " ".join(text.split()))[:200]

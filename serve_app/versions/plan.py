@@ -1,8 +1,8 @@
 """Plan of what a server serves: versions, aliases, canary and shadow of each policy.
 
-`ServedConfig` is what a person writes (Serve's `user_config`); a `Plan` is what came of it and of every change since:
-whole, numbered, the same for every replica. A version in a plan carries the hash of the bundle that was accepted, so
-that no replica serves another one under its name.
+`ServedConfig` is what a person writes (Serve's `user_config`) for a repository that has no plan yet; a `Plan` is what
+came of it and of every command since: whole, numbered, the same for every process. A version in a plan carries the hash
+of the bundle that was accepted, so that no process serves another one under its name.
 
 Every policy of a plan has the alias `production`, which is what clients get that ask for no version; where nobody said
 so it is written down when the policy is first served. So a version that is loaded later is never in use by itself, and
@@ -11,8 +11,6 @@ a rollback always knows what was.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from typing import Annotated, Any, Literal
@@ -105,7 +103,7 @@ class PolicyPlan(_Model):
     """Where an alias led before, the last one last."""
 
     unloaded: dict[Version, str] = {}
-    """The bundles of the history's versions that are not loaded: a rollback leads back to the same ones."""
+    """The bundles of versions that were loaded before: a rollback leads back to the same ones, and no poll to them."""
 
     canary: Canary | None = None
     shadow: Reference | None = None
@@ -128,35 +126,15 @@ class PolicyPlan(_Model):
         return version if version in self.versions else None
 
 
-class FailedVersion(_Model):
-    """A bundle that cannot be served."""
-
-    name: str
-    version: str
-    reason: str
-
-
-class Refusal(_Model):
-    """A change that was refused: what ran before it goes on."""
-
-    change: str
-    reason: str
-    at: str
-    versions: tuple[FailedVersion, ...] = ()
-
-
 class Plan(_Model):
-    """What every replica is to serve."""
+    """What every process is to serve."""
 
     generation: int
-    config: str
-    """The hash of the configuration that this was made from, refused ones included; a changed one is seen by it."""
+    """Its number: 1 is a repository's first."""
 
     policies: dict[Name, PolicyPlan]
     changed_at: str
     changed_by: str
-    refused: Refusal | None = None
-    """The last change, if it was refused."""
 
     def policy(self, name: str) -> PolicyPlan:
         """Return a policy. Raises UnknownPolicyError."""
@@ -168,20 +146,7 @@ class Plan(_Model):
 
     def after(self, policies: Mapping[str, PolicyPlan], by: str) -> Plan:
         """Return the next plan, with these policies."""
-        return self.model_copy(
-            update={
-                "generation": self.generation + 1,
-                "policies": dict(policies),
-                "changed_at": now(),
-                "changed_by": by,
-                "refused": None,
-            }
-        )
-
-    def refusing(self, refusal: Refusal, *, config: str | None = None) -> Plan:
-        """Return the next plan: what was served before, and why a change of it was refused."""
-        changes: dict[str, Any] = {"generation": self.generation + 1, "refused": refusal}
-        return self.model_copy(update=changes if config is None else {**changes, "config": config})
+        return Plan(generation=self.generation + 1, policies=dict(policies), changed_at=now(), changed_by=by)
 
 
 def now() -> str:
@@ -192,9 +157,3 @@ def now() -> str:
 def timestamp(time: datetime) -> str:
     """Return a time in UTC as ISO 8601."""
     return time.isoformat(timespec="milliseconds")
-
-
-def config_hash(document: Any) -> str:
-    """Return what tells a changed configuration from the same one given again."""
-    text = json.dumps(document or {}, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from rlservo.export.contract.contract import version_key
-from rlservo.export.contract.errors import ConflictError, UnknownPolicyError, UnknownVersionError
+from rlservo.export.contract.errors import ConflictError, RlservoError, UnknownPolicyError, UnknownVersionError
 from rlservo.serve_app.versions.plan import PRODUCTION, Canary, Plan, PolicyConfig, PolicyPlan, ServedConfig
 
 LONGEST_HISTORY = 16  # earlier versions of an alias that a rollback can go back through
@@ -51,6 +51,28 @@ def plan_of(config: ServedConfig, available: Mapping[str, Digests], before: Plan
         for name in before.policies.keys() - policies.keys():
             policies[name] = _unloaded(name, before.policies[name])
     return policies
+
+
+def agrees(plan: Plan, config: ServedConfig) -> bool:
+    """Return whether a plan is what a configuration means, given the versions that the plan knows."""
+    known = {name: each.versions for name, each in plan.policies.items() if each.versions}
+    try:
+        return plan_of(config, known, plan) == plan.policies
+    except RlservoError:
+        return False
+
+
+def differences(before: Mapping[str, PolicyPlan], after: Mapping[str, PolicyPlan]) -> dict[tuple[str, str, str], Any]:
+    """Return what is served otherwise after than before, by policy, field and version or alias."""
+    changed: dict[tuple[str, str, str], Any] = {}
+    for name in before.keys() | after.keys():
+        was, now = (policies.get(name) or PolicyPlan(versions={}) for policies in (before, after))
+        for field, old, new in (("versions", was.versions, now.versions), ("aliases", was.aliases, now.aliases)):
+            changed |= {(name, field, key): new.get(key) for key in old | new if old.get(key) != new.get(key)}
+        for field in ("canary", "shadow"):
+            if getattr(was, field) != getattr(now, field):
+                changed[name, field, ""] = getattr(now, field)
+    return changed
 
 
 def load(plan: Plan, name: str, version: str, digest: str) -> dict[str, PolicyPlan]:
@@ -162,9 +184,8 @@ def _checked(name: str, was: PolicyPlan, **changes: Any) -> PolicyPlan:
     if versions and PRODUCTION not in aliases:
         aliases[PRODUCTION] = list(versions)[-1]
     history = _moved(was, aliases)
-    known = {**was.unloaded, **was.versions}
-    kept = {version for earlier in history.values() for version in earlier if version not in versions}
-    unloaded = {version: known[version] for version in sorted(kept, key=version_key) if version in known}
+    known = sorted({**was.unloaded, **was.versions}.items(), key=lambda item: version_key(item[0]))
+    unloaded = {version: digest for version, digest in known if version not in versions}
     values |= {"versions": versions, "aliases": aliases, "history": history, "unloaded": unloaded}
     try:
         policy = PolicyPlan(**values)

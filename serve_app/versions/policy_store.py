@@ -25,7 +25,6 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.interface import Observation
-from rlservo.serve_app.runtime.network_memory import NetworkMemory
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.micro_batching import Batcher
@@ -353,14 +352,13 @@ def load_policy(
     threads: int = 1,
     options: Mapping[str, PolicyOptions] | None = None,
     limits: BundleLimits = DEFAULT_LIMITS,
-    memory: NetworkMemory | None = None,
 ) -> Policy:
     """Load and prove a bundle; `options` are by policy name, '*' is for those not named. Raises BundleError."""
     if not options:
-        return Policy.load(folder, threads=threads, limits=limits, memory=memory)
+        return Policy.load(folder, threads=threads, limits=limits)
     name = read_contract(folder, limits).name
     chosen = options.get(name, options.get("*", DEFAULT_OPTIONS))
-    policy = Policy.load(folder, threads=threads, options=chosen, limits=limits, memory=memory)
+    policy = Policy.load(folder, threads=threads, options=chosen, limits=limits)
     if _wants_batches(policy):
         policy.check_rows()
     return policy

@@ -1,35 +1,59 @@
-"""Repository of published versions behind a URI: lists them by their manifests, fetches one into a local folder.
+"""Repository of published versions behind a URI: lists them by its index, fetches one into the cache by its hash.
 
-    <uri>/<name>/<version>.json     the manifest: without it there is no such version
-    <uri>/<name>/<version>/...      the bundle's files, which never change
+    <uri>/index.json             the hash of every version: without its line there is no such version
+    <uri>/<name>/<version>/...   the bundle's files, which never change
 
-A version is fetched by its hash into the cache; from there on it is an ordinary bundle folder. What is in the cache
-needs no storage, so what runs goes on, and starts again, while the storage is away.
+Whoever may write there wrote them: names, sizes and numbers are checked before anything is made of them. What is in
+the cache needs no storage, so what runs goes on, and starts again, while the storage is unreachable.
 """
 
 from __future__ import annotations
 
-import logging
-import re
-import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
 
-from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from rlservo.export.contract.bundle import DEFAULT_LIMITS, MAX_FILES, MAX_SUMS_BYTES, SUMS_FILE, BundleLimits, read_sums
 from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN
-from rlservo.export.contract.errors import BundleError, BundleTamperedError, RlservoError, UnavailableError
-from rlservo.serve_app.versions.bundle_cache import BundleCache, Lease
-from rlservo.serve_app.versions.manifest import MAX_MANIFEST_BYTES, SUFFIX, Manifest
-from rlservo.serve_app.versions.object_storage import ObjectStorage, announced, listed
-from rlservo.serve_app.versions.plan import now
-
-logger = logging.getLogger(__name__)
-
-AT_ONCE = 16  # calls to the storage
-MAX_MANIFESTS = 100_000
+from rlservo.export.contract.errors import BundleError, BundleTamperedError
+from rlservo.serve_app.versions.bundle_cache import BundleCache
+from rlservo.serve_app.versions.object_storage import ObjectStorage
 
 Key = tuple[str, str]  # (name, version)
+INDEX = "index.json"
+MAX_INDEX_BYTES = 16 << 20
+MAX_FILE_BYTES = 4 << 30  # where no limit is set
+DATA_SUFFIXES = (".onnx", ".ts", ".json", ".npz", ".md", ".txt", ".csv", ".yaml", ".png")
+"""Of files that a user has added to a bundle: nothing that something might run or unpickle."""
+
+
+class Index(BaseModel):
+    """Every version that is published, with the hash of its SHA256SUMS."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    format: Literal[1] = 1
+    policies: dict[
+        Annotated[str, Field(pattern=NAME_PATTERN)],
+        dict[Annotated[str, Field(pattern=VERSION_PATTERN)], Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]],
+    ] = {}
+
+    @classmethod
+    def parse(cls, content: bytes, place: str) -> Index:
+        """Return the index that was read at `place`. Raises BundleError."""
+        try:
+            return cls.model_validate(json.loads(content))
+        except (ValueError, RecursionError) as error:
+            reason = str(error)
+            if isinstance(error, ValidationError):
+                first = error.errors(include_url=False)[0]
+                where = ".".join(str(part)[:80] for part in first["loc"])
+                reason = f"{where}: {first['msg']} (given: {first['input']!r:.80})"
+            raise BundleError(f"{place} is no index of versions: {reason[:300]}") from None
 
 
 class RemoteRepository:
@@ -37,144 +61,52 @@ class RemoteRepository:
 
     def __init__(self, storage: ObjectStorage, cache: BundleCache, limits: BundleLimits = DEFAULT_LIMITS) -> None:
         self.uri = storage.uri
+        self.cache = cache
         self._storage = storage
-        self._cache = cache
         self._limits = limits
-        self._known: dict[Key, tuple[Any, Manifest]] = {}  # with what the listing said of it
 
-    def versions(self) -> tuple[dict[Key, str], dict[Key, RlservoError]]:
-        """Return the hash of every published version, and what is wrong with those that cannot be served.
-
-        Only manifests are read, and of those that the listing tells apart, only new ones. One that cannot be read is
-        that version's UnavailableError, until the next look reads it again; what the cache has of it is returned
-        nevertheless. Raises UnavailableError where the storage is away, and BundleError where nothing is published.
-        """
-        with announced(lambda: f"the list of versions in {self.uri}"):
-            stamps = self._stamps()
-            changed = [key for key, stamp in stamps.items() if stamp is None or self._stamp_of(key) != stamp]
-            results = self._manifests(changed)
-        errors = {key: result for key, result in results.items() if isinstance(result, RlservoError)}
-        known = {key: each for key, each in self._known.items() if key in stamps and key not in results}
-        known |= {key: (stamps[key], each) for key, each in results.items() if isinstance(each, Manifest)}
-        unread = {key: error for key, error in errors.items() if isinstance(error, UnavailableError)}
-        if unread and not known:
-            raise next(iter(unread.values()))
-        self._known = known
-        digests = {key: manifest.digest for key, (_, manifest) in sorted(known.items())}
-        earlier = self._recall()[1] if unread else {}
-        unread_before = {key: earlier[key] for key in sorted(unread) if key in earlier}
-        index = {**digests, **unread_before}  # a version is not forgotten because it could not be read once
-        self._cache.remember(self.uri, {"at": now(), "digests": [[*key, digest] for key, digest in index.items()]})
-        return digests | {key: each for key, each in unread_before.items() if self._cache.holds(each)}, errors
-
-    def remembered(self, error: UnavailableError) -> dict[Key, str]:
-        """Return what was published when the storage last answered, as far as the cache has it, and say so.
-
-        Raises the error, which says why the storage does not answer, where the cache has nothing.
-        """
-        at, digests = self._recall()
-        held = {key: digest for key, digest in digests.items() if self._cache.holds(digest)}
-        if not held:
-            raise error
-        missing = [f"{name} {version}" for name, version in digests.keys() - held.keys()]
-        left_out = f"; not in the cache, and left out: {listed(sorted(missing))}" if missing else ""
-        logger.warning("%s: the cache serves what was published on %s%s", error.message, at, left_out)
-        return held
-
-    def _recall(self) -> tuple[str, dict[Key, str]]:
-        """Return when the storage last answered, and what was published then."""
-        document = self._cache.recall(self.uri) or {"at": "", "digests": []}
-        return document["at"], {(name, version): digest for name, version, digest in document["digests"]}
-
-    def fetch(self, name: str, version: str, digest: str) -> Lease:
-        """Return the folder of the bundle with that hash, fetched unless the cache has it.
-
-        Raises UnavailableError, BundleError, and BundleTamperedError where another bundle is published by now.
-        """
-        lease = self._cache.lease(digest)
-        if lease is not None:
-            return lease
-        folder = f"{name}/{version}"
+    def versions(self) -> dict[Key, str]:
+        """Return the hash of every published version. Raises UnavailableError, and BundleError where there is none."""
         try:
-            manifest = self._manifest((name, version))
+            index = Index.parse(self._storage.read(INDEX, MAX_INDEX_BYTES)[0], f"{self.uri}/{INDEX}")
         except FileNotFoundError:
-            raise BundleError(f"{self.uri}/{folder}{SUFFIX} is not there: the version was deleted") from None
-        if manifest.digest != digest:
-            raise BundleTamperedError(
-                f"{self.uri}/{folder}{SUFFIX} is not the manifest that was accepted as version {version} of '{name}': "
-                "published versions do not change; publish changes as a new version"
-            )
-        progress = [folder]
+            raise BundleError(f"{self.uri} has no {INDEX}: nothing was published there (`rlservo publish`)") from None
+        return {(name, version): digest for name, each in index.policies.items() for version, digest in each.items()}
 
-        def read(file: str, size: int) -> Iterator[bytes]:
-            done = 0
-            for block in self._storage.blocks(f"{folder}/{file}", size):
-                done += len(block)
-                progress[0] = f"{folder}/{file}, of which {done:,} of {size:,} bytes are here"
-                yield block
+    @contextlib.contextmanager
+    def fetch(self, name: str, version: str, digest: str) -> Iterator[Path]:
+        """Give the folder of the bundle with that hash until the block ends, fetched unless the cache has it.
 
-        place = f"{self.uri}/{folder}"
-        with announced(lambda: f"{self.uri}/{progress[0]}"):
-            try:
-                return self._cache.add(manifest, place, read)
-            except FileNotFoundError:
-                raise BundleError(f"{place} lacks a file that its manifest lists: it was deleted in part") from None
-
-    def _stamps(self) -> dict[Key, Any]:
-        """Return every manifest that is listed, with what changes when it does."""
-        entries = self._storage.entries()
-        names = [name for name in entries if re.fullmatch(NAME_PATTERN, name) and not name.endswith(SUFFIX)]
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            folders = dict(zip(names, pool.map(self._storage.entries, names), strict=True))
-        found = {
-            (name, entry.removesuffix(SUFFIX)): stamp
-            for name, entries in folders.items()
-            for entry, stamp in entries.items()
-            if entry.endswith(SUFFIX)
-            and re.fullmatch(VERSION_PATTERN, entry.removesuffix(SUFFIX))
-            and stamp is not False
-        }
-        if not found:
-            raise BundleError(
-                f"{self.uri} holds no published version: expected <name>/<version>{SUFFIX}, as `rlservo publish` writes"
-            )
-        if len(found) > MAX_MANIFESTS:
-            raise BundleError(f"{self.uri} lists {len(found):,} versions: at most {MAX_MANIFESTS:,}")
-        return found
-
-    def _stamp_of(self, key: Key) -> Any:
-        return self._known[key][0] if key in self._known else None
-
-    def _manifests(self, keys: Sequence[Key]) -> dict[Key, Manifest | RlservoError | None]:
-        """Read manifests; None is one that was deleted meanwhile. Raises UnavailableError.
-
-        A storage that stopped to answer is not asked for each of a thousand: together they wait for one time-out.
+        Raises UnavailableError, BundleError, and BundleTamperedError where another bundle is there by now.
         """
-        results: dict[Key, Manifest | RlservoError | None] = {}
-        lost_s = 0.0
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            for key, (result, took_s) in zip(keys, pool.map(self._try_manifest, keys), strict=True):
-                results[key] = result
-                if isinstance(result, UnavailableError):
-                    lost_s += took_s
-                    if lost_s > AT_ONCE * self._storage.timeout_s:
-                        pool.shutdown(wait=False, cancel_futures=True)
-                        raise result
-        return results
+        place = f"{self.uri}/{name}/{version}"
 
-    def _try_manifest(self, key: Key) -> tuple[Manifest | RlservoError | None, float]:
-        """Return a manifest or what is wrong with it, and how long that took [s]."""
-        began = time.monotonic()
-        result: Manifest | RlservoError | None
+        def download(entry: Path) -> None:
+            self._copy(f"{name}/{version}/{SUMS_FILE}", MAX_SUMS_BYTES, entry / SUMS_FILE)
+            found, sums = read_sums(entry)
+            if found != digest:
+                raise BundleTamperedError(
+                    f"{place} is not the bundle that was accepted as version {version} of '{name}' (its hashes are "
+                    "others): published versions do not change; publish changes as a new version"
+                )
+            if len(sums) > MAX_FILES:
+                raise BundleError(f"{place} lists {len(sums)} files: at most {MAX_FILES}")
+            for file in sums:
+                check_file_type(file, place)
+                self._copy(f"{name}/{version}/{file}", self._limits.of(file)[0] or MAX_FILE_BYTES, entry / file)
+
+        with self.cache.bundle(digest, place, download) as folder:
+            yield folder
+
+    def _copy(self, name: str, most: int, file: Path) -> None:
         try:
-            result = self._manifest(key)
-        except (BundleError, UnavailableError) as error:
-            result = error
+            with file.open("wb") as stream:
+                self._storage.copy(name, most, stream)
         except FileNotFoundError:
-            result = None
-        return result, time.monotonic() - began
+            raise BundleError(f"{self.uri}/{name} is not there: the version was deleted, all or in part") from None
 
-    def _manifest(self, key: Key) -> Manifest:
-        name = f"{key[0]}/{key[1]}{SUFFIX}"
-        content = self._storage.read(name, MAX_MANIFEST_BYTES + 1)
-        return Manifest.parse(content, f"{self.uri}/{name}", self._limits)
+
+def check_file_type(name: str, place: Any) -> None:
+    """Raise BundleError for a file that is no data of a bundle."""
+    if PurePosixPath(name).suffix not in DATA_SUFFIXES:
+        raise BundleError(f"{place} lists {name}: a published bundle holds {', '.join(DATA_SUFFIXES)} and {SUMS_FILE}")

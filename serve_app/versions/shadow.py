@@ -17,8 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.runtime.network_memory import NetworkDroppedError
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.policy_store import Decision, Shadow
 
 logger = logging.getLogger(__name__)
@@ -88,7 +86,7 @@ class Shadows:
             shadow, obs, decision = self._waiting.get()
             series = self._series_of(shadow, decision)
             try:
-                differences = _differences(_act(shadow.policy, obs), decision.action, batch=decision.batch)
+                differences = _differences(shadow.policy.act(obs), decision.action, batch=decision.batch)
             except RlservoError:  # its action left the space, say: that is what a shadow is run for
                 series.failed += 1
                 continue
@@ -103,14 +101,6 @@ class Shadows:
 
     def _series_of(self, shadow: Shadow, decision: Decision) -> _Series:
         return self._series.setdefault((decision.name, decision.version, shadow.version), _Series())
-
-
-def _act(policy: Policy, obs: Any) -> Any:
-    while True:
-        try:
-            return policy.act(obs)
-        except NetworkDroppedError as dropped:
-            dropped.network.restore()
 
 
 def _differences(ours: Any, theirs: Any, *, batch: int | None) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""`rlservo serve s3://...` on Ray Serve: versions published while it runs, and a restart with the storage away.
+"""`rlservo serve s3://...`: versions published while it runs, and a restart with the storage away.
 
 That one is ended by a second Ctrl-C, at once and with nothing left.
 """
@@ -33,6 +33,7 @@ def test_published_versions_are_served_also_when_the_storage_is_away(storage: St
     runtime.mkdir(mode=0o700)
     environment = {
         **storage.environment,
+        "RLSERVO_PLAN": storage.uri,
         "XDG_RUNTIME_DIR": str(runtime),
         "RLSERVO_CACHE": str(tmp_path / "cache"),
         "RLSERVO_LOG_FILE": str(log),
@@ -65,5 +66,5 @@ def test_published_versions_are_served_also_when_the_storage_is_away(storage: St
         (run.key_file,) = (runtime / "rlservo").iterdir()  # the operator's; `end` asserts that it goes
         run.end(signal.SIGINT, signal.SIGINT)
     written = log.read_text() + seen
-    assert "the cache serves what was published on 20" in written
+    assert "serving plan 2, the last one that was seen here" in written
     assert SECRET not in written

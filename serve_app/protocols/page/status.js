@@ -186,9 +186,8 @@ async function askContract(name, version) {
   return { contract: JSON.parse(text), drift: driftOf(looks.newest, { policy: name, version }) };
 }
 
-function warningsOf({ refused, behind }) {
+function warningsOf({ behind }) {
   const warnings = [...behind];
-  if (refused) warnings.push(`The last change, "${refused.change}", was refused: ${refused.reason}`);
   if (new Set([...listings.values()].map(({ listing }) => listing.generation)).size > 1) {
     warnings.push("Not every replica has followed the last change yet.");
   }
@@ -206,7 +205,7 @@ function factsOf({ generation, changed_at: changedAt, changed_by: changedBy }) {
   const waited = looks.newest.map((samples) => samples.get("rlservo_queue_longest")?.[0]?.value ?? 0);
   return [
     ["Replicas that answered", replicas.length > 1 ? `${replicas.join(", ")}; ${several}` : replicas.join("")],
-    ["Last change", change && `${change} (number ${generation})`],
+    ["Last change", change && `${change} (plan ${generation})`],
     ["Refused before a version was chosen", refusals.map(([code, count]) => `${code} ${count}`).join(", ")],
     ["Most requests that waited at once", String(Math.max(0, ...waited))],
     ["Not counted", "what a proxy refuses before a replica sees it"],

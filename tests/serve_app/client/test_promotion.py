@@ -671,7 +671,7 @@ def killed_at(is_over: Callable[[list[str]], bool]) -> Iterator[list[str]]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PromotionLog, "write", dying(PromotionLog.write, lambda _, event: f"'{event}' is written"))
-        patch.setattr(AdminClient, "_command", dying(AdminClient._command, lambda _, n, command, d: f"{command} {d}"))
+        patch.setattr(AdminClient, "command", dying(AdminClient.command, lambda _, n, command, d: f"{command} {d}"))
         yield moments
 
 

@@ -47,10 +47,10 @@ from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions import blocking_calls, plan_changes
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.plan import Plan, PolicyPlan, ServedConfig
-from rlservo.serve_app.versions.replica_versions import ReplicaProgress, ReplicaVersions
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
-from stores import MemoryLedger
+from stores import plan_files
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -80,7 +80,7 @@ def patience(request: pytest.FixtureRequest) -> dict[str, float]:
 def url(root: Path, served: Serve, patience: dict[str, float]) -> Iterator[str]:
     """A server of ur5 in 1 and 2, and of gridworld."""
     loader = VersionLoader(Repository([root]), **patience)
-    control = ReplicaVersions(loader, MemoryLedger(), replica="r")
+    control = ReplicaVersions(loader, plan_files(root), replica="r")
     asyncio.run(control.configure({}))
     app = create_app(lambda: control.store, ServerSettings(operator_key=DIGEST), replica="r", control=control)
     with served(app) as port:
@@ -392,45 +392,38 @@ def test_a_file_system_that_hangs_is_given_up_with_a_few_threads_at_most(
         pytest.fail("the version does not load although the file system is back")
 
 
-def test_a_replica_whose_files_hang_does_not_hold_up_the_commands_of_others(
+def test_a_process_whose_files_hang_follows_what_others_change_meanwhile(
     root: Path, tmp_path: Path, stall: Callable[[Path], Stalled], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.LEDGER_POLL_S", 0.05)
+    monkeypatch.setattr("rlservo.serve_app.versions.plan_files.FOLDER_POLL_S", 0.05)
     monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.RETRY_PERIOD_S", 0.3)
     elsewhere = Path(shutil.copytree(root, tmp_path / "elsewhere"))
 
     async def run() -> None:
-        shelf = MemoryLedger()
         controls: list[ReplicaVersions] = []
-
-        async def tell(generation: int) -> list[ReplicaProgress]:
-            return [await control.follow(generation) for control in controls]
-
         for folder in (root, elsewhere):
             loader = VersionLoader(Repository([folder]), load_timeout_s=1)
-            controls.append(ReplicaVersions(loader, shelf, replica=folder.name, broadcast=tell))
+            controls.append(ReplicaVersions(loader, plan_files(root), replica=folder.name))
         config = {"policies": {"ur5": {"versions": ["1"]}, "gridworld": {}}, "unlisted": "ignore"}
         for control in controls:
             await control.configure(config)
         stalled = stall(elsewhere / "ur5" / "2" / "policy.onnx")
-        with pytest.raises(UnavailableError, match="elsewhere: loading policy 'ur5' version 2 took longer than 1 s"):
-            await controls[0].load("ur5", "2", what="load")
         watching = asyncio.create_task(controls[1].poll_ledger())
-        for number in range(5):  # of the other policy, while the watching replica tries again and again
-            began = time.monotonic()
-            with pytest.raises(UnavailableError, match="elsewhere: loading policy 'ur5' version 2 took longer"):
-                await controls[0].change(lambda p, n=number: aliased(p, f"alias{n}"), what="alias")  # type: ignore[misc]
-            assert time.monotonic() - began < 0.9  # not another second
+        await controls[0].load("ur5", "2", what="load")
+        await asyncio.sleep(1.5)
+        assert controls[1].behind[0].startswith("loading policy 'ur5' version 2 took longer than 1 s")
+        for number in range(5):  # of the other policy
+            await controls[0].change(lambda p, n=number: aliased(p, f"alias{n}"), what="alias")  # type: ignore[misc]
+            await asyncio.sleep(0.5)
             served = controls[1].store
             assert served is not None and f"alias{number}" in served.plans["gridworld"].aliases
-            await asyncio.sleep(0.1)
         stalled.go_on.set()
         for _ in range(200):
             if controls[1].store is not None and controls[1].store.versions("ur5") == ("1", "2"):
                 break
             await asyncio.sleep(0.05)
         watching.cancel()
-        assert controls[1].progress().behind == ()
+        assert controls[1].behind == ()
 
     asyncio.run(run())
 

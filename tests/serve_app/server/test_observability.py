@@ -129,8 +129,8 @@ def test_the_log_says_what_happened_and_values_only_when_asked(
     ur5: Path, served: Callable[[Any], AbstractContextManager[int]], log_file: Path, values: bool
 ) -> None:
     settings = ServerSettings(log_file=str(log_file), log_requests=True, log_values=values)
-    configure(settings, replica="r9")
     store = load_store(ur5)
+    configure(settings, replica="r9")
     with served(create_app(lambda: store, settings)) as port:
         obs = [SECRET] * 27
         assert post(port, "/v1/policies/ur5/act", {"obs": obs}, x_request_id="cell-7/1")[0] == 200
@@ -158,8 +158,8 @@ def test_requests_on_streams_are_logged_like_others(
     ur5: Path, served: Callable[[Any], AbstractContextManager[int]], log_file: Path
 ) -> None:
     settings = ServerSettings(log_file=str(log_file), log_requests=True)
-    configure(settings)
     store = load_store(ur5)
+    configure(settings)
     with served(create_app(lambda: store, settings)) as port:
         address = f"ws://127.0.0.1:{port}/v1/policies/ur5"
 

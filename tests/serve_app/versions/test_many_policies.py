@@ -39,4 +39,5 @@ def test_bundle_that_has_moved_since_the_look_is_found(discrete_policy: Callable
     places = repository.Repository([here, there])
     digest = places.available(ServedConfig())["grid"]["1"]
     (here / "grid").rename(there / "grid")
-    assert places.fetch("grid", "1", digest).folder == there / "grid" / "1"
+    with places.fetch("grid", "1", digest) as folder:
+        assert folder == there / "grid" / "1"

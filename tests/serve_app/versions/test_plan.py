@@ -8,7 +8,7 @@ import pytest
 
 from rlservo.export.contract.errors import ConflictError, UnknownPolicyError, UnknownVersionError, UsageError
 from rlservo.serve_app.versions import plan_changes
-from rlservo.serve_app.versions.plan import Canary, Plan, PolicyPlan, ServedConfig, config_hash
+from rlservo.serve_app.versions.plan import Canary, Plan, PolicyPlan, ServedConfig
 from rlservo.serve_app.versions.plan_changes import plan_of
 
 AVAILABLE = {"ur5": {"1": "a", "2": "b", "10": "c"}, "mir": {"1": "d"}}
@@ -19,7 +19,7 @@ def planned(config: dict[str, Any], before: Plan | None = None) -> dict[str, Pol
 
 
 def made(policies: dict[str, PolicyPlan], generation: int = 1) -> Plan:
-    return Plan(generation=generation, config="x", policies=policies, changed_at="now", changed_by="test")
+    return Plan(generation=generation, policies=policies, changed_at="now", changed_by="test")
 
 
 def test_nothing_said_is_everything_there_with_the_newest_by_number_as_default() -> None:
@@ -179,6 +179,10 @@ def test_what_is_in_use_is_not_unloaded() -> None:
         plan_changes.set_canary(now, "ur5", Canary(version="3", share=0.5))
 
 
-def test_a_configuration_is_known_again_whatever_the_order_of_its_keys() -> None:
-    assert config_hash({"a": 1, "b": {"c": 2, "d": 3}}) == config_hash({"b": {"d": 3, "c": 2}, "a": 1})
-    assert config_hash(None) == config_hash({}) != config_hash({"unlisted": "ignore"})
+def test_a_plan_agrees_with_its_configuration_until_a_command_changes_what_that_says() -> None:
+    config = ServedConfig.parse({"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}}}})
+    before = made(plan_of(config, AVAILABLE, None))
+    assert plan_changes.agrees(before, config) and plan_changes.agrees(before, ServedConfig())
+    after = before.after(plan_changes.set_alias(before, "ur5", "production", "2"), "alias")
+    assert not plan_changes.agrees(after, config)
+    assert not plan_changes.agrees(after, ServedConfig.parse({"policies": {"ur5": {"versions": ["3"]}}}))

@@ -1,11 +1,13 @@
-"""Several replicas' controls over one ledger, with real bundles: who serves what, and what a broken bundle does."""
+"""Several processes over one plan in a repository, with real bundles: who serves what, and who is told."""
 
 from __future__ import annotations
 
 import asyncio
+import json
+import os
 import shutil
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,46 +17,50 @@ import pytest
 from rlservo.export.contract.errors import (
     BundleError,
     ConflictError,
-    PartlyAppliedError,
     RefusedError,
+    RlservoError,
     UnavailableError,
+    UsageError,
 )
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions import plan_changes
-from rlservo.serve_app.versions.plan import Canary
-from rlservo.serve_app.versions.replica_versions import Change, ReplicaProgress, ReplicaVersions
+from rlservo.serve_app.versions.plan import Canary, Plan
+from rlservo.serve_app.versions.plan_files import FOLDER, PlanFiles
+from rlservo.serve_app.versions.plan_writer import Change, PlanWriter
+from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.versions.repository import Repository
 from rlservo.serve_app.versions.version_loader import VersionLoader
-from stores import MemoryLedger
 
 OBS = np.zeros(27, np.float32) + 0.1
 
 
 class Fleet:
-    """Replicas that tell each other, as Serve's broadcast does. Each has folders of its own, as on several nodes."""
+    """Processes that share a plan. Each has folders of its own, as on several nodes."""
 
-    def __init__(self, *folders: Path) -> None:
-        self.shelf = MemoryLedger()
-        self.current: Any = None
+    def __init__(self, plans: Path, *folders: Path) -> None:
+        self.plans = plans
         self.controls = [self.start(folder, f"r{n}") for n, folder in enumerate(folders)]
 
     def start(self, folder: Path, name: str) -> ReplicaVersions:
-        loader = VersionLoader(Repository([folder]))
-        return ReplicaVersions(loader, self.shelf, replica=name, broadcast=self.tell, is_current=self.is_current)
+        return ReplicaVersions(VersionLoader(Repository([folder])), self.files, replica=name)
 
-    async def tell(self, generation: int) -> Sequence[ReplicaProgress]:
-        return [await control.follow(generation) for control in self.controls]
-
-    async def is_current(self, document: Any) -> bool:
-        return bool(document == self.current)
+    @property
+    def files(self) -> PlanFiles:
+        return PlanFiles([], root=str(self.plans))
 
     async def deploy(self, document: Any) -> None:
-        self.current = document
         for control in self.controls:
             await control.configure(document)
 
+    async def follow(self) -> None:
+        for control in self.controls:
+            await control.follow()
+
     def defaults(self) -> list[str]:
         return [control.store.default("ur5") if control.store else "" for control in self.controls]
+
+    def numbers(self) -> set[int]:
+        return {control.plan.generation for control in self.controls if control.plan}
 
 
 def config(*versions: str, production: str, **more: Any) -> dict[str, Any]:
@@ -64,8 +70,8 @@ def config(*versions: str, production: str, **more: Any) -> dict[str, Any]:
     }
 
 
-def aliasing(version: str) -> Change:
-    return lambda before: plan_changes.set_alias(before, "ur5", "production", version)
+def aliasing(version: str, alias: str = "production") -> Change:
+    return lambda before: plan_changes.set_alias(before, "ur5", alias, version)
 
 
 @pytest.fixture
@@ -77,57 +83,124 @@ def break_weights(folder: Path, version: str) -> None:
     (folder / "ur5" / version / "policy.onnx").write_bytes(b"nothing")
 
 
-def test_a_change_on_one_replica_is_served_by_all_when_it_returns(folder: Path) -> None:
+async def until(condition: Callable[[], bool]) -> None:
+    for _ in range(1000):
+        if condition():
+            return
+        await asyncio.sleep(0.02)
+    pytest.fail("it did not come about within 20 s")
+
+
+def test_a_change_is_served_by_who_took_it_when_it_answers_and_by_the_others_within_a_second(folder: Path) -> None:
     async def run() -> None:
-        fleet = Fleet(folder, folder)
+        fleet = Fleet(folder, folder, folder, folder)
         await fleet.deploy(config("1", production="1"))
-        first, second = fleet.controls
+        first, second, third = fleet.controls
+        polls = [asyncio.create_task(control.poll_ledger()) for control in (second, third)]
         held = second.store
-        await first.load("ur5", "2", what="load")
-        await second.change(aliasing("2"), what="alias")
-        assert fleet.defaults() == ["2", "2"]
-        assert held is not None and held.default("ur5") == "1"  # whoever began with the old store ends with it
+        await first.load("ur5", "2", what="load ur5 2")
+        plan = await first.change(aliasing("2"), what="alias ur5 production=2")
+        assert fleet.defaults()[0] == "2" and first.plan == plan and plan.generation == 3
+        began = asyncio.get_running_loop().time()
+        await until(lambda: fleet.defaults() == ["2", "2", "2"])
+        assert asyncio.get_running_loop().time() - began < 1.5  # on a busy machine
+        assert held is not None and held.default("ur5") == "1"  # a request that began with the old store ends with it
         held.act("ur5", None, OBS)
-        assert {control.plan.generation for control in fleet.controls if control.plan} == {3}
+        assert fleet.numbers() == {3}
+        for poll in polls:
+            poll.cancel()
 
     asyncio.run(run())
+    files = sorted((folder / FOLDER).iterdir())
+    assert [file.name for file in files] == ["000000001.json", "000000002.json", "000000003.json"]
+    assert [json.loads(file.read_text())["changed_by"] for file in files] == [
+        "configuration",
+        "load ur5 2",
+        "alias ur5 production=2",
+    ]
 
 
-def test_changes_at_the_same_time_all_happen_one_after_the_other(folder: Path) -> None:
+def test_of_two_operators_at_once_one_wins_and_the_other_is_told(folder: Path, tmp_path: Path) -> None:
     async def run() -> None:
-        fleet = Fleet(folder, folder, folder)
-        await fleet.deploy(config("1", "2", production="1"))
-        changes = [
-            control.change(lambda p, n=n: plan_changes.set_alias(p, "ur5", f"alias{n}", "2"), what=f"alias{n}")  # type: ignore[misc]
-            for n, control in enumerate(fleet.controls * 3)
-        ]
-        await asyncio.gather(*changes)
-        for control in fleet.controls:
-            assert control.store is not None and len(control.store.plans["ur5"].aliases) == 1 + 9
-        assert fleet.shelf.newest() == 10
+        fleet = Fleet(tmp_path, folder, folder, folder)
+        await fleet.deploy(config("1", "2", "10", production="1"))
+        versions = ("2", "10", "10")  # two of the three want the same
+        outcomes = await asyncio.gather(
+            *(
+                control.change(aliasing(version), what=f"alias ur5 production={version}")
+                for control, version in zip(fleet.controls, versions, strict=True)
+            ),
+            return_exceptions=True,
+        )
+        await fleet.follow()
+        (won,) = set(fleet.defaults())
+        for version, outcome in zip(versions, outcomes, strict=True):
+            if version == won:
+                assert isinstance(outcome, Plan)
+            else:
+                assert isinstance(outcome, ConflictError)
+                assert f"another command came first (plan 2: alias ur5 production={won})" in outcome.message
+        assert fleet.numbers() == {2}
 
     asyncio.run(run())
 
 
-def test_a_version_that_fails_is_refused_and_every_replica_says_why(folder: Path) -> None:
+def test_two_operators_that_roll_back_at_once_go_back_once(folder: Path, tmp_path: Path) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder, folder)
+        await fleet.deploy(config("1", "2", "10", production="1"))
+        for version in ("2", "10"):
+            await fleet.controls[0].change(aliasing(version), what="alias")
+        await fleet.follow()
+        await asyncio.gather(
+            *(
+                c.change(lambda p: plan_changes.roll_back(p, "ur5", "production"), what="rollback")
+                for c in fleet.controls
+            )
+        )
+        await fleet.follow()
+        assert fleet.defaults() == ["2", "2"] and fleet.numbers() == {4}
+
+    asyncio.run(run())
+
+
+def test_changes_of_different_things_at_once_are_all_made(folder: Path, tmp_path: Path) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder, folder)
+        await fleet.deploy({})
+        first, second = fleet.controls
+        await asyncio.gather(
+            first.change(aliasing("1", "candidate"), what="alias"),
+            second.change(aliasing("2", "old"), what="alias"),
+            first.change(lambda p: plan_changes.set_shadow(p, "ur5", "2"), what="shadow"),
+            second.change(lambda p: plan_changes.set_alias(p, "gridworld", "candidate", "1"), what="alias"),
+        )
+        await fleet.follow()
+        assert fleet.numbers() == {5}
+        for control in fleet.controls:
+            assert control.plan is not None
+            ur5, gridworld = control.plan.policies["ur5"], control.plan.policies["gridworld"]
+            assert (ur5.aliases["candidate"], ur5.aliases["old"], ur5.shadow) == ("1", "2", "2")
+            assert gridworld.aliases["candidate"] == "1"
+
+    asyncio.run(run())
+
+
+def test_a_version_that_fails_is_refused_before_anything_is_written(folder: Path) -> None:
     async def run() -> None:
         fleet = Fleet(folder, folder)
         await fleet.deploy(config("1", production="1"))
+        (control,) = fleet.controls
         break_weights(folder, "2")
         with pytest.raises(RefusedError, match=r"nothing has changed: .*policy.onnx is not the file") as caught:
-            await fleet.controls[0].load("ur5", "2", what="load ur5 2")
+            await control.load("ur5", "2", what="load ur5 2")
         assert caught.value.details["versions"][0]["version"] == "2"
-        for control in fleet.controls:
-            assert control.plan is not None and control.plan.refused is not None
-            assert control.plan.refused.change == "load ur5 2"
-            states = control.states()["ur5"]
-            assert (states["1"].state, states["2"].state) == ("ready", "failed")
-            assert "is not the file" in states["2"].reason and states["1"].loaded_at is not None
-        assert fleet.defaults() == ["1", "1"]
-        await fleet.controls[1].change(lambda p: plan_changes.set_shadow(p, "ur5", None), what="shadow off")
-        assert (
-            fleet.controls[0].plan is not None and fleet.controls[0].plan.refused is None
-        )  # the last change went well
+        assert fleet.numbers() == {1} and len(list((folder / FOLDER).iterdir())) == 1
+        assert control.states()["ur5"]["1"].state == "ready" and control.states()["ur5"]["1"].loaded_at is not None
+        with pytest.raises(ConflictError):
+            await control.change(lambda p: plan_changes.unload(p, "ur5", "1"), what="unload")
+        await control.change(aliasing("1"), what="alias ur5 production=1")  # as it is: nothing to write
+        assert fleet.numbers() == {1} and len(list((folder / FOLDER).iterdir())) == 1
 
     asyncio.run(run())
 
@@ -145,7 +218,7 @@ def test_golden_vectors_that_are_not_reproduced_refuse_a_version(
     (target / "SHA256SUMS").write_text("\n".join([golden if "golden" in line else line for line in sums]) + "\n")
 
     async def run() -> None:
-        fleet = Fleet(folder)
+        fleet = Fleet(folder, folder)
         await fleet.deploy(config("10", production="10"))
         with pytest.raises(RefusedError, match="golden"):
             await fleet.controls[0].load("ur5", "11", what="load")
@@ -153,84 +226,73 @@ def test_golden_vectors_that_are_not_reproduced_refuse_a_version(
     asyncio.run(run())
 
 
-def test_a_wrong_configuration_is_refused_and_the_first_one_ends_the_start(folder: Path) -> None:
+def test_a_configuration_begins_a_plan_and_commands_rule_after(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     async def run() -> None:
-        fleet = Fleet(folder, folder)
+        fleet = Fleet(tmp_path, folder, folder)
         break_weights(folder, "2")
-        with pytest.raises((RefusedError, BundleError), match="is not the file"):
-            await fleet.deploy(config("1", "2", production="1"))
-        assert fleet.shelf.plans == {}
-        await fleet.deploy(config("1", production="1"))
-        for wrong in (config("1", "2", production="2"), {"policies": 7}, config("1", "99", production="1")):
-            await fleet.deploy(wrong)
-            assert fleet.defaults() == ["1", "1"]
-            for control in fleet.controls:
-                assert control.plan is not None and control.plan.refused is not None
-                assert control.plan.refused.change == "configuration"
-        # A replica that starts now starts with what is served, and not with the refused configuration.
-        late = fleet.start(folder, "late")
-        await late.configure(fleet.current)
-        assert late.store is not None and late.store.versions("ur5") == ("1",)
+        for wrong, kind in (
+            (config("1", "2", production="1"), RlservoError),
+            ({"policies": 7}, UsageError),
+            (config("1", "99", production="1"), RlservoError),
+        ):
+            with pytest.raises(kind):
+                await fleet.deploy(wrong)
+            assert not (tmp_path / FOLDER).exists()
+        await fleet.deploy(config("1", "10", production="1"))
+        assert "says otherwise" not in caplog.text
+        await fleet.controls[0].change(aliasing("10"), what="alias ur5 production=10")
+        whole_new_cluster = [fleet.start(folder, f"new{n}") for n in range(2)]
+        for control in whole_new_cluster:
+            await control.configure(config("1", "10", production="1"))
+            assert control.store is not None and control.store.default("ur5") == "10"
+        assert caplog.text.count("plan 2 in") == 2 and "says otherwise than the configuration, and holds" in caplog.text
 
     asyncio.run(run())
 
 
-def test_a_restarted_replica_comes_up_with_what_is_served_and_a_changed_file_wins(folder: Path) -> None:
-    async def run() -> None:
-        fleet = Fleet(folder, folder)
-        first = config("1", "2", production="1")
-        await fleet.deploy(first)
-        await fleet.controls[0].change(aliasing("2"), what="alias")
-        restarted = fleet.start(folder, "restarted")
-        await restarted.configure(first)  # Serve starts it with its file
-        assert restarted.store is not None and restarted.store.default("ur5") == "2"
-        await fleet.deploy(first)  # deploying the same file again changes nothing
-        assert fleet.defaults() == ["2", "2"]
-        await fleet.deploy(config("10", production="10"))
-        assert fleet.defaults() == ["10", "10"]
-        # Serve may start a replica with the configuration before the current one.
-        late = fleet.start(folder, "late")
-        await late.configure(first)
-        assert late.store is not None and late.store.default("ur5") == "10"
-        assert fleet.defaults() == ["10", "10"]
-
-    asyncio.run(run())
-
-
-def test_a_replica_that_cannot_follow_keeps_what_it_had_and_the_command_names_it(folder: Path, tmp_path: Path) -> None:
+def test_a_process_that_cannot_follow_keeps_what_it_had_and_tells_why(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     elsewhere = Path(shutil.copytree(folder, tmp_path / "elsewhere"))
     shutil.rmtree(elsewhere / "ur5" / "2")
 
     async def run() -> None:
-        fleet = Fleet(folder, elsewhere)
+        fleet = Fleet(tmp_path, folder, elsewhere)
         await fleet.deploy(config("1", production="1"))
-        with pytest.raises(PartlyAppliedError, match=r"r1: the repository has no version '2'") as caught:
-            await fleet.controls[0].load("ur5", "2", what="load")
-        assert list(caught.value.details["replicas"]) == ["r1"]
-        with pytest.raises(PartlyAppliedError, match="r1"):
-            await fleet.controls[0].change(aliasing("2"), what="alias")
-        assert fleet.defaults() == ["2", "1"]
-        assert fleet.controls[1].progress().behind and fleet.controls[1].states()["ur5"]["2"].state == "failed"
+        await fleet.controls[0].load("ur5", "2", what="load")
+        await fleet.controls[0].change(aliasing("2"), what="alias")
+        await fleet.follow()
+        assert fleet.defaults() == ["2", "1"] and fleet.numbers() == {3}
+        behind = fleet.controls[1]
+        assert "has no version '2' of policy 'ur5' any more" in behind.behind[0]
+        assert behind.states()["ur5"]["2"].state == "failed"
+        await behind.follow()  # it is not tried again at every look
         shutil.copytree(folder / "ur5" / "2", elsewhere / "ur5" / "2")
-        assert (await fleet.controls[1].follow()).behind == ()
-        assert fleet.defaults() == ["2", "2"]
+        await behind.follow()
+        assert fleet.defaults() == ["2", "1"]
+        monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.RETRY_PERIOD_S", 0.0)
+        await behind.follow()
+        assert fleet.defaults() == ["2", "2"] and behind.behind == ()
 
     asyncio.run(run())
 
 
-def test_the_same_version_is_the_same_bundle_on_every_replica(
+def test_the_same_version_is_the_same_bundle_in_every_process(
     folder: Path, box_policy: Callable[..., Path], tmp_path: Path
 ) -> None:
     async def run() -> None:
-        fleet = Fleet(folder)
-        await fleet.deploy(config("1", "2", production="1"))
+        fleet = Fleet(folder, folder)
+        document = config("1", "2", production="1")
+        await fleet.deploy(document)
         store = fleet.controls[0].store
         assert store is not None
         action = store.act("ur5", "2", OBS).action
         shutil.rmtree(folder / "ur5" / "2")
         shutil.move(box_policy(tmp_path / "again", version="2", seed=9), folder / "ur5" / "2")
         restarted = fleet.start(folder, "restarted")  # its default is there; the exchanged version is not served
-        await restarted.configure(fleet.current)
+        await restarted.configure(document)
         assert restarted.store is not None and restarted.store.versions("ur5") == ("1",)
         assert "is not the bundle that was accepted" in restarted.states()["ur5"]["2"].reason
         await fleet.controls[0].load("ur5", "2", what="load")  # now it is
@@ -240,13 +302,15 @@ def test_the_same_version_is_the_same_bundle_on_every_replica(
     asyncio.run(run())
 
 
-def test_a_restarted_replica_whose_default_is_gone_does_not_come_up(folder: Path) -> None:
+def test_a_process_whose_default_is_gone_does_not_start(folder: Path) -> None:
     async def run() -> None:
-        fleet = Fleet(folder)
+        fleet = Fleet(folder, folder)
         await fleet.deploy(config("1", "2", production="2"))
         break_weights(folder, "2")
-        with pytest.raises(BundleError, match="cannot be served as version 2, its default"):
-            await fleet.start(folder, "restarted").configure(fleet.current)
+        with pytest.raises(
+            BundleError, match=r"cannot be served as version 2, its default in plan 1 of .*/node/\.plan"
+        ):
+            await fleet.start(folder, "restarted").configure({})
 
     asyncio.run(run())
 
@@ -257,7 +321,7 @@ def test_canary_and_shadow_have_to_read_and_give_the_same(
     discrete_policy(folder, name="ur5", version="12")
 
     async def run() -> None:
-        fleet = Fleet(folder)
+        fleet = Fleet(folder, folder)
         await fleet.deploy(config("1", "12", production="1"))
         control = fleet.controls[0]
         with pytest.raises(RefusedError, match=r"version 12 cannot be the canary of version 1"):
@@ -266,11 +330,12 @@ def test_canary_and_shadow_have_to_read_and_give_the_same(
             )
         with pytest.raises(RefusedError, match=r"version 12 cannot be the shadow of version 1"):
             await control.change(lambda p: plan_changes.set_shadow(p, "ur5", "12"), what="shadow")
+        assert fleet.numbers() == {1}
 
     asyncio.run(run())
 
 
-def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folder: Path) -> None:
+def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folder: Path, tmp_path: Path) -> None:
     began, go_on = threading.Event(), threading.Event()
 
     def slowly(bundle: Path) -> Policy:
@@ -280,7 +345,7 @@ def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folde
         return Policy.load(bundle)
 
     async def run() -> None:
-        control = ReplicaVersions(VersionLoader(Repository([folder]), slowly), MemoryLedger(), replica="slow")
+        control = ReplicaVersions(VersionLoader(Repository([folder]), slowly), PlanFiles([folder]), replica="slow")
         await control.configure(config("1", production="1"))
         change = asyncio.create_task(control.load("ur5", "2", what="load"))
         while not began.is_set():
@@ -294,22 +359,25 @@ def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folde
     asyncio.run(run())
 
 
-def test_a_replica_that_nobody_told_sees_the_ledger_by_itself(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.LEDGER_POLL_S", 0.02)
+def test_a_version_that_takes_too_long_is_there_when_it_is_asked_for_again(folder: Path) -> None:
+    go_on = threading.Event()
+    loads: list[Path] = []
+
+    def slowly(bundle: Path) -> Policy:
+        loads.append(bundle)
+        assert bundle.name != "2" or go_on.wait(20)
+        return Policy.load(bundle)
 
     async def run() -> None:
-        fleet = Fleet(folder)
-        await fleet.deploy(config("1", "2", production="1"))
-        deaf = fleet.start(folder, "deaf")
-        await deaf.configure(fleet.current)
-        watching = asyncio.create_task(deaf.poll_ledger())
-        await fleet.controls[0].change(aliasing("2"), what="alias")
-        for _ in range(200):
-            if deaf.store is not None and deaf.store.default("ur5") == "2":
-                break
-            await asyncio.sleep(0.02)
-        watching.cancel()
-        assert deaf.store is not None and deaf.store.default("ur5") == "2"
+        loader = VersionLoader(Repository([folder]), slowly, load_timeout_s=0.5)
+        control = ReplicaVersions(loader, PlanFiles([folder]))
+        await control.configure(config("1", production="1"))
+        with pytest.raises(UnavailableError, match=r"loading policy 'ur5' version 2 took longer than 0.5 s"):
+            await control.load("ur5", "2", what="load")
+        go_on.set()
+        await until(lambda: not loader.loading)
+        await control.load("ur5", "2", what="load")
+        assert [path.name for path in loads] == ["1", "2"]
 
     asyncio.run(run())
 
@@ -325,17 +393,66 @@ def test_names_and_versions_do_not_leave_the_repository(folder: Path, tmp_path: 
 def test_nothing_changes_before_the_policies_are_loaded(folder: Path) -> None:
     async def run() -> None:
         with pytest.raises(UnavailableError, match="still being loaded"):
-            await Fleet(folder).controls[0].change(aliasing("1"), what="alias")
+            await Fleet(folder, folder).controls[0].change(aliasing("1"), what="alias")
 
     asyncio.run(run())
 
 
-def test_a_change_that_contradicts_writes_nothing(folder: Path) -> None:
+def test_a_command_without_a_server_begins_the_plan_that_servers_then_serve(folder: Path) -> None:
     async def run() -> None:
-        fleet = Fleet(folder)
-        await fleet.deploy(config("1", production="1"))
-        with pytest.raises(ConflictError):
-            await fleet.controls[0].change(lambda p: plan_changes.unload(p, "ur5", "1"), what="unload")
-        assert fleet.shelf.newest() == 1
+        def writer() -> PlanWriter:
+            return PlanWriter(VersionLoader(Repository([folder])), PlanFiles([folder]))
+
+        plan = await writer().change(aliasing("1"), what="alias ur5 production=1")
+        assert plan.generation == 1 and plan.policies["ur5"].history == {"production": ("10",)}
+        fleet = Fleet(folder, folder)
+        await fleet.deploy({})
+        assert fleet.defaults() == ["1"]
+        break_weights(folder, "2")
+        with pytest.raises(RefusedError, match=r"policy\.onnx is not the file"):
+            await writer().change(aliasing("2"), what="alias ur5 production=2")
+        await fleet.follow()
+        assert fleet.numbers() == {1}
 
     asyncio.run(run())
+
+
+def test_a_plan_that_is_no_plan_stops_nobody_and_a_lost_one_is_not_begun_again(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder)
+        await fleet.deploy(config("1", production="1"))
+        (control,) = fleet.controls
+        poll = asyncio.create_task(control.poll_ledger())
+        following = tmp_path / FOLDER / "000000002.json"
+        following.write_text('{"generation": 2, "policies": {}, "by": "a later rlservo"}')
+        await until(lambda: "000000002.json is no plan that this rlservo reads" in caplog.text)
+        await asyncio.sleep(1.2)
+        assert caplog.text.count("is no plan") == 1 and fleet.defaults() == ["1"]
+        following.unlink()
+        shutil.move(tmp_path / FOLDER, tmp_path / "away")
+        with pytest.raises(UnavailableError, match="has lost plan 1, which is served here"):
+            await control.change(aliasing("1", "candidate"), what="alias")
+        shutil.move(tmp_path / "away", tmp_path / FOLDER)
+        await control.change(aliasing("1", "candidate"), what="alias")
+        poll.cancel()
+
+    asyncio.run(run())
+
+
+def test_the_plan_stands_in_the_first_place_that_can_be_written_or_in_the_users_state(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    bundle = folder / "ur5" / "1"
+    other = Path(shutil.copytree(folder, tmp_path / "other"))
+    assert PlanFiles([bundle, "https://host/policies", other, folder]).place == f"{other}/{FOLDER}"
+    assert PlanFiles([bundle, "s3://bucket/policies", other]).place == "s3://bucket/policies/.plan"
+    assert PlanFiles([folder], root=str(other)).place == f"{other}/{FOLDER}"
+    kept = PlanFiles([bundle, "https://host/policies"]).place
+    assert kept.startswith(f"{tmp_path}/state/rlservo/plans/") and kept != PlanFiles([bundle]).place
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    assert PlanFiles([folder]).place.startswith(f"{tmp_path}/state/")
+    (folder / FOLDER).mkdir()  # the operator's, who may write there
+    assert PlanFiles([folder]).place == f"{folder}/{FOLDER}"
