@@ -47,6 +47,13 @@ def serve(
         float | None,
         typer.Option(min=1, metavar="SECONDS", help="Look for new versions this often; they are loaded, not in use."),
     ] = None,
+    session_store: Annotated[
+        str | None,
+        typer.Option(
+            metavar="memory|URL",
+            help="Where sessions by id are kept; several workers need redis://HOST:PORT/DATABASE.",
+        ),
+    ] = None,
     config: policy_commands.ConfigOption = None,
     versions: policy_commands.VersionsOption = None,
     alias: policy_commands.AliasOption = None,
@@ -90,6 +97,7 @@ def serve(
                 ("default_policy", default_policy),
                 ("record", record and str(record)),
                 ("poll_s", poll),
+                ("session_store", session_store),
             )
             if value is not None
         },

@@ -24,6 +24,7 @@ import yaml
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.server.api_keys import new_key
 from servers import free_ports
+from storages import RedisServer, running_redis
 
 ROOT = Path(__file__).resolve().parents[1]
 KEY, LINE = new_key("operator", admin=True)
@@ -159,14 +160,22 @@ def serving(*versions: str, production: str = "1", **more: Any) -> dict[str, Any
 
 @pytest.fixture(scope="session")
 def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """The cluster, with two replicas and version 1 of ur5 deployed by `serve deploy`."""
+    """The cluster, with two replicas, version 1 of ur5 deployed by `serve deploy`, and sessions in Redis."""
+    with running_redis() as redis, _cluster(cluster_repository, tmp_path_factory, redis) as made:
+        yield made
+
+
+@contextlib.contextmanager
+def _cluster(
+    cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory, redis: RedisServer
+) -> Iterator[Cluster]:
     port, grpc_port, dashboard = free_ports(3)
     folder = Path(tempfile.mkdtemp(prefix="r"))
     configuration = yaml.safe_load((ROOT / "deploy" / "serve.yaml").read_text())
     configuration["http_options"]["port"] = port
     configuration["grpc_options"]["port"] = grpc_port
     configuration["applications"][0]["args"] = {
-        "policies": [str(cluster_repository)], "replicas": 2, "settings": {"api_keys": LINE}
+        "policies": [str(cluster_repository)], "replicas": 2, "settings": {"api_keys": LINE, "session_store": redis.url}
     }  # fmt: skip
     own = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "RLSERVO_"))}
     environment = own | SWITCHES | {"RAY_AUTH_TOKEN": secrets.token_hex(32)}

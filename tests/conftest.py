@@ -20,7 +20,8 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 pytest_plugins = [
-    "servers",  # which others import
+    "servers",  # which others import, as the next
+    "storages",
     "quick_rllib",  # its settings, for the tests that import RLlib
     "browser",
     "checkpoints",
@@ -28,7 +29,6 @@ pytest_plugins = [
     "clusters",
     "cockpits",
     "environments",
-    "storages",
     "trainings",
 ]
 

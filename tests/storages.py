@@ -1,18 +1,24 @@
-"""Object storages: moto's S3, and a proxy before it that lies."""
+"""Storages: moto's S3, a proxy before it that lies, and Redis."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import http.client
 import http.server
 import itertools
 import logging
 import os
+import shutil
+import signal
+import subprocess
+import tempfile
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -192,3 +198,70 @@ def late(seconds: float) -> Lie:
         return reply  # type: ignore[return-value]
 
     return wait
+
+
+class RedisServer:
+    """A redis-server of our own on a Unix socket. It can be killed and started again with the files that it wrote."""
+
+    def __init__(self, folder: Path) -> None:
+        assert shutil.which("redis-server") is not None, "no Redis (Debian: apt-get install redis-server)"
+        self._folder = folder
+        self._socket = folder / "redis.sock"
+        self.url = f"unix://{self._socket}?db=0"
+        self.start()
+
+    def start(self) -> None:
+        options = {"port": "0", "unixsocket": self._socket, "dir": self._folder, "save": "", "loglevel": "warning"}
+        arguments = [str(part) for name, value in options.items() for part in (f"--{name}", value)]
+        self.process = subprocess.Popen(["redis-server", *arguments], stdout=subprocess.DEVNULL)
+        deadline = time.monotonic() + 30
+        while True:
+            try:
+                assert self.command("PING") == b"PONG\n"
+                return
+            except subprocess.CalledProcessError:
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+
+    def command(self, *words: str) -> bytes:
+        """Return what redis-cli prints."""
+        return subprocess.run(
+            ["redis-cli", "-s", str(self._socket), "-e", *words], check=True, capture_output=True
+        ).stdout
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait(30)
+        self._socket.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def running_redis() -> Iterator[RedisServer]:
+    """A Redis that keeps nothing by itself; `SAVE` writes a file, which the next start reads."""
+    with tempfile.TemporaryDirectory(prefix="redis") as folder:  # sockets need a short path
+        server = RedisServer(Path(folder))
+        try:
+            yield server
+        finally:
+            server.kill()
+
+
+@pytest.fixture
+def redis_server() -> Iterator[RedisServer]:
+    """`running_redis`."""
+    with running_redis() as server:
+        yield server
+
+
+def closing_sessions(app: Any) -> Any:
+    """Close an application's connections to Redis with it, as an engine does."""
+
+    async def run(scope: Any, receive: Any, send: Any) -> None:
+        await app(scope, receive, send)
+        if scope["type"] == "lifespan":
+            await app.state.core.close()
+
+    return run

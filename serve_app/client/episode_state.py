@@ -23,6 +23,7 @@ class EpisodeState:
         self._server_state = server_state
         self._is_stream = is_stream
         self._session_id = uuid.uuid4().hex if server_state and not is_stream else None
+        self._has_unanswered_start = False  # which may reach the server after the next one
         self._is_limited = False  # whether the server limits the step of a policy without recurrent state
         self.reset()
 
@@ -72,6 +73,9 @@ class EpisodeState:
                 raise SessionLostError("the connection broke, and the episode's memory went with it: call reset()")
             fields["reset"] = self._steps == 0
             if self._session_id is not None:
+                if self._has_unanswered_start:
+                    self._session_id = uuid.uuid4().hex
+                self._has_unanswered_start = self._steps == 0
                 fields["session_id"] = self._session_id
         elif self.is_carried(contract):
             fields["state"] = self._state
@@ -106,8 +110,9 @@ class EpisodeState:
 
         Raises SessionLostError when the reply is of another episode, UnavailableError when it lacks the state.
         """
-        if self.is_on_server(contract):
+        if self.is_on_server(contract) and (contract.state or "session_step" in reply):
             self._steps = check_step(reply, self._steps)
+            self._has_unanswered_start = False
         else:
             if self.is_carried(contract):
                 self._state = next_state(reply, contract)

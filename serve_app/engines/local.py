@@ -203,7 +203,9 @@ class _Application:
         server, settings = self._server, self._server.settings
         if self._is_worker:
             _stop_with_parent()
-        serving = Serving(server.places, settings, replica=self._replica, host=server.host)
+        serving = Serving(
+            server.places, settings, replica=self._replica, host=server.host, is_alone=not self._is_worker
+        )
         await serving.start(server.served)
         store = serving.core.store()
         if settings.default_policy not in (None, *store.names):

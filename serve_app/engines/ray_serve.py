@@ -128,7 +128,9 @@ class PolicyServer(InferenceMethods):
         try:
             configure(self._settings, replica=replica)
             check_exposure(host, self._settings)
-            self._serving = Serving(places, self._settings, replica=replica, host=host, is_behind_serve=True)
+            self._serving = Serving(
+                places, self._settings, replica=replica, host=host, is_alone=False, is_behind_serve=True
+            )
         except RlservoError as error:
             raise _plain(error) from None
         self._grpc = Grpc(self._serving.core, local_only=is_loopback(host))

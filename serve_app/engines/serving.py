@@ -19,11 +19,18 @@ class Serving:
     """What one process serves: an engine makes it, starts it in its event loop, and stops it there."""
 
     def __init__(
-        self, places: Sequence[str], settings: ServerSettings, *, replica: str, host: str, is_behind_serve: bool = False
+        self,
+        places: Sequence[str],
+        settings: ServerSettings,
+        *,
+        replica: str,
+        host: str,
+        is_alone: bool,
+        is_behind_serve: bool = False,
     ) -> None:
         """Take the folders and URIs of policies, this process's name and the address that is listened on.
 
-        Nothing is loaded yet. Raises UsageError.
+        `is_alone` says whether every request reaches this process. Nothing is loaded yet. Raises UsageError.
         """
         self.settings = settings
         loader, files = version_loader(places, settings), plan_files(places, settings)
@@ -34,6 +41,7 @@ class Serving:
             replica=replica,
             control=self.control,
             host=host,
+            is_alone=is_alone,
             is_behind_serve=is_behind_serve,
         )
         self.core = self.app.state.core
@@ -56,11 +64,12 @@ class Serving:
         gc.freeze()
 
     async def stop(self) -> None:
-        """End the background tasks and complete the recording."""
+        """End the background tasks, close connections and complete the recording."""
         for task in self._tasks:
             task.cancel()
         for task in self._tasks:
             with contextlib.suppress(asyncio.CancelledError):
                 await task
+        await self.core.close()
         if self.core.recorder is not None:
             await asyncio.to_thread(self.core.recorder.close)

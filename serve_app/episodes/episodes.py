@@ -1,25 +1,21 @@
 """Actions that depend on earlier ones: find a request's recurrent state, decide, keep the next state.
 
-It comes with the request and returns with the reply (`state`), or stays here: under a session's id, or with a stream.
-One of them must be said: a recurrent policy that silently began anew with every request would act wrongly and look
-right. A state goes to the version that it is of, and to no other. Whatever is refused leaves it where it was.
+It comes with the request and returns with the reply (`state`), or stays on the server: under a session's id, or with a
+stream. The request must say which: a recurrent policy that silently began an episode with every request would act
+wrongly and look right. A state goes to the version that it belongs to, and to no other. A refused request leaves it
+where it was.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rlservo.export.contract.errors import (
-    RequestError,
-    SessionError,
-    SessionLostError,
-    StateNeededError,
-    UnavailableError,
-)
+from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
 from rlservo.serve_app.episodes.carried_state import NO_STATE, CarriedState, carry, split_identity
-from rlservo.serve_app.episodes.request import Episode, Request, new_episode_id
-from rlservo.serve_app.episodes.sessions import Session, SessionId, Sessions, shorten
+from rlservo.serve_app.episodes.request import Episode, Request, SessionId, new_episode_id
+from rlservo.serve_app.episodes.sessions import Session, Sessions, shorten
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import (
     NEEDS_LAST,
@@ -32,23 +28,42 @@ from rlservo.serve_app.versions.policy_store import (
 )
 from rlservo.serve_app.wire.state_names import BELONGS_TO
 
+if TYPE_CHECKING:
+    from rlservo.serve_app.episodes.redis_sessions import RedisSessions
+
+NO_SHARED_SESSIONS = (
+    "this server has several processes and no store for sessions that they share: carry the 'state' in each request "
+    "({} begins an episode), use a WebSocket, or start the server with one worker or with --session-store redis://..."
+)
+
 
 class Episodes:
     """Acts for requests that belong to an episode."""
 
-    def __init__(self, *, max_sessions: int, idle_s: float) -> None:
-        """`max_sessions` and `idle_s` bound what `Sessions` remembers."""
+    def __init__(
+        self, *, max_sessions: int, idle_s: float, store: RedisSessions | None = None, is_alone: bool = True
+    ) -> None:
+        """`max_sessions` and `idle_s` bound what `Sessions` remembers.
+
+        A `store` keeps the sessions instead. `is_alone` says whether this is the only process that requests reach.
+        """
         self.sessions = Sessions(most=max_sessions, idle_s=idle_s)
-        self.is_shared = False
-        """Whether sessions are found by `shared_sessions.py`: ids of policies that remember nothing are labels then."""
+        self._idle_s = idle_s
+        self.store = store
+        self._has_sessions = is_alone or store is not None
         self.marks_states = False
         """Whether a state that goes to the client names its episode, for a recording."""
+        self.begun: Counter[str] = Counter()
+        """Sessions begun here, by policy name."""
+        self.lost: Counter[str] = Counter()
+        """Requests whose session does not exist (any more), by policy name."""
 
-    def act(self, store: PolicyStore, request: Request) -> Decision:
+    async def act(self, store: PolicyStore, request: Request) -> Decision:
         """Decide for a request that says something of its episode, or came on a stream that keeps one.
 
-        Raises SessionError, SessionLostError, RequestError, UnavailableError where nothing more can be remembered, and
-        what `Policy.step` raises; the recurrent state has then not moved on.
+        Only a session in a shared store is waited for. Raises SessionError, SessionLostError, RequestError,
+        UnavailableError where nothing more can be remembered or the store cannot be reached, and what `Policy.step`
+        raises; the recurrent state has then not moved on.
         """
         episode, stream = request.episode or NO_EPISODE, request.stream
         if episode.final_status is not None and (episode.reset or (episode.state is not None and not episode.state)):
@@ -58,11 +73,8 @@ class Episodes:
             )
         if episode.session_id is not None:
             request.label = str(episode.session_id)
-            name = request.policy
-            has_session = self.sessions.peek(name, episode.session_id) is not None
-            begins = episode.reset and not self.is_shared
-            if has_session or begins or _choose(store, request).is_stateful:
-                return self._act_in_session(store, request, episode, episode.session_id)
+            if store.remembers(request.policy):
+                return await self._act_in_session(store, request, episode, episode.session_id)
             # There is nothing to remember: the id says only which requests belong together.
             episode = replace(episode, session_id=None, reset=False, end=False)
         if episode.end or (episode.reset and request.stream_id is None):
@@ -83,7 +95,7 @@ class Episodes:
         self, store: PolicyStore, name: str, version: str | None, session_id: SessionId | None, identity: Any
     ) -> Policy:
         """Return the policy whose tensors a request's are: its session's, or that of the state it carries."""
-        session = None if session_id is None else self.sessions.peek(name, session_id)
+        session = None if session_id is None else self.sessions.find(name, session_id)
         if session is not None:
             return session.policy
         own = store.find(name, split_identity(identity)[0]) if type(identity) is str and version is None else None
@@ -95,7 +107,7 @@ class Episodes:
         assert episode.state is not None
         carried = CarriedState.parse(episode.state)
         if carried.policy_identity is not None:
-            policy = _owner(store, name, version, carried.policy_identity)
+            policy = _owner(store, request, carried.policy_identity)
         else:
             policy = _choose(store, request)
             if stream is not None and not carried.is_empty and store.has(stream.policy) and version is None:
@@ -129,7 +141,7 @@ class Episodes:
         if begins:
             policy = _choose(store, request)
         else:
-            self._check_version(store, request, stream)
+            _check_version(store, request, policy, "this stream's episode")
         decision, step = _take_step(policy, request, episode, session=Session(policy) if begins else stream)
         rows = step.rows if policy.is_stateful else 0
         if rows != stream.rows:
@@ -140,67 +152,58 @@ class Episodes:
         decision.episode = EpisodeNote(step=stream.steps)
         return decision
 
-    def _act_in_session(
+    async def _act_in_session(
         self, store: PolicyStore, request: Request, episode: Episode, session_id: SessionId
     ) -> Decision:
-        """Act from the state that stands under the request's id; its `seq` tells a request sent again."""
-        name, seq = request.policy, request.seq
+        """Act from the state that stands under the request's id."""
+        name = request.policy
         if episode.state is not None:
             raise RequestError("the request has a 'state' and a 'session_id': either you carry the state, or we do")
-        if episode.reset:
-            policy = _choose(store, request)
-            before = self.sessions.peek(name, session_id)
-            if before is not None and _is_late(request, before):
-                raise UnavailableError(
-                    f"another request began session '{shorten(session_id)}' of policy '{name[:64]}' at the same time: "
-                    "try again"
-                )
-            if policy.is_stateful and not episode.end:
-                self.sessions.check_room(name, session_id)
-            session = Session(policy)
-        else:
-            session = self.sessions.use(name, session_id)
-            self._check_version(store, request, session, session_id)
-            repeated = session.answer_again(seq, request.obs)
-            if repeated is not None:
-                return repeated
-            if _is_late(request, session):
-                raise SessionError(
-                    f"the request was under way when another one began session '{shorten(session_id)}' again: it is of "
-                    "the episode before"
-                )
-        decision, step = _take_step(session.policy, request, episode, session=session)
-        if episode.end:
-            self.sessions.end(name, session_id)
-        elif episode.reset:
-            self.sessions.put(name, session_id, session, step.rows if session.policy.is_stateful else 0)
-        session.keep(step)
-        decision.episode = EpisodeNote(session_id=session_id, step=session.steps)
-        session.connection = request.connection
-        session.seq, session.answer, session.inputs_hash = seq, None, b""
-        if seq is not None:  # without the inputs: they may be views of a whole request's body
-            session.answer = replace(decision, inputs={}, is_repeat=True)
-            session.inputs_hash = session.policy.fingerprint(step.inputs)
+        if not self._has_sessions:
+            raise RequestError(NO_SHARED_SESSIONS)
+        try:
+            decision = await (self.store or self.sessions).act(store, request, session_id, self._step_session)
+        except SessionLostError:
+            self.lost[name] += 1
+            raise
+        self.begun[name] += episode.reset
         return decision
 
-    def _check_version(
-        self, store: PolicyStore, request: Request, session: Session, session_id: SessionId | None = None
-    ) -> None:
-        """A session stays with the version it began with, for as long as that is loaded."""
-        name, version = request.policy, request.version
-        own = session.policy.contract.version
-        which = "this stream's episode" if session_id is None else f"session '{shorten(session_id)}'"
-        if not store.has(session.policy):
-            if session_id is not None:
-                self.sessions.end(name, session_id, lost=True)
-            raise SessionLostError(
-                f"{which} was with version {own} of policy '{name}', which is no longer loaded: begin an episode"
-            )
-        if version is not None and store.get(name, version) is not session.policy:
-            raise SessionError(
-                f"{which} is with version {own} of policy '{name}', and the request names version {version[:32]}: "
-                "begin an episode with that one"
-            )
+    def _step_session(self, store: PolicyStore, request: Request, session: Session | None) -> tuple[Decision, Session]:
+        """Return the decision and the session after it; the one before stays as it is.
+
+        A session answered its last request already when that is repeated; then it is the one after, too.
+        """
+        episode, seq = request.episode, request.seq
+        assert episode is not None and episode.session_id is not None
+        if episode.reset:
+            session = Session(_choose(store, request))
+        else:
+            if session is None:
+                raise self._lost(request, episode.session_id)
+            _check_version(store, request, session.policy, f"session '{shorten(episode.session_id)}'")
+            repeated = session.answer_again(seq, request.obs)
+            if repeated is not None:
+                return repeated, session
+            if session.is_ended:
+                raise self._lost(request, episode.session_id)
+        policy = session.policy
+        decision, step = _take_step(policy, request, episode, session=session)
+        after = Session(policy, steps=session.steps, rows=step.rows, begun=session.begun, seq=seq, is_ended=episode.end)
+        after.keep(step)
+        decision.episode = EpisodeNote(session_id=episode.session_id, step=after.steps)
+        if seq is not None:  # without the inputs: they may be views of a whole request's body
+            after.answer = replace(decision, inputs={}, is_repeat=True)
+            after.inputs_hash = policy.fingerprint(step.inputs)
+        return decision, after
+
+    def _lost(self, request: Request, session_id: SessionId) -> SessionLostError:
+        shown = shorten(session_id)
+        return SessionLostError(
+            f"this server has no session '{shown}' of policy '{request.policy[:64]}': it was never begun, was ended, "
+            f"was idle for {self._idle_s:g} s, or ended with its process, store or version: begin an episode",
+            {"session_id": shown, "policy": request.policy[:64]},
+        )
 
 
 NO_EPISODE = Episode()
@@ -211,27 +214,30 @@ def _choose(store: PolicyStore, request: Request) -> Policy:
     return store.choose(request.policy, request.version, request.label)
 
 
-def _is_late(request: Request, session: Session) -> bool:
-    """Whether a request was on its way when a session began: its client has given it up, or did not wait."""
-    return session.policy.is_stateful and request.arrived < session.begun
-
-
-def _owner(store: PolicyStore, name: str, version: str | None, identity: str) -> Policy:
+def _owner(store: PolicyStore, request: Request, identity: str) -> Policy:
     """Return the policy that a carried state is of. Raises SessionError, or SessionLostError where it is gone."""
-    own = store.find(name, identity)
+    own = store.find(request.policy, identity)
     if own is None:
-        store.get(name, version)  # a policy or version that does not exist comes first
+        store.get(request.policy, request.version)  # a policy or version that does not exist comes first
         raise SessionLostError(
-            f"the state is of '{identity[:128]}', which is not loaded here (any more) as policy '{name}': begin an "
-            "episode (state {})",
+            f"the state is of '{identity[:128]}', which is not loaded here (any more) as policy '{request.policy}': "
+            "begin an episode (state {})",
             {"state": identity[:128]},
         )
-    if version is not None and store.get(name, version) is not own:
-        raise SessionError(
-            f"the state is of version {own.contract.version} of policy '{name}', and the request names version "
-            f"{version[:32]}: begin an episode with that one (state {{}}), or name the state's"
-        )
+    _check_version(store, request, own, "the state")
     return own
+
+
+def _check_version(store: PolicyStore, request: Request, policy: Policy, memory: str) -> None:
+    """Raise SessionLostError where the policy of a memory is gone, SessionError where the request names another."""
+    own = f"version {policy.contract.version} of policy '{request.policy}'"
+    if not store.has(policy):
+        raise SessionLostError(f"{memory} is of {own}, which is no longer loaded: begin an episode")
+    if request.version is not None and store.get(request.policy, request.version) is not policy:
+        raise SessionError(
+            f"{memory} is of {own}, and the request names version {request.version[:32]}: begin an episode with that "
+            "one, or name the memory's"
+        )
 
 
 def _take_step(

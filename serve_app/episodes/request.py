@@ -7,10 +7,15 @@ import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rlservo.export.contract.errors import DeadlineError
-from rlservo.serve_app.episodes.sessions import Session, SessionId
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.episodes.sessions import Session
+
+SessionId: TypeAlias = str | int
+"""Triton's clients number their sequences; 7 and "7" are two."""
 
 MAX_SEED = 2**63 - 1
 LONGEST_SESSION_ID = 128
@@ -102,6 +107,16 @@ class Request:
     """Whether its JSON held NaN or Infinity, which JSON does not have."""
     reply_options: Any = None
     """How the reply is to be written: the codec's own affair, from its `parse` to its `encode`."""
+
+
+class ClientGoneError(Exception):
+    """The client hung up: no one waits for an answer, and there is nothing to count."""
+
+
+async def check_client(request: Request) -> None:
+    """Raise ClientGoneError where a session's client gave its request up: its next episode may have begun."""
+    if request.has_hung_up is not None and await request.has_hung_up():
+        raise ClientGoneError
 
 
 def check_deadline(request: Request) -> None:

@@ -1,31 +1,26 @@
 """Sessions: recurrent state of running episodes on the server, bounded in number, evicted when idle.
 
-A session is begun explicitly and belongs to this process. Whoever asks for one that is not here gets an error, because
-a state begun anew in the middle of an episode would give wrong actions without a word. What is bounded is episodes (a
-batch is so many side by side), in sessions and on streams together. A session of a policy that remembers nothing only
-keeps its version, takes no place, and makes room for a newer one.
+A session is begun explicitly. A request for one that does not exist gets an error, because a state begun again in the
+middle of an episode would give wrong actions without notice. `Sessions` keeps them in this process; `redis_sessions.py`
+keeps them where several processes find them.
 """
 
 from __future__ import annotations
 
-import asyncio
 import time
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import SessionError, SessionLostError, UnavailableError
+from rlservo.export.contract.errors import RlservoError, SessionError, UnavailableError
+from rlservo.serve_app.episodes.request import Request, SessionId, check_client
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.runtime.recurrent_state import State
-from rlservo.serve_app.versions.policy_store import Decision
-
-SWEEP_S = 1.0  # [s] at least between two looks for idle sessions
-
-SessionId: TypeAlias = str | int
-"""Triton's clients number their sequences; 7 and "7" are two."""
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 
 
 @dataclass(slots=True)
@@ -38,17 +33,15 @@ class Session:
     steps: int = 0
     rows: int = 0  # episodes that it takes the place of
     used: float = field(default_factory=time.monotonic)
-    begun: float = field(default_factory=time.perf_counter)
+    begun: float = field(default_factory=time.perf_counter)  # the episode: no two of an id have the same
     connection: Any = None  # of the last request
     seq: int | None = None  # of the last request that was answered
     inputs_hash: bytes = b""  # of its observation
-    answer: Decision | None = None  # to the last request, for the same request sent again
-    token: str = ""  # of its episode, where several replicas serve (`shared_sessions.py`, as the next two)
-    stamps: deque[bytes] = field(default_factory=lambda: deque(maxlen=8))  # the proxy's, of the last requests
-    stamped: Decision | None = None  # the answer to the last of them
+    answer: Decision | None = None  # to the last request, for the same request sent again; None where it had no `seq`
+    is_ended: bool = False  # kept only for its answer
 
     def keep(self, step: Step) -> None:
-        """Remember what a step came to."""
+        """Remember a step's outcome."""
         self.state = step.state or None
         self.last = step.leaves
         self.steps += 1
@@ -56,11 +49,11 @@ class Session:
     def begin(self, policy: Policy) -> None:
         """Forget everything: the next step is an episode's first."""
         self.policy = policy
-        self.state = self.last = self.seq = self.answer = None
+        self.state = self.last = None
         self.steps = 0
 
     def answer_again(self, seq: int | None, obs: Any) -> Decision | None:
-        """Return the answer there was, when this is the last request again (its reply got lost).
+        """Return the last request's answer if this is the same request again (its reply got lost).
 
         To compute it twice would move the recurrent state on twice. Raises SessionError for a request that comes out of
         order, and for another one under the last one's number: the old answer would be an action for what is long past.
@@ -81,6 +74,9 @@ class Session:
         )
 
 
+StepSession: TypeAlias = Callable[[PolicyStore, Request, Session | None], tuple[Decision, Session]]
+"""Computes a step: the decision, and the session after it."""
+
 Key: TypeAlias = tuple[str, SessionId]  # (policy name, session id)
 
 
@@ -88,111 +84,79 @@ class Sessions:
     """The sessions of one process, by policy name and session id."""
 
     def __init__(self, *, most: int, idle_s: float) -> None:
-        """`most` bounds the episodes that are remembered, and apart from them the sessions that remember none."""
+        """`most` bounds the episodes in memory, in sessions and on streams together (a batch is so many)."""
         self._most = most
         self._idle_s = idle_s
         self._sessions: OrderedDict[Key, Session] = OrderedDict()  # the longest unused come first
-        self._sweeper: asyncio.TimerHandle | None = None
         self.rows = 0  # episodes remembered, in sessions and on streams
-        self.begun: Counter[str] = Counter()  # by policy name, as the next two
-        self.evicted: Counter[str] = Counter()
-        self.lost: Counter[str] = Counter()
+        self.evicted: Counter[str] = Counter()  # by policy name
 
     def __len__(self) -> int:
         return len(self._sessions)
 
     def count(self) -> Counter[str]:
         """Return how many sessions there are, by policy name."""
+        self._evict()
         return Counter(name for name, _ in self._sessions)
 
-    def check_room(self, name: str, session_id: SessionId) -> None:
-        """Raise UnavailableError where not even one more episode could be remembered: before any work for it."""
+    def find(self, name: str, session_id: SessionId) -> Session | None:
+        """Return a session that is not idle, None where there is none."""
         self._evict()
-        before = self._sessions.get((name, session_id))
-        if self.rows >= self._most and (before is None or not before.rows):
-            raise self._full(1)
+        return self._sessions.get((name, session_id))
 
-    def put(self, name: str, session_id: SessionId, session: Session, rows: int) -> None:
-        """Keep a session that was begun; one of that id ends. Raises UnavailableError, and nothing has changed."""
-        self._evict()
-        key = (name, session_id)
-        before = self._sessions.get(key)
-        if rows and self.rows - (0 if before is None else before.rows) + rows > self._most:
-            raise self._full(rows)
-        self.end(name, session_id)
-        session.rows = rows
-        session.used = time.monotonic()
-        self.rows += rows
-        self.begun[name] += 1
-        self._sessions[key] = session
-        if not rows:
-            stateless = [each for each, other in self._sessions.items() if not other.rows]
-            if len(stateless) > self._most:
-                del self._sessions[stateless[0]]
-        self._sweep_later()
+    async def act(
+        self, store: PolicyStore, request: Request, session_id: SessionId, step_session: StepSession
+    ) -> Decision:
+        """Decide for a request of a session. Raises UnavailableError, ClientGoneError, and what `step_session` raises.
+
+        It waits for nothing where requests come in order anyway: on the connection of the last one.
+        """
+        key = (request.policy, session_id)
+        before = self.find(*key)
+        if before is None or request.connection is None or request.connection != before.connection:
+            await check_client(request)
+            before = self.find(*key)
+        if before is not None and request.arrived < before.begun:
+            raise overtaken(request, session_id)
+        decision, after = step_session(store, request, before)
+        if after.is_ended:
+            self.end(*key)
+            return decision
+        more = after.rows - (0 if before is None else before.rows)
+        self._check_room(more)
+        self.rows += more
+        after.connection, after.used = request.connection, time.monotonic()
+        self._sessions[key] = after
+        self._sessions.move_to_end(key)
+        return decision
+
+    def end(self, name: str, session_id: SessionId) -> None:
+        """Forget a session."""
+        session = self._sessions.pop((name, session_id), None)
+        if session is not None:
+            self.rows -= session.rows
 
     def reserve(self, stream: Session, rows: int) -> None:
         """Reserve the places of a stream's episodes. Raises UnavailableError, and nothing has changed."""
-        more = rows - stream.rows
-        if more > 0:
-            self._evict()
-            if self.rows + more > self._most:
-                raise self._full(rows)
+        self._evict()
+        self._check_room(rows - stream.rows)
+        self.rows += rows - stream.rows
         stream.rows = rows
-        self.rows += more
 
     def release(self, stream: Session) -> None:
         """Give the places of a stream's episodes back."""
         self.rows -= stream.rows
         stream.rows = 0
 
-    def use(self, name: str, session_id: SessionId) -> Session:
-        """Return a session that was begun here, which is used by that; one lost is counted. Raises SessionLostError."""
-        self._evict()
-        key = (name, session_id)
-        session = self._sessions.get(key)
-        if session is None:
-            self.lost[name] += 1
-            raise SessionLostError(
-                f"this server has no session '{shorten(session_id)}' of policy '{name[:64]}': it was never begun, was "
-                f"ended, was idle for {self._idle_s:g} s, or ended with its process or its version: begin an episode",
-                {"session_id": shorten(session_id), "policy": name[:64]},
+    def _check_room(self, more: int) -> None:
+        if more > 0 and self.rows + more > self._most:
+            what = "another episode" if more == 1 else f"{more} more episodes (a batch is so many)"
+            raise UnavailableError(
+                f"the server remembers {self.rows} episodes already, at most {self._most}, and has no room for {what}: "
+                f"end a session, wait until an idle one is evicted ({self._idle_s:g} s), or send the state along with "
+                "each request",
+                {"episodes": self.rows, "most": self._most},
             )
-        session.used = time.monotonic()
-        self._sessions.move_to_end(key)
-        return session
-
-    def peek(self, name: str, session_id: SessionId) -> Session | None:
-        """Return a session, if it is here and not idle, without counting that as its use."""
-        session = self._sessions.get((name, session_id))
-        return session if session is not None and session.used > time.monotonic() - self._idle_s else None
-
-    def end(self, name: str, session_id: SessionId, *, lost: bool = False) -> None:
-        """Forget a session; `lost` counts it among those that a client will miss."""
-        session = self._sessions.pop((name, session_id), None)
-        if session is not None:
-            self.rows -= session.rows
-            self.lost[name] += lost
-
-    def tokens(self) -> set[str]:
-        """Return the tokens of all."""
-        return {session.token for session in self._sessions.values()}
-
-    def take_all(self) -> list[tuple[str, SessionId, Session]]:
-        """Forget all sessions, and return them."""
-        taken = [(name, session_id, session) for (name, session_id), session in self._sessions.items()]
-        for name, session_id, _ in taken:
-            self.end(name, session_id)
-        return taken
-
-    def _full(self, rows: int) -> UnavailableError:
-        what = "another episode" if rows == 1 else f"{rows} more episodes (a batch is so many)"
-        return UnavailableError(
-            f"the server remembers {self.rows} episodes already, at most {self._most}, and has no room for {what}: end "
-            f"a session, wait until an idle one is evicted ({self._idle_s:g} s), or send the state along with each "
-            "request",
-            {"episodes": self.rows, "most": self._most},
-        )
 
     def _evict(self) -> None:
         oldest = time.monotonic() - self._idle_s
@@ -203,22 +167,13 @@ class Sessions:
             self.end(name, session_id)
             self.evicted[name] += 1
 
-    def _sweep_later(self) -> None:
-        """Look for idle sessions again when the first of them may be one: nobody may ask for anything by then."""
-        if self._sweeper is not None:
-            return
-        try:
-            loop = asyncio.get_running_loop()
-        except RuntimeError:  # in process, without a server: whoever asks next sweeps
-            return
-        wait_s = next(iter(self._sessions.values())).used + self._idle_s - time.monotonic()
-        self._sweeper = loop.call_later(max(wait_s, min(SWEEP_S, self._idle_s)), self._sweep)
 
-    def _sweep(self) -> None:
-        self._sweeper = None
-        self._evict()
-        if self._sessions:
-            self._sweep_later()
+def overtaken(request: Request, session_id: SessionId) -> RlservoError:
+    """Return the error of a request during which another one began its session."""
+    shown = f"session '{shorten(session_id)}' of policy '{request.policy[:64]}'"
+    if request.episode is not None and request.episode.reset:
+        return UnavailableError(f"another request began {shown} at the same time: try again")
+    return SessionError(f"the request was under way when another one began {shown} again: it is of the episode before")
 
 
 def shorten(session_id: SessionId) -> str:

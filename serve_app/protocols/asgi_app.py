@@ -36,14 +36,16 @@ def create_app(
     control: ReplicaVersions | None = None,
     host: str = "127.0.0.1",
     is_behind_serve: bool = False,
+    is_alone: bool = True,
 ) -> PolicyApp:
     """Return the application; `store_provider` gives None for as long as the policies are being loaded.
 
     With a `control` what is served can be administered. `replica` is the `Core`'s, which is the application's
-    `state.core`; `host` is the address that is listened on; `is_behind_serve` is `PolicyApp`'s. Raises UsageError when
-    the API keys that `settings` name cannot be read.
+    `state.core`; `host` is the address that is listened on; `is_behind_serve` is `PolicyApp`'s; `is_alone` says that
+    this is the only process that requests reach. Raises UsageError when the API keys that `settings` name cannot be
+    read.
     """
-    core = Core(store_provider, settings, replica=replica, control=control)
+    core = Core(store_provider, settings, replica=replica, control=control, is_alone=is_alone)
     checks = AccessChecks(Hosts(host, settings, keyed=bool(core.keys.accepted.keys)), core.keys)
     # A redirect would be an answer to a path that no route has: there is none.
     app = PolicyApp(

@@ -26,7 +26,7 @@ from rlservo.export.contract.errors import (
     RlservoError,
     UnknownPolicyError,
 )
-from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.episodes.request import ClientGoneError, Request
 from rlservo.serve_app.protocols.action_routes import PostRoute, StreamRoute
 from rlservo.serve_app.protocols.http_errors import (
     Headers,
@@ -50,7 +50,7 @@ from rlservo.serve_app.server.access_checks import (
 from rlservo.serve_app.server.api_keys import Access, Key, access_of
 from rlservo.serve_app.server.audit import AUDIT, AuditEntry
 from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_path import ClientGoneError, Codec
+from rlservo.serve_app.server.request_path import Codec
 
 PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
 HANG_UP_TURNS = 4

@@ -27,8 +27,7 @@ from starlette.types import Receive
 from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError, quoted
 from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, OPTIONS, Episode, Request
-from rlservo.serve_app.episodes.sessions import SessionId
+from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, OPTIONS, Episode, Request, SessionId
 from rlservo.serve_app.protocols.http_endpoint import Body, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, too_large
 from rlservo.serve_app.protocols.json_codec import parse_episode, parse_finite, parse_options

@@ -25,12 +25,13 @@ class Core(RequestPath):
         *,
         replica: str = "",
         control: ReplicaVersions | None = None,
+        is_alone: bool = True,
     ) -> None:
         """Read the keys that `settings` name; `replica` names this process in the metrics. Raises UsageError.
 
         With a `control` what is served can change while the server runs.
         """
-        super().__init__(store_provider, settings, replica)
+        super().__init__(store_provider, settings, replica, is_alone=is_alone)
         self.control = control
         self.replica = replica
         self.keys = CurrentKeys(settings)
@@ -39,6 +40,11 @@ class Core(RequestPath):
 
             self.recorder = RequestRecorder(settings)
             self.episodes.marks_states = True
+
+    async def close(self) -> None:
+        """Close connections to other services."""
+        if self.episodes.store is not None:
+            await self.episodes.store.close()
 
     @property
     def ready(self) -> bool:

@@ -30,18 +30,18 @@ from rlservo.export.contract.errors import (
     UnavailableError,
 )
 from rlservo.serve_app.episodes.episodes import Episodes
-from rlservo.serve_app.episodes.request import Episode, Request, check_deadline
-from rlservo.serve_app.episodes.sessions import Session
+from rlservo.serve_app.episodes.request import ClientGoneError, Episode, Request, check_deadline
 from rlservo.serve_app.server.api_keys import A_KEY
 from rlservo.serve_app.server.loop_clock import LoopClock
 from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.request_log import FIELDS, RequestLog
 from rlservo.serve_app.server.row_count import count_rows, most_rows
-from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.server.settings import MEMORY, ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blamed_version
 from rlservo.serve_app.versions.shadow import Shadows
 
 if TYPE_CHECKING:
+    from rlservo.serve_app.episodes.redis_sessions import RedisSessions
     from rlservo.serve_app.server.request_recorder import RequestRecorder
 
 logger = logging.getLogger(__name__)
@@ -53,10 +53,6 @@ BUG = "the server failed on this request; its log says how"
 StoreProvider = Callable[[], PolicyStore | None]
 Source = TypeVar("Source", contravariant=True)
 Reply = TypeVar("Reply", covariant=True)
-
-
-class ClientGoneError(Exception):
-    """The client hung up before its request was here: there is nobody to answer, and nothing to count."""
 
 
 class Codec(Protocol[Source, Reply]):
@@ -148,13 +144,23 @@ class Admission:
 class RequestPath:
     """Answers requests, and is the one place that admits, counts, logs and times them."""
 
-    def __init__(self, store_provider: StoreProvider, settings: ServerSettings, replica: str = "") -> None:
-        """`store_provider` gives None for as long as the policies are being loaded."""
+    def __init__(
+        self, store_provider: StoreProvider, settings: ServerSettings, replica: str = "", *, is_alone: bool = True
+    ) -> None:
+        """`store_provider` gives None for as long as the policies are being loaded.
+
+        `is_alone` says whether every request reaches this process. Raises UsageError.
+        """
         self._store_provider = store_provider
         self._max_batch = settings.max_batch
         self.settings = settings
         self.admission = Admission(settings)
-        self.episodes = Episodes(max_sessions=settings.max_sessions, idle_s=settings.session_idle_s)
+        self.episodes = Episodes(
+            max_sessions=settings.max_sessions,
+            idle_s=settings.session_idle_s,
+            store=_session_store(settings),
+            is_alone=is_alone,
+        )
         self.metrics = Metrics(replica)
         self.log = RequestLog(settings)
         self.shadows = Shadows(self.metrics.record_differences)
@@ -217,10 +223,8 @@ class RequestPath:
         single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
         if (len(obs) if single else most_rows(obs)) > self._max_batch:
             self._check_batch(store, request)
-        if request.episode is not None and request.episode.session_id is not None:
-            await self._check_client(store, request)
         if request.episode is not None or request.stream is not None:
-            decision = self.episodes.act(store, request)
+            decision = await self.episodes.act(store, request)
         elif store.batches and not request.explore:
             check = partial(_check_again, request, time.perf_counter(), self.admission.max_wait_s)
             decision = await store.act_together(name, request.version, obs, label=request.label, check=check)
@@ -232,24 +236,6 @@ class RequestPath:
         if shadow is not None and decision.version == shadow.of and not request.explore:
             self.shadows.offer(shadow, obs, decision)
         return decision
-
-    async def _check_client(self, store: PolicyStore, request: Request) -> None:
-        """Raise ClientGoneError where a session's client gave its request up: its next episode may have begun."""
-        if request.has_hung_up is None or not store.get(request.policy, request.version).is_stateful:
-            return
-        session = self._session_of(request)
-        if session is not None and request.connection is not None and request.connection == session.connection:
-            return
-        if await request.has_hung_up():
-            raise ClientGoneError
-
-    def _session_of(self, request: Request) -> Session | None:
-        """Return the memory that a request goes on from, of those under ids here."""
-        episode = request.episode
-        if episode is None or episode.session_id is None or episode.reset:
-            return None
-        session = self.episodes.sessions.peek(request.policy, episode.session_id)
-        return session if session is not None and session.policy.is_stateful else None
 
     def record_failure(
         self,
@@ -353,6 +339,15 @@ def _check_names(request: Request) -> None:
         if type(text) is str and A_KEY.search(text):
             request.label = request.episode = None
             raise RequestError(f"'{name}' holds an API key, which would be recorded: send a name of your own")
+
+
+def _session_store(settings: ServerSettings) -> RedisSessions | None:
+    """Return the store of sessions that several processes share, where one is set. Raises UsageError."""
+    if settings.session_store == MEMORY:
+        return None
+    from rlservo.serve_app.episodes.redis_sessions import RedisSessions  # only servers with several workers need it
+
+    return RedisSessions(settings.session_store, idle_s=settings.session_idle_s, patience_s=settings.max_queue_ms / 1e3)
 
 
 def _check_again(request: Request, since: float, limit_s: float) -> None:

@@ -115,13 +115,16 @@ def recording(core: Core) -> None:
 
 def sessions(core: Core) -> None:
     """Sample the episodes in memory."""
-    kept, show = core.episodes.sessions, core.metrics.sampled
+    episodes, kept, show = core.episodes, core.episodes.sessions, core.metrics.sampled
     now = kept.count()
-    for name in sorted({*now, *kept.begun, *kept.lost}):
-        show.gauge("rlservo_sessions", "Sessions kept under an id", now[name], policy=name)
-        show.counter("rlservo_sessions_begun", "Sessions begun under an id", kept.begun[name], policy=name)
+    for name in sorted({*now, *episodes.begun, *episodes.lost}):
+        show.gauge("rlservo_sessions", "Sessions kept under an id in this process", now[name], policy=name)
+        show.counter("rlservo_sessions_begun", "Sessions begun under an id", episodes.begun[name], policy=name)
         show.counter("rlservo_sessions_evicted", "Sessions forgotten when idle", kept.evicted[name], policy=name)
-        show.counter("rlservo_sessions_lost", "Requests whose session is not here", kept.lost[name], policy=name)
+        show.counter("rlservo_sessions_lost", "Requests whose session is not here", episodes.lost[name], policy=name)
+    if episodes.store is not None:
+        failed = "Reads and writes of sessions that Redis did not carry out: such requests are answered 503"
+        show.counter("rlservo_session_store_failures", failed, episodes.store.unreachable)
     show.gauge("rlservo_episodes_remembered", "Episodes in memory, in sessions and on streams", kept.rows)
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rlservo.export.contract.bundle import BundleLimits
 
 PREFIX = "RLSERVO_"
+MEMORY = "memory"  # of this process: where sessions are kept by default
 
 
 class ServerSettings(BaseModel):
@@ -106,12 +107,17 @@ class ServerSettings(BaseModel):
     log_values: bool = False
     """Log the sentences of errors, which may name values of observations."""
 
+    session_store: str = Field(MEMORY, repr=False)  # the URL may hold a password
+    """Place of the sessions that a client names by id: `memory` of the process, or for several workers or replicas
+    `redis://[USER:PASSWORD@]HOST:PORT/DATABASE` (`rediss://` with TLS, `unix://` for a socket). Each server needs a
+    database of its own. `rlservo serve --session-store` sets it, too."""
+
     max_sessions: int = Field(1024, ge=1)
-    """Episodes one replica remembers at once, in sessions and on streams (a batch is so many); a further one is
-    answered 503."""
+    """Episodes one process remembers at once, in sessions in its memory and on streams (a batch is so many); a further
+    one is answered 503."""
 
     session_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
-    """[s] A session that nobody asks anything for so long is forgotten; a stream's lives as long as the stream."""
+    """[s] A session without a step for so long is forgotten; a stream's lives as long as the stream."""
 
     policy_options: dict[str, PolicyOptions] = {}
     """How strict each policy is at its edges, by policy name; '*' is for the others. As a variable: a JSON object."""
@@ -189,6 +195,13 @@ class ServerSettings(BaseModel):
         for name in value.split(","):
             if re.fullmatch(r"\s*(\*|\[?[A-Za-z0-9._:-]+\]?)?\s*", name) is None:
                 raise ValueError(f"expected names without scheme or path, such as robot-7.local, got {name[:80]!r}")
+        return value
+
+    @field_validator("session_store")
+    @classmethod
+    def _store(cls, value: str) -> str:
+        if value != MEMORY and not value.startswith(("redis://", "rediss://", "unix://")):
+            raise ValueError("expected memory, or a URL such as redis://127.0.0.1:6379/0")
         return value
 
     @field_validator("policy_options", mode="before")

@@ -165,6 +165,10 @@ class PolicyStore:
         served = self._served.get(policy.contract.name)
         return served is not None and served.versions.get(policy.contract.version) is policy
 
+    def remembers(self, name: str) -> bool:
+        """Whether a version of this policy is stateful. Raises UnknownPolicyError."""
+        return any(policy.is_stateful for policy in self._find(name).versions.values())
+
     def is_certain(self, name: str, version: str | None) -> bool:
         """Whether a recurrent state that does not say whose it is can only be of the policy that this request gets.
 

@@ -278,23 +278,23 @@ def test_a_refused_request_leaves_the_memory_where_it_was(ask: Ask, recurrent: P
 
 
 def test_a_session_stays_with_its_version_until_that_is_gone(
-    store: PolicyStore, served: Serve, box_policy: Callable[..., Path], tmp_path: Path
+    served: Serve, leaky_policy: Callable[..., Path], tmp_path: Path
 ) -> None:
-    one, two = (Policy.load(box_policy(tmp_path, version=version, seed=seed)) for seed, version in enumerate("12"))
+    one, two = (Policy.load(leaky_policy(tmp_path, version=version, seed=seed)) for seed, version in enumerate("12"))
     stores = [store_of(one), store_of(one, two), store_of(two)]
     now = 0
-    obs = np.linspace(-1, 1, 27).tolist()
+    obs = [0.5, -0.25, 1.0]
     with served(create_app(lambda: stores[now], ServerSettings())) as port:
         ask = asking(port)
 
         def step(**more: Any) -> tuple[int, Any]:
-            return ask("/v1/policies/ur5/act", {"obs": obs, "session_id": "s", **more})
+            return ask("/v1/policies/leaky/act", {"obs": obs, "session_id": "s", **more})
 
         assert step(reset=True)[1]["version"] == "1"
         now = 1
         assert step()[1]["version"] == "1"  # the newest is 2 by now
-        assert ask("/v1/policies/ur5/act", {"obs": obs})[1]["version"] == "2"
-        status, reply = ask("/v1/policies/ur5/versions/2/act", {"obs": obs, "session_id": "s"})
+        assert ask("/v1/policies/leaky/act", {"obs": obs, "state": {}})[1]["version"] == "2"
+        status, reply = ask("/v1/policies/leaky/versions/2/act", {"obs": obs, "session_id": "s"})
         assert (status, reply["code"]) == (409, "session-conflict")
         now = 2
         status, reply = step()

@@ -22,6 +22,7 @@ import pytest
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
+from storages import closing_sessions
 from stores import load_store
 
 OBS = np.random.default_rng(3).uniform(-0.3, 0.3, (8, 3)).astype(np.float32)
@@ -38,7 +39,7 @@ class Server:
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         self._loop = asyncio.get_running_loop()
-        await self._app(scope, receive, send)
+        await closing_sessions(self._app)(scope, receive, send)
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
@@ -58,9 +59,14 @@ def bundle(leaky_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathF
 
 
 @pytest.fixture
-def server(bundle: Path, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[Server]:
+def server(
+    bundle: Path, served: Callable[[Any], AbstractContextManager[int]], request: pytest.FixtureRequest
+) -> Iterator[Server]:
+    settings = ServerSettings()
+    if getattr(request, "param", "memory") == "redis":
+        settings = ServerSettings(session_store=request.getfixturevalue("redis_server").url)
     store = load_store(bundle)
-    server = Server(create_app(lambda: store, ServerSettings()))
+    server = Server(create_app(lambda: store, settings))
     with served(server) as server.port:
         yield server
 
@@ -84,6 +90,7 @@ def json_body(obs: Any, *, start: bool = False, **more: Any) -> tuple[str, bytes
 
 
 BODIES = pytest.mark.parametrize("body", [oip_body, json_body])
+STORES = pytest.mark.parametrize("server", ["memory", "redis"], indirect=True)
 
 
 def raw(path: str, body: bytes) -> bytes:
@@ -126,7 +133,15 @@ def give_up(port: int, path: str, body: bytes) -> None:
         connection.sendall(raw(path, body))
 
 
+def knock(port: int) -> None:
+    """Wait until a server has read what came before: it accepts connections in order."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+        connection.sendall(raw("/v1/policies/none/act", b"{}"))
+        assert connection.recv(1)
+
+
 @BODIES
+@STORES
 @pytest.mark.parametrize("more", [{}, {"seq": 9}])
 def test_a_step_that_was_given_up_does_not_move_the_next_episode(
     server: Server, client: Client, episode: Callable[[Any], list[float]], body: Any, more: Any
@@ -149,7 +164,7 @@ def test_a_step_that_came_in_part_before_its_session_began_again_is_refused(
     whole = raw(*body(OTHER))
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as late:
         late.sendall(whole[:-5])
-        client.ask(*json_body(OBS[0]))  # by now the server has read that
+        knock(server.port)
         assert client.ask(*body(OBS[0], start=True))[1]["action"] == episode(OBS[0])
         late.sendall(whole[-5:])
         answer = late.recv(65536).decode()
@@ -159,6 +174,7 @@ def test_a_step_that_came_in_part_before_its_session_began_again_is_refused(
 
 
 @BODIES
+@STORES
 def test_a_start_that_was_given_up_does_not_begin_the_episode_after_it_again(
     server: Server, client: Client, episode: Callable[[Any], list[float]], body: Any
 ) -> None:
@@ -178,7 +194,7 @@ def test_a_start_that_came_in_part_before_another_one_is_refused(
     whole = raw(*body(OTHER, start=True))
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as late:
         late.sendall(whole[:-5])
-        client.ask(*json_body(OBS[0]))
+        knock(server.port)
         assert client.ask(*body(OBS[0], start=True))[1]["action"] == episode(OBS[0])
         late.sendall(whole[-5:])
         assert " 503 " in late.recv(65536).decode()

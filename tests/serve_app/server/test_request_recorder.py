@@ -293,7 +293,7 @@ def test_a_session_keeps_no_request_alive(start: Callable[..., Server]) -> None:
     body = {"obs": [0.5, 0.25, 0.125], "session_id": "a", "reset": True}
     for seq in ({}, {"seq": 1}):
         assert server.act("lstm_box", body | seq)[0] == 200
-        session = server.core.episodes.sessions.peek("lstm_box", "a")
+        session = server.core.episodes.sessions.find("lstm_box", "a")
         assert session is not None and (session.answer is None or session.answer.inputs == {})
     assert session.answer is not None
 

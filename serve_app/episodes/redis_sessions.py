@@ -1,0 +1,156 @@
+"""Sessions in Redis, shared by several processes: a memory is replaced only by the step that was computed from it.
+
+A key holds a stamp, new with every write, and the session. A step reads both, computes, and writes if the stamp is
+still the one that it read; otherwise another step was written first, and it starts again with what that one left. So
+the memories of a session form one chain, and an answer is sent only after its memory is part of it: however late a
+process goes on or a write arrives, no step is computed from an old memory.
+
+A Redis that restarts or fails over may come back with an older copy. A session names the run of Redis (`run_id`) in
+which it was written, and is lost in every other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import logging
+import os
+import time
+from typing import Any
+
+from redis.asyncio import Redis
+from redis.asyncio.retry import Retry
+from redis.backoff import NoBackoff
+from redis.exceptions import ConnectionError as RedisConnectionError
+from redis.exceptions import RedisError
+
+from rlservo.export.contract.errors import OverloadedError, UnavailableError, UsageError
+from rlservo.serve_app.episodes.request import Request, SessionId, check_client, check_deadline
+from rlservo.serve_app.episodes.sessions import Session, StepSession, overtaken
+from rlservo.serve_app.versions.policy_store import Decision, EpisodeNote, PolicyStore
+from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+
+logger = logging.getLogger(__name__)
+
+CONNECTIONS = 64  # of one process at most; each carries one command at a time
+TIMEOUT_S = 1.0  # for a connection, and for each reply
+STAMP_BYTES = 16
+READ = "return {redis.call('GET', KEYS[1]), string.match(redis.call('INFO', 'server'), 'run_id:(%x+)')}"
+# A command whose reply was lost is sent again: a write that is there already has succeeded.
+WRITE = f"""
+local now = redis.call('GETRANGE', KEYS[1], 0, {STAMP_BYTES - 1})
+if now == ARGV[1] then redis.call('SET', KEYS[1], ARGV[2], 'PX', ARGV[3]) end
+return now == ARGV[1] or now == string.sub(ARGV[2], 1, {STAMP_BYTES})
+"""
+
+FIELDS = ("state", "last", "steps", "begun", "seq", "inputs_hash", "is_ended")
+ANSWER_FIELDS = ("infer_ms", "batch", "notices")  # of a `Decision`: its action is the session's last
+
+
+class RedisSessions:
+    """The sessions of all processes that use one Redis database."""
+
+    def __init__(self, url: str, *, idle_s: float, patience_s: float) -> None:
+        """Connect when the first session is used. Raises UsageError for an unusable URL.
+
+        Redis forgets a session `idle_s` after its last step. A request that arrived more than `patience_s` ago is not
+        computed.
+        """
+        self._idle_ms = max(1, round(idle_s * 1e3))
+        self._patience_s = patience_s
+        retry = Retry(NoBackoff(), 1, supported_errors=(RedisConnectionError,))  # an idle connection may be closed
+        try:
+            self._redis = Redis.from_url(url, socket_timeout=TIMEOUT_S, socket_connect_timeout=TIMEOUT_S, retry=retry)
+        except ValueError:  # whose sentence may hold the password
+            raise UsageError("the session store's URL is not usable: expected redis://HOST:PORT/DATABASE") from None
+        self._read = self._redis.register_script(READ)
+        self._write = self._redis.register_script(WRITE)
+        self._connections = asyncio.Semaphore(CONNECTIONS)
+        self._is_down = False
+        self.unreachable = 0
+        """Reads and writes that failed."""
+
+    async def act(
+        self, store: PolicyStore, request: Request, session_id: SessionId, step_session: StepSession
+    ) -> Decision:
+        """Decide for a request of a session, as `Sessions.act`. Raises DeadlineError, too."""
+        named = json.dumps([request.policy, session_id]).encode()
+        key = "rlservo:session:" + hashlib.blake2b(named, digest_size=16).hexdigest()
+        stamp, run, session = await self._load(key, store, request, session_id)
+        begun = None if session is None else session.begun
+        while True:
+            decision, after = step_session(store, request, session)
+            content = os.urandom(STAMP_BYTES) + _pack(after, run)
+            if decision.is_repeat or await self._call(request, self._write, key, stamp, content, self._idle_ms):
+                return decision
+            stamp, run, session = await self._load(key, store, request, session_id)
+            if session is not None and session.begun != begun:
+                raise overtaken(request, session_id)
+
+    async def _load(
+        self, key: str, store: PolicyStore, request: Request, session_id: SessionId
+    ) -> tuple[bytes, bytes, Session | None]:
+        """Return (stamp, Redis's run, session). Raises ClientGoneError, too."""
+        record, run = await self._call(request, self._read, key)
+        await check_client(request)  # after the read: what its client sent later is not in it, or it has hung up by now
+        if record is None:
+            return b"", run, None
+        return record[:STAMP_BYTES], run, _unpack(record[STAMP_BYTES:], store, request.policy, session_id, run)
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._redis.aclose()
+
+    async def _call(self, request: Request, script: Any, key: str, *arguments: Any) -> Any:
+        try:
+            async with self._connections:
+                check_deadline(request)
+                if time.perf_counter() - request.received > self._patience_s:
+                    raise OverloadedError(f"the session's turn did not come within {self._patience_s:g} s: try again")
+                reply = await script(keys=[key], args=arguments)
+        except (RedisError, OSError) as error:
+            self.unreachable += 1
+            if not self._is_down:
+                self._is_down = True
+                logger.warning("Redis, which keeps the sessions, cannot be used: %s", error)
+            raise UnavailableError(
+                "the store of this server's sessions cannot be used at the moment: try again, or carry the 'state' in "
+                "each request"
+            ) from None
+        if self._is_down:
+            self._is_down = False
+            logger.warning("Redis, which keeps the sessions, can be used again")
+        return reply
+
+
+def _pack(session: Session, run: bytes) -> bytes:
+    fields = {name: getattr(session, name) for name in FIELDS}
+    if session.is_ended:
+        fields["state"] = None
+    answer = session.answer
+    if answer is not None:
+        fields["answer"] = {name: getattr(answer, name) for name in ANSWER_FIELDS}
+    return pack({"run": run, "identity": session.policy.identity, **fields})
+
+
+def _unpack(content: bytes, store: PolicyStore, name: str, session_id: SessionId, run: bytes) -> Session | None:
+    """Return a session; None where it was written in another run of Redis, or its policy is not loaded."""
+    fields = unpack(content)
+    policy = store.find(name, fields.pop("identity"))
+    if fields.pop("run") != run or policy is None:
+        return None
+    answer = fields.pop("answer", None)
+    session = Session(policy, **fields)
+    if answer is not None:
+        session.answer = Decision(
+            policy.build_action(fields["last"], batch=answer["batch"] is not None),
+            policy,
+            {},
+            name,
+            policy.contract.version,
+            **{**answer, "notices": tuple(answer["notices"])},
+            episode=EpisodeNote(session_id=session_id, step=session.steps),
+            is_repeat=True,
+        )
+    return session
