@@ -1,8 +1,9 @@
-"""Bounds on HTTP connections: head, body, trailers, pipelined requests, connections of one address.
+"""Bounds on HTTP connections and WebSockets: heads, bodies, trailers, pipelining, pings, connections of one address.
 
 uvicorn (0.54) waits indefinitely for a request's head and body, reads heads and trailers of any size, takes a trailer
-for a header, and queues any number of pipelined requests. `BoundedHttp` is uvicorn's connection with limits, given to
-uvicorn by its option `http`. It overrides methods of `asyncio.Protocol` and callbacks of httptools' parser.
+for a header, queues any number of pipelined requests, and answers pings of a client that reads nothing. `BoundedHttp`
+and `BoundedWebSocket` are uvicorn's connections with limits, given to uvicorn by its options `http` and `ws`. They
+override methods of `asyncio.Protocol`, callbacks of httptools' parser and uvicorn's handlers of frames.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any, cast
 from starlette.types import Receive, Scope, Send
 from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from uvicorn.server import ServerState
 
 from rlservo.export.contract.errors import DeadlineError, OverloadedError, RequestError
@@ -31,6 +33,10 @@ MAX_PIPELINED = 32  # requests that a connection may send before the first one i
 MAX_CONNECTIONS = 4096  # of one process
 SPARE = 32  # connections of an address beyond its bound that are answered 429; further ones are closed at once
 UNREAD_MS = 30_000  # [ms] that a client may leave a reply unread
+SLICE_BYTES = 4096  # of a WebSocket's data, read before its bounds are checked again
+MAX_UNANSWERED = 64  # messages of a WebSocket
+MAX_FRAMES = 1000  # pings, pongs and fragments of a WebSocket in a second
+VIOLATION = 1008  # WebSocket's close code for a client that does not keep to what a server allows
 ERROR_CODES = {
     400: RequestError.code,
     408: DeadlineError.code,
@@ -210,6 +216,65 @@ class BoundedHttp(HttpToolsProtocol):
         sentence = f"your address has more than {count} connections, or all clients {MAX_CONNECTIONS}: close some"
         self._limits.record(429, sentence, self.client and self.client[0])
         return _answer(send, 429, _encode(429, sentence))
+
+
+class BoundedWebSocket(WebSocketsSansIOProtocol):
+    """A WebSocket that ends when its client sends more than can be answered, and is not read while it reads nothing."""
+
+    _frames = 0
+    _second = 0.0
+
+    def data_received(self, data: bytes) -> None:
+        """Read what came, as long as the client keeps to the bounds."""
+        for start in range(0, len(data), SLICE_BYTES):
+            if self.transport.is_closing():
+                return
+            super().data_received(data[start : start + SLICE_BYTES])
+            if self.queue.qsize() > MAX_UNANSWERED:
+                self._end(f"more than {MAX_UNANSWERED} requests are unanswered")
+
+    def handle_ping(self) -> None:
+        """Answer a ping."""
+        super().handle_ping()
+        self._count_frame()
+
+    def handle_pong(self, event: Any) -> None:
+        """Take a pong."""
+        super().handle_pong(event)
+        self._count_frame()
+
+    def handle_cont(self, event: Any) -> None:
+        """Take a fragment."""
+        super().handle_cont(event)
+        self._count_frame()
+
+    def pause_writing(self) -> None:
+        """Read nothing more while the client does not read."""
+        super().pause_writing()
+        self.transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        """Read on, unless a message still waits for the application."""
+        super().resume_writing()
+        if not self.read_paused:
+            self.transport.resume_reading()
+
+    def _count_frame(self) -> None:
+        now = self.loop.time()
+        if now - self._second > 1.0:
+            self._second, self._frames = now, 0
+        self._frames += 1
+        if self._frames == MAX_FRAMES:
+            self._end(f"more than {MAX_FRAMES} pings, pongs or fragments in a second")
+
+    def _end(self, reason: str) -> None:
+        if self.close_sent or self.transport.is_closing():
+            return
+        self.conn.fail(VIOLATION, reason)
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.close_sent = True
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": VIOLATION, "reason": reason})
+        self.transport.close()
 
 
 async def _answer(send: Send, status: int, content: bytes) -> None:

@@ -26,7 +26,13 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.supervisors import Multiprocess
 
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
-from rlservo.serve_app.engines.http_bounds import LIMITS, MAX_CONNECTIONS, BoundedHttp, ConnectionLimits
+from rlservo.serve_app.engines.http_bounds import (
+    LIMITS,
+    MAX_CONNECTIONS,
+    BoundedHttp,
+    BoundedWebSocket,
+    ConnectionLimits,
+)
 from rlservo.serve_app.engines.ports import BACKLOG, listen
 from rlservo.serve_app.engines.serving import Serving
 from rlservo.serve_app.server.admin_key import operator_key
@@ -148,6 +154,7 @@ class EmbeddedServer:
             factory=True,
             interface="asgi3",
             http=BoundedHttp,
+            ws=BoundedWebSocket,
             lifespan="on",
             workers=self.workers,
             log_config=None,

@@ -282,3 +282,71 @@ def test_what_connections_are_refused_for_is_counted(server: Run) -> None:
     exchange(server, b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + os.urandom(8))
     _, text = exchange(server, head(method="GET", path="/metrics"))
     assert b'code="bad-request"' in text
+
+
+def frame(opcode: int, payload: bytes, *, final: bool = True) -> bytes:
+    """Return a client's frame, masked with zeros: the payload as it is."""
+    assert len(payload) < 126
+    return bytes([opcode | (0x80 if final else 0), 0x80 | len(payload)]) + bytes(4) + payload
+
+
+@contextlib.contextmanager
+def web_socket(run: Run) -> Iterator[socket.socket]:
+    upgrade = ("upgrade: websocket", "connection: upgrade", "sec-websocket-version: 13")
+    opening = head(
+        *upgrade, "sec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==", method="GET", path="/v1/policies/ur5/stream"
+    )
+    with contextlib.closing(connected(run.port, 20)) as connection:
+        connection.sendall(opening)
+        received = b""
+        while b"\r\n\r\n" not in received:
+            received += connection.recv(65536)
+        assert received.startswith(b"HTTP/1.1 101")
+        yield connection
+
+
+@pytest.mark.parametrize(
+    ("flood", "reason"),
+    [
+        (frame(0x9, b""), b"more than 1000 pings, pongs or fragments in a second"),
+        (frame(0xA, b""), b"more than 1000 pings, pongs or fragments in a second"),
+        (frame(0x2, b"a"), b"more than 64 requests are unanswered"),
+    ],
+    ids=["pings", "pongs", "messages"],
+)
+def test_a_flood_of_frames_ends_the_stream_with_the_reason(server: Run, flood: bytes, reason: bytes) -> None:
+    before = memory_mb(server)
+    with others_are_answered(server), web_socket(server) as stream:
+        with contextlib.suppress(OSError):
+            for _ in range(50):
+                stream.sendall(flood * 20_000)
+        received = b""
+        with contextlib.suppress(OSError):
+            while piece := stream.recv(65536):
+                received += piece
+        assert reason in received or received == b""  # closed while the client still sends, the reason may be lost
+    assert memory_mb(server) - before < 64
+
+
+def test_pings_of_a_client_that_reads_nothing_take_bounded_memory(server: Run) -> None:
+    """Slower than the bound on frames, and never reading the pongs."""
+    before = memory_mb(server)
+    with web_socket(server) as stream, others_are_answered(server):
+        stream.settimeout(0.5)
+        with contextlib.suppress(OSError):
+            for _ in range(40):
+                stream.sendall(frame(0x9, b"a" * 125) * 20)
+                time.sleep(0.03)
+    assert memory_mb(server) - before < 16
+
+
+def test_a_message_too_large_is_closed_with_its_code(server: Run) -> None:
+    with web_socket(server) as stream:
+        size = (5 << 20).to_bytes(8, "big")
+        with contextlib.suppress(OSError):
+            stream.sendall(b"\x82\xff" + size + bytes(4) + bytes(5 << 20))
+        received = b""
+        with contextlib.suppress(OSError):
+            while piece := stream.recv(65536):
+                received += piece
+    assert (1009).to_bytes(2, "big") in received
