@@ -88,7 +88,8 @@ class Elements:
             style = f" style='background:{colour};color:#000'" if colour else ""
             rows.append(
                 f"<tr{style} title='{deviations[index]:+.1f} standard deviations'>"
-                f"<td>{html.escape(name)}</td><td style='text-align:right'>{values[index]:.3f}</td>"
+                f"<td style='white-space:normal'>{html.escape(name).replace('_', '_<wbr>')}</td>"
+                f"<td style='text-align:right'>{values[index]:.3f}</td>"
                 f"<td>{html.escape(self.units[index])}</td><td>{_bounds(self.low[index], self.high[index])}</td>"
                 f"<td>{trained}</td></tr>"
             )

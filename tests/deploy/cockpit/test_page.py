@@ -57,6 +57,12 @@ WORK_OF_A_FRAME = """async () => {
   const whole = frames.slice(0, -1);
   return [0, 1].map(index => Math.max(...whole.map(frame => frame[index])));
 }"""
+# Of the table's farthest cell and of its panel, whose width does not depend on the window's.
+RIGHT_EDGES = """() => {
+  const right = part => part.getBoundingClientRect().right;
+  const table = [...document.querySelectorAll("table")].at(-1);
+  return [Math.max(...[...table.querySelectorAll("th, td")].map(right)), right(table.parentElement)];
+}"""
 # Where the README's picture goes: RLSERVO_PICTURES=examples pytest tests/deploy/cockpit/test_page.py -k picture
 PICTURES = os.environ.get("RLSERVO_PICTURES")
 
@@ -221,6 +227,8 @@ def test_the_plots_move_and_the_table_tells_what_the_policy_sees(drive: Drive, w
     window.wait_for("shoulder_velocity")
     text = window.text()
     assert "rad/s" in text and "±1.1" in text and " ± " in text
+    table, panel = window.page.evaluate(RIGHT_EDGES)
+    assert table <= panel  # the last column, too
     window.click("Plots", role="tab")
 
 
