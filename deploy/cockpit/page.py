@@ -11,7 +11,7 @@ import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Protocol
 
@@ -19,6 +19,7 @@ import numpy as np
 import viser
 import websockets.asyncio.server
 
+from rlservo.deploy.cockpit.inputs import checked_messages, point_of
 from rlservo.deploy.cockpit.stage import Vector
 from rlservo.export.contract.errors import UsageError
 
@@ -28,8 +29,17 @@ NEARER = 0.62  # tan(45 / 2) / tan(75 / 2), about: MuJoCo's angle of view to vis
 NARROW = 0.75  # of a window's width to its height, below which it is a phone's
 FARTHER, SHEET = 1.7, 0.6  # what a phone's camera makes of that: distance, and height of the middle above the window's
 PANEL_S = 0.5  # between two refreshes of numbers and plots: drawn in software, one costs as much as a frame
-# Pages that may talk to the cockpit: its own, also through a forwarded port. Programs send no Origin.
-ORIGINS = [re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?"), None]
+HOSTS = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")  # of any port: one may be forwarded to ours
+# viser's page is one file, which unpacks itself and compiles a part of its scripts from strings.
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; "
+    "worker-src blob:; style-src 'unsafe-inline'; img-src 'self' data: blob:; font-src data:; "
+    "connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Frame-Options": "DENY",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
 
 
 _phones: weakref.WeakSet[viser.ClientHandle] = weakref.WeakSet()
@@ -59,17 +69,18 @@ class _Server(viser.ViserServer):
 def served_page(port: int, title: str) -> Iterator[viser.ViserServer]:
     """Serve an empty page until the block ends. Raises UsageError where the port is taken."""
     _check_port(port)
-    with _silence(), _only_our_origins():  # its own banner names a port that ours names as well
+    with _silence(), _guarded_requests():  # its own banner names a port that ours names as well
         server = _Server(HOST, port, label=title, verbose=False)
     try:
-        server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=False)
-        # Shadows and reflections take five times as long to draw where there is no graphics card.
-        server.scene.configure_default_lights(cast_shadow=False)
-        server.scene.configure_environment_map(None)
-        server.scene.add_light_hemisphere("/sky", ground_color=(190, 190, 190), intensity=1.5)
-        server.gui.main_panel.dock_right()
-        server.on_client_connect(partial(_keep_aimed, server.initial_camera))
-        yield server
+        with checked_messages():
+            server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=False)
+            # Shadows and reflections take five times as long to draw where there is no graphics card.
+            server.scene.configure_default_lights(cast_shadow=False)
+            server.scene.configure_environment_map(None)
+            server.scene.add_light_hemisphere("/sky", ground_color=(190, 190, 190), intensity=1.5)
+            server.gui.main_panel.dock_right()
+            server.on_client_connect(partial(_keep_aimed, server.initial_camera))
+            yield server
     finally:
         with _silence():
             server.stop()
@@ -127,7 +138,8 @@ def _aim(camera: viser.CameraHandle, position: Vector, look_at: Vector) -> None:
         up = np.array([0.0, 0.0, 1.0]) - ahead[2] * ahead
         down = SHEET * np.tan(camera.fov / 2) * np.linalg.norm(way) * up / np.linalg.norm(up)
         position, look_at = look_at - way - down, look_at - down
-    camera.position, camera.look_at = position, look_at
+    if point_of(camera.position) is not None and point_of(camera.look_at) is not None:  # viser fails with others
+        camera.position, camera.look_at = position, look_at
 
 
 def _check_port(port: int) -> None:
@@ -148,15 +160,37 @@ def _silence() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _only_our_origins() -> Iterator[None]:
-    """Let only pages of this machine open a WebSocket: viser has no option for websockets' own check.
+def _guarded_requests() -> Iterator[None]:
+    """Let only the cockpit's own page, and programs, talk to it, and no other page embed it: viser has no option.
 
     Any other web page in the same browser could drive the robot.
     """
     server: Any = websockets.asyncio.server
     serve = server.serve
-    server.serve = partial(serve, origins=ORIGINS)
+
+    def guarded(*given: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            refusal = _refusal(request.headers)
+            reply = connection.respond(403, f"{refusal}\n") if refusal else process_request(connection, request)
+            if reply is not None:
+                reply.headers.update(HEADERS)
+            return reply
+
+        return serve(*given, process_request=answer, **options)
+
+    server.serve = guarded
     try:
         yield
     finally:
         server.serve = serve
+
+
+def _refusal(headers: Any) -> str:
+    """Return why a request is refused, or nothing. Programs send no Origin."""
+    host = "".join(headers.get_all("Host")).lower()
+    if not HOSTS.fullmatch(host):
+        return f"the host {host[:100]!r} is not this machine: the cockpit is at {HOST}"
+    origins = headers.get_all("Origin")
+    if any(origin.lower() not in (f"http://{host}", f"https://{host}") for origin in origins):
+        return f"a page of {', '.join(origins)[:100]} may not use the cockpit"
+    return ""

@@ -5,14 +5,16 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import viser
 
 from rlservo.deploy.cockpit.drive import Drive
+from rlservo.deploy.cockpit.inputs import number_of
 from rlservo.deploy.cockpit.page import aim_cameras, set_value
 from rlservo.deploy.cockpit.policies import FALLBACKS, Choice, Link, PolicySource
 from rlservo.deploy.cockpit.readings import Readings, escape
@@ -43,16 +45,17 @@ class DrivePanel:
         self._status = gui.add_markdown("")
         with gui.add_folder("Drive"):
             time_buttons = gui.add_button_group("Time", ("Play", "Pause", "Step"))
-            time_buttons.on_click(lambda event: drive.do(getattr(drive, str(event.target.value).lower())))
+            times = {"Play": drive.play, "Pause": drive.pause, "Step": drive.step}
+            time_buttons.on_click(lambda event: self._press(times, event.target.value))
             starts: dict[str, Callable[[], None]] = {
                 "New target": lambda: drive.begin("here"),
                 "Reset": lambda: drive.begin("own", keep_target=True),
                 "Random start": lambda: drive.begin("random", keep_target=True),
             }
             begin = gui.add_button_group("Episode", tuple(starts))
-            begin.on_click(lambda event: drive.do(starts[str(event.target.value)]))
+            begin.on_click(lambda event: self._press(starts, event.target.value))
             speed = gui.add_slider("Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0)
-            speed.on_update(lambda event: drive.do(lambda: drive.set_speed(float(event.target.value))))
+            speed.on_update(lambda event: drive.do(partial(drive.set_speed, number_of(event.target))))
             self._push = gui.add_checkbox("Drag the robot", initial_value=False, hint="instead of its target")
             self._push.on_update(lambda _: self._offer_start())
             self._drop = gui.add_button("Drop a cube ahead", visible=False)
@@ -171,14 +174,18 @@ class DrivePanel:
         for slider in (self._action_latency, self._observation_latency, self._noise, self._payload):
             on_change(slider, self._disturb)
 
+    def _press(self, commands: Mapping[str, Callable[[], None]], button: Any) -> None:
+        if button in commands:
+            self._drive.do(commands[button])
+
     def _choose_policy(self) -> None:
         self._offer_versions()
-        set_value(self._version, self._versions[self._name.value][0])
+        set_value(self._version, next(iter(self._versions.get(self._name.value, ())), self._version.value))
         self._choose()
 
     def _choose(self, env_arguments: dict[str, Any] | None = None) -> None:
         choice = Choice(self._name.value, self._version.value)
-        link = Link(float(self._deadline.value), self._fallback.value)
+        link = Link(number_of(self._deadline), self._fallback.value)
         if env_arguments is not None:
             env_arguments = {**self._drive.view.stage.arguments, **env_arguments}
         self._drive.do(lambda: self._drive.choose(choice, link, env_arguments))
@@ -190,10 +197,10 @@ class DrivePanel:
 
     def _disturb(self) -> None:
         disturbance = Disturbance(
-            int(self._action_latency.value), int(self._observation_latency.value), float(self._noise.value)
+            int(number_of(self._action_latency)), int(number_of(self._observation_latency)), number_of(self._noise)
         )
         if self._payload.visible:
-            disturbance = replace(disturbance, payload=float(self._payload.value))
+            disturbance = replace(disturbance, payload=number_of(self._payload))
         self._drive.do(lambda: self._drive.disturb(disturbance))
 
     def _drop_obstacle(self) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from rlservo.deploy.cockpit.inputs import number_of
 from rlservo.deploy.cockpit.page import aim_cameras, set_value
 from rlservo.deploy.cockpit.readings import Readings, escape
 from rlservo.deploy.cockpit.scenery import Scenery
@@ -27,6 +28,7 @@ MOST_EPISODES = 500  # in memory
 # What a recording does not tell where it stands is left out: the room and the cubes round a MiR100.
 EMPTY_FLOOR = "rlservo/NoObstacleNavigationMir100Sim-v0"
 NO_MOMENT = "-"
+WAYS = {"Pause": 0, "Back": -1, "Step": 1}
 
 
 class Tape:
@@ -122,9 +124,9 @@ class PlaybackPanel:
             moments = (NO_MOMENT, *(_moment_title(number, moment) for number, moment in enumerate(tape.moments)))
             self._moment = gui.add_dropdown("Worst moments", moments, visible=bool(tape.moments))
         self._readings = Readings(gui, contract, "The bundle's action minus the recorded one")
-        self._choice.on_update(lambda event: self._go(titles.index(event.target.value), 0))
+        self._choice.on_update(lambda event: self._choose(titles, event.target.value))
         self._slider.on_update(lambda event: self._scrub(event))
-        self._moment.on_update(lambda event: self._jump(moments.index(event.target.value) - 1))
+        self._moment.on_update(lambda event: self._jump(moments, event.target.value))
         play.on_click(lambda event: self._press(str(event.target.value)))
         aim_cameras(server, *self._stage.env.viewpoint())
 
@@ -132,7 +134,7 @@ class PlaybackPanel:
         """Draw a frame of the scene, and let time go on."""
         now = time.perf_counter()
         if self._is_playing:
-            row = self._row + (now - self._last) / self._period_s * float(self._speed.value)
+            row = self._row + (now - self._last) / self._period_s * number_of(self._speed)
             self._row = min(row, len(self._cycles) - 1.0)
             self._is_playing = self._row < len(self._cycles) - 1
         self._last = now
@@ -166,6 +168,10 @@ class PlaybackPanel:
         self._stage.env.show_observations(obs, min(row, len(obs) - 1))
         return self._stage.scene()
 
+    def _choose(self, titles: Sequence[str], title: str) -> None:
+        if title in titles:
+            self._go(titles.index(title), 0)
+
     def _go(self, number: int, row: int) -> None:
         self._is_playing = False
         self._cycles = self._tape.cycles(number)
@@ -174,20 +180,20 @@ class PlaybackPanel:
 
     def _scrub(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:  # a person, not we
-            self._is_playing, self._row = False, float(min(event.target.value, len(self._cycles) - 1))
+            self._is_playing, self._row = False, min(number_of(event.target), len(self._cycles) - 1.0)
 
-    def _jump(self, number: int) -> None:
-        if number >= 0:
-            self._go(*self._tape.find(self._tape.moments[number]))
+    def _jump(self, titles: Sequence[str], title: str) -> None:
+        if title in titles[1:]:
+            self._go(*self._tape.find(self._tape.moments[titles.index(title) - 1]))
 
     def _press(self, button: str) -> None:
         last = len(self._cycles) - 1
         if button == "Play":
             self._row = 0.0 if self._row >= last else self._row
             self._is_playing = True
-        else:
+        elif button in WAYS:
             self._is_playing = False
-            way = {"Pause": 0, "Back": -1, "Step": 1}[button]
+            way = WAYS[button]
             self._row = float(min(last, max(0, int(self._row) + way)))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 import viser
 
+from rlservo.deploy.cockpit.inputs import point_of
 from rlservo.deploy.cockpit.meshes import beam_mesh, floor_lines, shape_mesh
 from rlservo.deploy.cockpit.stage import Scene, Stage, Vector
 from rlservo.envs.shapes import Poses, Shape, body_poses, moving_bodies, visible_shapes
@@ -199,7 +200,8 @@ class _Handle:
 
     def follow(self, position: Vector) -> None:
         at = position + self._lift
-        is_elsewhere = self._control.visible and not np.allclose(self._control.position, at, atol=1e-6)
+        where = point_of(self._control.position)
+        is_elsewhere = self._control.visible and (where is None or not np.allclose(where, at, atol=1e-6))
         if is_elsewhere and time.monotonic() > self._held_until:
             self._control.position = at
 
@@ -208,7 +210,9 @@ class _Handle:
 
     def _moved(self, event: viser.TransformControlsEvent, on_move: Move) -> None:
         self._held_until = 0.0 if event.phase == "end" else time.monotonic() + HELD_S
-        on_move(np.array(event.target.position, np.float64) - self._lift)
+        position = point_of(event.target.position)
+        if position is not None:
+            on_move(position - self._lift)
 
 
 def _by_body(shapes: list[Shape]) -> dict[int, list[Shape]]:

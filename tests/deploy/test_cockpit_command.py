@@ -27,8 +27,8 @@ def refused(*arguments: str) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
-def handshake(port: int, origin: str) -> int:
-    """Return the status that a web page of this origin gets for its WebSocket."""
+def handshake(port: int, **more: str) -> int:
+    """Return the status that a WebSocket gets with these headers."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     headers = {
         "Connection": "Upgrade",
@@ -36,7 +36,7 @@ def handshake(port: int, origin: str) -> int:
         "Sec-WebSocket-Version": "13",
         "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
         "Sec-WebSocket-Protocol": f"viser-v{version('viser')}",
-        "Origin": origin,
+        **more,
     }
     connection.request("GET", "/", headers=headers)
     status = connection.getresponse().status
@@ -52,10 +52,22 @@ def test_it_serves_a_page_on_loopback_and_leaves_nothing(shipped: Path, number: 
         assert run.process.stdout.readline() == f"cockpit at http://127.0.0.1:{port}; Ctrl-C stops\n"
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=60) as reply:
             assert b"<html" in reply.read().lower()
+            assert "frame-ancestors 'none'" in reply.headers["Content-Security-Policy"]
+            assert reply.headers["X-Frame-Options"] == "DENY"
         with pytest.raises(ConnectionRefusedError), socket.create_connection(("127.0.0.2", port), timeout=5):
             pass  # it listens on 127.0.0.1 alone
-        for origin, status in ((f"http://localhost:{port}", 101), ("http://elsewhere.example", 403)):
-            assert handshake(port, origin) == status
+        own = f"127.0.0.1:{port}"
+        for headers, status in (
+            ({}, 101),  # a program
+            ({"Origin": f"http://{own}"}, 101),
+            ({"Origin": "http://localhost:9000", "Host": "localhost:9000"}, 101),  # a port forwarded to ours
+            ({"Origin": f"http://127.0.0.1:{port + 1}"}, 403),  # another server of this machine
+            ({"Origin": f"http://localhost:{port}"}, 403),
+            ({"Origin": "http://elsewhere.example"}, 403),
+            ({"Origin": "null"}, 403),
+            ({"Origin": f"http://elsewhere.example:{port}", "Host": f"elsewhere.example:{port}"}, 403),
+        ):
+            assert handshake(port, **headers) == status, headers
         assert run.end(number) == 0
         assert run.process.stdout.read() == ""
 
