@@ -54,7 +54,7 @@ class Serving:
         """
         await self.control.configure(served)
         self.core.admission.loop_clock.start()
-        self._tasks.append(asyncio.create_task(self.control.poll_ledger()))
+        self._tasks.append(asyncio.create_task(self.control.poll_plan()))
         if self.core.metrics.is_shared:
             self._tasks.append(asyncio.create_task(keep_sampled(self.core)))
         if self.settings.poll_s is not None:

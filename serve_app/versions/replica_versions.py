@@ -8,6 +8,7 @@ file system hangs.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Awaitable, Mapping
@@ -125,8 +126,23 @@ class ReplicaVersions:
         before, self._failed = self._failed, {k: e for k, e in self._failed.items() if k[:2] in self._loader.loading}
         return self._failed != before
 
-    async def poll_ledger(self) -> None:
+    async def poll_plan(self) -> None:
         """Follow the plans that others write, until cancelled."""
+        telling = asyncio.create_task(self._tell_newer())  # where files hang, the plan is followed all the same
+        try:
+            await self._follow_always()
+        finally:
+            telling.cancel()
+
+    async def _tell_newer(self) -> None:
+        with contextlib.suppress(UnavailableError):
+            digests, _ = await self._loader.look()
+            newer = ", ".join(" ".join(key) for key in self._newer(digests)[:10])
+            if newer:
+                number = self._generation()
+                logger.warning("newer than what plan %d has, and not loaded: %s (`rlservo policy load`)", number, newer)
+
+    async def _follow_always(self) -> None:
         told = ""
         while True:
             await asyncio.sleep(self._files.poll_s)

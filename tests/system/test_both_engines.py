@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -150,6 +151,39 @@ def test_another_hosts_request_and_another_pages_are_refused(engine: Engine) -> 
     body = json.dumps({"obs": OBS.tolist()}).encode()
     assert engine.ask("POST", "/v1/policies/ur5/act", body, {"host": "evil.example"})[0] == 403
     assert engine.ask("POST", "/v1/policies/ur5/act", body, {"origin": "http://evil.example"})[0] == 403
+
+
+def test_every_replica_of_a_cluster_follows_the_plan_of_the_repository(cluster: Cluster) -> None:
+    headers = {"authorization": f"Bearer {KEY}"}
+
+    def candidates() -> dict[str, str | None]:
+        """What each replica says where the alias leads, by its name."""
+        found: dict[str, str | None] = {}
+        deadline = time.monotonic() + 60
+        while len(found) < 2:
+            connection = http.client.HTTPConnection("127.0.0.1", cluster.port, timeout=30)
+            connection.request("GET", "/v1/policies", headers=headers)
+            listing = json.loads(connection.getresponse().read())
+            connection.close()
+            (ur5,) = (policy for policy in listing["policies"] if policy["name"] == "ur5")
+            found[listing["replica"]] = ur5["aliases"].get("candidate")
+            assert time.monotonic() < deadline, found
+        return found
+
+    def follow(version: str | None) -> None:
+        deadline = time.monotonic() + 30
+        while set(candidates().values()) != {version}:
+            assert time.monotonic() < deadline
+
+    with cluster.admin() as admin:
+        admin.load("ur5", "2")
+        admin.alias("ur5", "candidate", "2")
+    follow("2")
+    done = cluster.run("rlservo.deploy.cli", "policy", "alias", "ur5", "candidate=", "--repository", cluster.repository)
+    assert done.returncode == 0 and "loaded 1, 2;" in done.stdout, done.stdout + done.stderr
+    follow(None)
+    with cluster.admin() as admin:
+        admin.unload("ur5", "2")
 
 
 def test_metrics_and_the_status_page_are_served(engine: Engine) -> None:

@@ -408,7 +408,7 @@ def test_a_process_whose_files_hang_follows_what_others_change_meanwhile(
         for control in controls:
             await control.configure(config)
         stalled = stall(elsewhere / "ur5" / "2" / "policy.onnx")
-        watching = asyncio.create_task(controls[1].poll_ledger())
+        watching = asyncio.create_task(controls[1].poll_plan())
         await controls[0].load("ur5", "2", what="load")
         await asyncio.sleep(1.5)
         assert controls[1].behind[0].startswith("loading policy 'ur5' version 2 took longer than 1 s")

@@ -434,7 +434,7 @@ def test_a_plan_in_object_storage_is_followed_raced_for_and_outlives_all(
         controls = [replica(storage.uri, cache=cache) for _ in range(3)]
         for control in controls:
             await control.configure({})
-        polls = [asyncio.create_task(control.poll_ledger()) for control in controls]
+        polls = [asyncio.create_task(control.poll_plan()) for control in controls]
         await controls[0].change(aliased("1"), what="alias ur5 production=1")
         await until(lambda: all(c.store is not None and c.store.default("ur5") == "1" for c in controls))
         storage.tell(late(0.1))

@@ -96,7 +96,7 @@ def test_a_change_is_served_by_who_took_it_when_it_answers_and_by_the_others_wit
         fleet = Fleet(folder, folder, folder, folder)
         await fleet.deploy(config("1", production="1"))
         first, second, third = fleet.controls
-        polls = [asyncio.create_task(control.poll_ledger()) for control in (second, third)]
+        polls = [asyncio.create_task(control.poll_plan()) for control in (second, third)]
         held = second.store
         await first.load("ur5", "2", what="load ur5 2")
         plan = await first.change(aliasing("2"), what="alias ur5 production=2")
@@ -248,6 +248,22 @@ def test_a_configuration_begins_a_plan_and_commands_rule_after(
             await control.configure(config("1", "10", production="1"))
             assert control.store is not None and control.store.default("ur5") == "10"
         assert caplog.text.count("plan 2 in") == 2 and "says otherwise than the configuration, and holds" in caplog.text
+
+    asyncio.run(run())
+
+
+def test_a_version_exported_since_is_not_in_use_by_itself_and_a_start_says_so(
+    folder: Path, box_policy: Callable[..., Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        await Fleet(folder, folder).deploy({})
+        box_policy(folder, version="11", seed=11)
+        fleet = Fleet(folder, folder)
+        await fleet.deploy({})
+        poll = asyncio.create_task(fleet.controls[0].poll_plan())
+        await until(lambda: "newer than what plan 1 has, and not loaded: ur5 11" in caplog.text)
+        assert fleet.defaults() == ["10"]
+        poll.cancel()
 
     asyncio.run(run())
 
@@ -424,7 +440,7 @@ def test_a_plan_that_is_no_plan_stops_nobody_and_a_lost_one_is_not_begun_again(
         fleet = Fleet(tmp_path, folder)
         await fleet.deploy(config("1", production="1"))
         (control,) = fleet.controls
-        poll = asyncio.create_task(control.poll_ledger())
+        poll = asyncio.create_task(control.poll_plan())
         following = tmp_path / FOLDER / "000000002.json"
         following.write_text('{"generation": 2, "policies": {}, "by": "a later rlservo"}')
         await until(lambda: "000000002.json is no plan that this rlservo reads" in caplog.text)
