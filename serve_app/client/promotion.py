@@ -87,7 +87,7 @@ class Promotion:
         self._canary = f"{terms.version}={terms.share:g}"
         self._shadow = "none" if terms.limits.action_difference is None else terms.version
         self._production = ""  # the version that is in production
-        self._generation = 0  # of its own last change
+        self._generation = 0  # of the newest plan that was seen
         self._counts = Counts()
         self._ends_at = math.inf  # by the clock
         self._logged_at = -math.inf
@@ -102,6 +102,7 @@ class Promotion:
                 decided = self._resume()
         except UntrustedError as error:
             raise UsageError(str(error)) from None
+        decided_at = None if decided is None else self._generation
         try:
             outcome = decided or (self._start() if is_new else None) or self._watch()
             if decided is None:
@@ -111,7 +112,7 @@ class Promotion:
         except UsageError as error:  # nothing is put into production that the log does not hold
             outcome = Outcome(STOPPED, error.message)
         try:
-            outcome = self._carry_out(outcome, is_resumed=decided is not None)
+            outcome = self._carry_out(outcome, decided_at)
             if outcome.is_finished:
                 self._log.write(END, outcome=outcome.outcome, why=outcome.why)
         except KeyboardInterrupt:
@@ -198,16 +199,11 @@ class Promotion:
             self._sleep(min(self._every_s, max(self._remaining, min(1.0, self._every_s))))
             try:
                 served = self._served()
-                trouble = ""
-                if served is not None and served.generation < self._generation:
-                    trouble = f"the server follows plan {served.generation}, and not yet {self._generation}"
-                elif changed := self._changed(served):
+                if changed := self._changed(served):
                     return Outcome(STOPPED, changed)
-                elif served is not None:
-                    self._generation = served.generation  # others have changed other policies
                 processes = self._processes()
                 self._counts.add(processes)
-                trouble = trouble or self._behind(processes)
+                trouble = self._behind(processes)
             except UntrustedError as error:
                 return Outcome(ROLLED_BACK, str(error))
             except RlservoError as error:
@@ -263,24 +259,24 @@ class Promotion:
 
     # Carry out what was decided.
 
-    def _carry_out(self, outcome: Outcome, *, is_resumed: bool) -> Outcome:
+    def _carry_out(self, outcome: Outcome, decided_at: int | None) -> Outcome:
         """Move the alias or not, and end the canary; return the outcome with what is served then."""
         deadline = self._clock() + PATIENCE_S
         while True:
             try:
-                return self._attempt(outcome, is_resumed=is_resumed)
+                return self._attempt(outcome, decided_at)
             except RlservoError as error:
                 if self._clock() > deadline:
                     return self._unfinished(outcome, error.message)
                 self._say(f"cannot be carried out yet: {error.message}")
             self._sleep(min(1.0, self._every_s))
 
-    def _attempt(self, outcome: Outcome, *, is_resumed: bool) -> Outcome:
+    def _attempt(self, outcome: Outcome, decided_at: int | None) -> Outcome:
         """Carry out once; what is done already is not done again."""
         name, version, served = self._terms.policy, self._terms.version, self._served()
         if outcome.outcome == PROMOTED and served is not None and served.production != version:
             changed = self._changed(served)
-            if not changed and is_resumed and served.generation != self._generation:
+            if not changed and decided_at not in (None, served.generation):
                 changed = f"this promotion may have been undone ({served.last_change}): start it again"
             try:
                 if not changed:
@@ -311,13 +307,17 @@ class Promotion:
     # Ask the servers.
 
     def _served(self) -> _Served | None:
-        """Return the plan of the policy; None where it is not served. Raises RlservoError."""
+        """Return the plan of the policy; None where it is not served. Raises RlservoError, also for an older plan."""
         with self._connect(self._terms.urls[0]) as client:
             listing = client.listing()
         try:
+            generation = int(listing["generation"])
+            if generation < self._generation:  # of a worker or replica that has not followed yet
+                raise UnavailableError(f"the server follows plan {generation}, and not yet {self._generation}")
+            self._generation = generation
             policy = next((policy for policy in listing["policies"] if policy["name"] == self._terms.policy), None)
             return policy and _Served(
-                int(listing["generation"]),
+                generation,
                 f"the last change was '{listing['changed_by'].strip()}', at {listing['changed_at'][:19]} UTC",
                 policy["versions"],
                 policy["version"],
