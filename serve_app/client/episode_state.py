@@ -110,9 +110,9 @@ class EpisodeState:
 
         Raises SessionLostError when the reply is of another episode, UnavailableError when it lacks the state.
         """
+        self._has_unanswered_start = False
         if self.is_on_server(contract) and (contract.state or "session_step" in reply):
             self._steps = check_step(reply, self._steps)
-            self._has_unanswered_start = False
         else:
             if self.is_carried(contract):
                 self._state = next_state(reply, contract)

@@ -1,7 +1,8 @@
-"""Recurrent state behind the real thing: Ray Serve, HAProxy, Triton's clients, and a replica that is killed."""
+"""Recurrent state behind a real server: Triton's clients, and workers that are killed."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -16,10 +17,9 @@ import pytest
 from rlservo.export.contract.errors import DeadlineError, SessionLostError, UnavailableError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.recording.episodes import Episode, episodes
-from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.runtime.policy import Policy
-from servers import LiveServer
+from servers import LiveServer, launched
+from storages import RedisServer
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
@@ -62,52 +62,38 @@ def test_tritons_clients_keep_sequences_over_every_way_they_have(
     assert len(refusals) == 4 and all("begin" in refusal for refusal in refusals), refusals
 
 
-def recorded_episodes(recording: Recording) -> list[Episode]:
-    """Return the episodes of three clients before a kill; the state that is carried may go on for a step after it."""
-    return [
-        one
-        for one in episodes(recording)
-        if one.begins
-        and len(one) in (3, 4)
-        and one.policy.contract.name == MODEL
-        and np.array_equal(one.obs["obs"][:3], SEEN[:3])
-    ]
-
-
-def test_a_killed_replica_takes_its_memories_along_and_its_clients_learn_of_it(
-    live_server: LiveServer, expected: list[np.ndarray]
+def test_when_workers_are_killed_streams_learn_of_it_and_sessions_in_redis_go_on(
+    redis_server: RedisServer, recurrent: Path, expected: list[np.ndarray]
 ) -> None:
-    url, key = f"http://127.0.0.1:{live_server.port}", live_server.key
-    (replica,) = live_server.run.processes("ServeReplica")
     with (
-        PolicyClient(url, MODEL, api_key=key, deadline_ms=500) as carrying,
-        PolicyClient(url, MODEL, api_key=key, server_state=True, deadline_ms=500) as held,
-        StreamClient(url, MODEL, api_key=key, server_state=True, deadline_ms=500) as streaming,
+        launched(recurrent, workers=2, settings={"session_store": redis_server.url}) as run,
+        contextlib.ExitStack() as stack,
     ):
-        clients: list[PolicyClient | StreamClient] = [carrying, held, streaming]
+        run.wait_until_ready()
+        url = f"http://127.0.0.1:{run.port}"
+        carrying = stack.enter_context(PolicyClient(url, MODEL, deadline_ms=5000))
+        held = stack.enter_context(PolicyClient(url, MODEL, server_state=True, deadline_ms=5000))
+        streaming = stack.enter_context(StreamClient(url, MODEL, server_state=True, deadline_ms=5000))
         for step in range(3):
-            for client in clients:
-                np.testing.assert_allclose(client.act(SEEN[step]), expected[step], rtol=1e-4, atol=1e-5)
-        # A killed replica's recording lacks the last second, or more where its writer had to wait for a processor.
-        deadline = time.monotonic() + 60
-        while len(recorded_episodes(Recording(live_server.recorded))) < 3:
+            for client in (carrying, held, streaming):
+                np.testing.assert_array_equal(client.act(SEEN[step]), expected[step])
+        for worker in run.processes("spawn_main"):
+            os.kill(worker, signal.SIGKILL)
+        for client in (carrying, held):
+            np.testing.assert_array_equal(until_answered(client, SEEN[3]), expected[3])
+        with pytest.raises(SessionLostError):
+            until_answered(streaming, SEEN[3])
+        streaming.reset()
+        for step in range(2):
+            np.testing.assert_array_equal(until_answered(streaming, SEEN[step]), expected[step])
+
+
+def until_answered(client: PolicyClient | StreamClient, obs: np.ndarray) -> np.ndarray:
+    """Ask until there is a server again."""
+    deadline = time.monotonic() + 60
+    while True:
+        try:
+            return np.asarray(client.act(obs))
+        except (UnavailableError, DeadlineError):
             assert time.monotonic() < deadline
-            time.sleep(0.2)
-        os.kill(replica, signal.SIGKILL)
-        for client in (held, streaming):
-            deadline = time.monotonic() + 60
-            while True:  # nothing but errors until the loss is told: never an action from a memory begun anew
-                assert time.monotonic() < deadline
-                with pytest.raises((SessionLostError, UnavailableError, DeadlineError)) as caught:
-                    client.act(SEEN[3])
-                if caught.errisinstance(SessionLostError):
-                    break
-                time.sleep(0.05)
-        np.testing.assert_allclose(carrying.act(SEEN[3]), expected[3], rtol=1e-4, atol=1e-5)
-        for client in (held, streaming):
-            client.reset()
-            np.testing.assert_allclose(client.act(SEEN[0]), expected[0], rtol=1e-4, atol=1e-5)
-            np.testing.assert_allclose(client.act(SEEN[1]), expected[1], rtol=1e-4, atol=1e-5)
-    recording = Recording(live_server.recorded)
-    assert len(recorded_episodes(recording)) >= 3  # of before the kill
-    assert any(not facts.whole and facts.damage is None for facts in recording.files)
+            time.sleep(0.05)

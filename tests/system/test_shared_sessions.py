@@ -43,4 +43,4 @@ def test_every_action_is_the_policys_own_over_three_workers(redis_server: RedisS
 def test_every_action_is_the_policys_own_over_two_replicas_of_ray_serve(cluster: Cluster) -> None:
     asked = connections(cluster.port, cluster.grpc_port, KEY)
     bundle = cluster.repository / RECURRENT
-    check(*asyncio.run(play(asked, bundle, 3000, cluster.replica_pids, rest=500)))
+    check(*asyncio.run(play(asked, bundle, 3000, cluster.replica_pids, rest=600)))
