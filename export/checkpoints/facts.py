@@ -19,8 +19,9 @@ from rlservo.export.checkpoints.old_location import ALGORITHM_STATE, POLICY_STAT
 from rlservo.export.checkpoints.unpickle import unpickle
 from rlservo.export.contract.errors import CheckpointError
 
-# Where RLlib (ray 2.60) keeps its counters in algorithm_state.pkl.
-_ENV_STEPS = "env_runners--num_env_steps_sampled_lifetime"
+# Where RLlib keeps its counter in algorithm_state.pkl: up to Ray 2.39, 2.40, and from 2.41 on.
+_STEPS = "num_env_steps_sampled_lifetime"
+_ENV_STEPS = ((_STEPS,), ("env_runners", _STEPS), f"env_runners--{_STEPS}")
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def read_facts(root: Path, notify: Callable[[str], None]) -> CheckpointFacts:
         env_id=_env_name(config.get("env")),
         env_config=_json_values(config.get("env_config") or {}, notify),
         training_iterations=_whole(state.get("training_iteration")),
-        env_steps=_whole(stats.get(_ENV_STEPS, {}).get("lifetime_sum")),
+        env_steps=_env_steps(stats),
         ray_version=_ray_version(root),
     )
 
@@ -94,7 +95,7 @@ def _open(file: Path, what: str, notify: Callable[[str], None]) -> dict[str, Any
     if not file.is_file():
         return None
     try:
-        opened = unpickle(file)
+        opened = unpickle(file, missing_ok=True)
     except CheckpointError as error:
         notify(f"the checkpoint's {what} cannot be told: {error}")
         return None
@@ -133,6 +134,11 @@ def _json_values(env_config: Mapping[str, Any], notify: Callable[[str], None]) -
         except (TypeError, ValueError):
             notify(f"env_config['{key}'] is a {type(value).__name__}, which JSON cannot hold: left out of the contract")
     return kept
+
+
+def _env_steps(stats: Mapping[Any, Mapping[str, Any]]) -> int | None:
+    counter = next((stats[key] for key in _ENV_STEPS if key in stats), {})
+    return _whole(counter.get("lifetime_sum", sum(counter.get("values", ())) or None))  # the values until Ray 2.50
 
 
 def _whole(number: Any) -> int | None:

@@ -19,6 +19,7 @@ from rlservo.export.checkpoints.old_location import (
     old_stack_root,
     policy_ids,
 )
+from rlservo.export.checkpoints.older_rays import OLD_WEIGHTS
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 
 MODULES = Path("learner_group") / "learner" / "rl_module"
@@ -27,7 +28,7 @@ ENV_TO_MODULE = "env_to_module_connector"
 MODULE_TO_ENV = "module_to_env_connector"
 CTOR_FILE = "class_and_ctor_args.pkl"
 STATE_STEMS = {"module": "module_state", "connector": "state"}
-STATE_SUFFIXES = (".pkl", ".msgpack")
+STATE_SUFFIXES = (".pkl", ".msgpack", ".pt")
 FACTS_FILE = "rlservo_facts.json"
 """Written by `prune.py` in place of RLlib's own configuration pickles."""
 
@@ -101,7 +102,8 @@ class CheckpointFiles:
         """Return every file that decides what the policy does, in a fixed order."""
         folders = (self.module, self.env_to_module, self.module_to_env)
         found = {file for folder in folders for file in folder.rglob("*") if file.is_file()}
-        if not self.has_pipelines and not self.alone:
+        early = weights_pickle(self.module).name == OLD_WEIGHTS
+        if (early or not self.has_pipelines) and not self.alone:
             found.add(self.root / CTOR_FILE)  # the configuration they are built from
         if self.is_one_of_several and self.together.is_file():
             found.add(self.together)
@@ -176,11 +178,11 @@ def _find_root(given: Path) -> Path:
     for folder in (given, *given.parents):
         if (folder / MODULES).is_dir():
             return folder
-    if (given / _BEFORE_COMPONENTS).is_dir():
+    if (given / _BEFORE_COMPONENTS).is_dir() and not policy_ids(given):  # RLModules inside old policies have both
         raise UnsupportedError(
             f"{given} holds its modules in {_BEFORE_COMPONENTS}/, as a Ray before 2.33 wrote them on the new API "
-            "stack, without connectors and in a form today's RLlib cannot restore: train again with a later Ray and "
-            "export that"
+            "stack: without the connectors and what they had learned, such as an observation filter's statistics; "
+            "train again with a later Ray and export that"
         )
     if old := old_stack_root(given):
         return old
@@ -198,6 +200,12 @@ def _find_root(given: Path) -> Path:
         f"{given} is not an RLlib checkpoint: looked for {MODULES}/ (an algorithm checkpoint of the new API stack), "
         "policies/ (the old stack) and checkpoint_NNNNNN/ (a Tune trial), found none of them"
     )
+
+
+def weights_pickle(folder: Path) -> Path:
+    """Return the file that holds a module's weights, as older Rays or as today's name it; it may not exist."""
+    older = folder / OLD_WEIGHTS
+    return older if older.is_file() else folder / f"{STATE_STEMS['module']}.pkl"
 
 
 def _is_module(folder: Path) -> bool:

@@ -10,8 +10,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
+from rlservo.export.checkpoints import older_rays
 from rlservo.export.contract.errors import CheckpointError, UsageError, first_line
 
 TRUNCATED = "the file is truncated or damaged ({})"
@@ -34,14 +35,15 @@ def user_code(app_dir: str | Path) -> Iterator[Path]:
             sys.path.remove(folder)
 
 
-def unpickle(file: Path) -> Any:
+def unpickle(file: Path, *, missing_ok: bool = False) -> Any:
     """Return the object pickled in `file` (cloudpickle writes ordinary pickles).
 
+    With `missing_ok`, values whose class Ray no longer has are left out: for what does not decide what a policy does.
     Raises CheckpointError when the file is missing or damaged, or the code it names cannot be imported.
     """
     try:
         with file.open("rb") as stream:
-            return pickle.load(stream)
+            return _Unpickler(stream, missing_ok=missing_ok).load()
     except OSError as error:
         raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from error
     except Exception as error:  # a damaged pickle raises almost anything, and so does the code it runs
@@ -90,6 +92,17 @@ class _StandIn:
     def extend(self, _items: Any) -> None: ...
 
     append = add = extend
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads older Rays' pickles as today's."""
+
+    def __init__(self, stream: BinaryIO, *, missing_ok: bool) -> None:
+        super().__init__(stream)
+        self._missing_ok = missing_ok
+
+    def find_class(self, module: str, name: str) -> Any:
+        return older_rays.find_class(super().find_class, module, name, missing_ok=self._missing_ok)
 
 
 def explain(error: BaseException) -> str:

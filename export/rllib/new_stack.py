@@ -6,11 +6,12 @@ them what they do. `NewStackLoop` is RLlib's own pipelines around RLlib's own fo
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,13 @@ from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from torch import Tensor, nn
 
 from rlservo.export.checkpoints.facts import read_config
-from rlservo.export.checkpoints.location import CTOR_FILE, ENV_TO_MODULE, MODULE_TO_ENV, STATE_STEMS, CheckpointFiles
+from rlservo.export.checkpoints.location import (
+    CTOR_FILE,
+    ENV_TO_MODULE,
+    MODULE_TO_ENV,
+    CheckpointFiles,
+    weights_pickle,
+)
 from rlservo.export.checkpoints.unpickle import explain, unpickle
 from rlservo.export.contract.errors import CheckpointError, NoNetworkError, UnsupportedError, first_line
 from rlservo.export.contract.scores import Q_VALUES
@@ -51,6 +58,14 @@ from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_heads
 from rlservo.export.rllib.new_connectors import read_action_steps, read_observation_steps
 from rlservo.export.rllib.new_pipelines import Pipelines, find_agent_slot, own_copy, pipelines_of
+from rlservo.export.rllib.older_components import (
+    CONSTANT,
+    is_older,
+    lists_connectors,
+    restore_older,
+    saved_spaces,
+    set_saved_state,
+)
 from rlservo.export.rllib.restore_order import connectors_that_rllib_restores
 from rlservo.export.rllib.restored_policy import RestoredPolicy, diverged_weights
 from rlservo.export.rllib.supported_spaces import check_spaces
@@ -203,10 +218,14 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     Raises CheckpointError when it cannot be read, UnsupportedError when exporting it would lose something.
     """
     module: Any = _restore(RLModule, files.module)
-    if files.has_pipelines:
+    if files.has_pipelines and lists_connectors(files.env_to_module):
         env_to_module, module_to_env = _restore_pipelines(files.runner)
     else:
         env_to_module, module_to_env = _build_pipelines(files, module, notify)
+        if files.has_pipelines:
+            for pipeline, folder in ((env_to_module, files.env_to_module), (module_to_env, files.module_to_env)):
+                with _explained(folder):
+                    set_saved_state(pipeline, folder)
 
     name = type(module).__name__
     if not isinstance(module, TorchRLModule):
@@ -276,15 +295,17 @@ def _build_pipelines(files: CheckpointFiles, module: Any, notify: Callable[[str]
             "default"
         )
     else:
-        saved = read_config(unpickle(files.root / CTOR_FILE).get("ctor_args_and_kwargs"))
+        saved = read_config(unpickle(files.root / CTOR_FILE, missing_ok=True).get("ctor_args_and_kwargs"))
         for name in PIPELINE_SETTINGS:
             if name in saved:
                 private_names.replace(config, name, saved[name])
-        notify(
-            "the checkpoint holds no connectors (recorded data, or an environment elsewhere): the pipelines are built "
-            "from its configuration"
-        )
+        lacks = "holds no connectors (recorded data, or an environment elsewhere)"
+        if files.has_pipelines:
+            lacks = "does not list its connectors (a Ray before 2.39)"
+        notify(f"the checkpoint {lacks}: the pipelines are built from its configuration")
     spaces = (config.observation_space or module.observation_space, config.action_space or module.action_space)
+    if files.has_pipelines:
+        spaces = saved_spaces(files.env_to_module)
     try:
         return (
             config.build_env_to_module_connector(spaces={INPUT_ENV_SINGLE_SPACES: spaces, INPUT_ENV_SPACES: spaces}),
@@ -297,11 +318,20 @@ def _build_pipelines(files: CheckpointFiles, module: Any, notify: Callable[[str]
 
 
 def _restore(kind: Any, folder: Path) -> Any:
+    with _explained(folder):
+        return restore_older(folder) if is_older(folder) else kind.from_checkpoint(str(folder))
+
+
+@contextlib.contextmanager
+def _explained(folder: Path) -> Iterator[None]:
+    """Raise CheckpointError where what is in `folder` cannot be restored."""
     unpickle(folder / CTOR_FILE)  # RLlib's own loader hides a missing class behind an unrelated error
     deprecation = logging.getLogger("ray._common.deprecation")
     deprecation.addFilter(_not_rllibs_own)
     try:
-        return kind.from_checkpoint(str(folder))
+        yield
+    except CheckpointError:
+        raise
     except Exception as error:  # whatever RLlib, torch or the user's own constructor raises
         raise CheckpointError(f"{folder} cannot be restored: {explain(error)}{_other_ray(folder)}") from error
     finally:
@@ -339,10 +369,10 @@ def _check_weights(files: CheckpointFiles, module: Any) -> str:
             raise CheckpointError(f"{files.module}: the weights '{key}' are not all finite: training diverged")
     if module.inference_only:
         return "it was saved for inference only"
-    state_file = files.module / f"{STATE_STEMS['module']}.pkl"
+    state_file = weights_pickle(files.module)
     if type(module).get_state is not TorchRLModule.get_state or not state_file.is_file():
         return ""  # a custom layout, which only the module itself can judge, or msgpack
-    missing = set(module.state_dict()) - set(unpickle(state_file))
+    missing = {key for key in module.state_dict() if not key.endswith(CONSTANT)} - set(unpickle(state_file))
     if needed := sorted(key for key in missing if not any(key.startswith(f"{prefix}.") for prefix in unneeded)):
         raise CheckpointError(f"{state_file} lacks weights that {type(module).__name__} needs: {', '.join(needed[:3])}")
     return f"{len(missing)} weights are missing" if missing else ""

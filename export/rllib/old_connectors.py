@@ -42,12 +42,7 @@ def check_connectors(state: Mapping[str, Any]) -> None:
                 f"{'observations' if side == 'agent' else 'actions'}: it was written by an early Ray or with "
                 "connectors switched off; restore it in Ray 2.7 or later and save it again"
             )
-        for name, saved in configs[side][1]:
-            if name in FILTERS and any("sum_sq_diff_array" not in stats for stats in saved["running_stats"]):
-                raise UnsupportedError(
-                    "the observation filter's statistics are in an earlier Ray's form, which today's RLlib cannot "
-                    "read: export with the Ray that wrote the checkpoint, or train on and save with a later one"
-                )
+        for name, _ in configs[side][1]:
             if name not in known:
                 where = "before the network" if side == "agent" else "after the network"
                 raise UnsupportedError(

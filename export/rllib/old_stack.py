@@ -44,6 +44,7 @@ from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_heads
 from rlservo.export.rllib.old_connectors import check_connectors, read_old_steps, read_old_transform
 from rlservo.export.rllib.old_models import register_custom_parts
+from rlservo.export.rllib.older_policies import MIXTURES, update_policy_state
 from rlservo.export.rllib.restored_policy import RestoredPolicy, diverged_weights
 from rlservo.export.rllib.supported_spaces import check_spaces
 
@@ -181,11 +182,12 @@ def _network_state(policy: Any) -> tuple[StateLeaf, ...]:
 
 def _restore(files: OldStackFiles, app_dir: Path) -> Any:
     """Return the policy, as `Policy.from_checkpoint` would, but always on the CPU and without its optimizer."""
-    state = unpickle(files.state)
+    state = unpickle(files.state, missing_ok=True)
     if not isinstance(state, dict) or not isinstance(state.get("policy_spec"), dict) or "weights" not in state:
         raise CheckpointError(
             f"{files.state} is not a policy's state: expected a dictionary with 'policy_spec' and 'weights'"
         )
+    update_policy_state(state, files)
     config = state["policy_spec"].get("config") or {}
     _check_config(files, state["policy_spec"].get("policy_class"), config)
     check_connectors(state)
@@ -219,11 +221,11 @@ def _check_config(files: OldStackFiles, policy_class: Any, config: Mapping[str, 
             f"policy {name} of {files.root} is written in {framework} (TensorFlow): only torch policies are exported; "
             "train with framework='torch'"
         )
-    mixtures = ("enable_rl_module_and_learner", "_enable_rl_module_api", "_enable_new_api_stack")
-    if any(config.get(setting) is True for setting in mixtures):
+    if any(config.get(setting) is True for setting in MIXTURES):
         raise UnsupportedError(
-            f"{files.root} holds an RLModule inside an old-stack policy ({name}), a mixture that Ray 2.5 to 2.9 wrote "
-            "and today's cannot restore: restore it in the Ray that wrote it"
+            f"{files.root} holds an RLModule inside an old-stack policy ({name}), a mixture that today's Ray cannot "
+            "restore, and not one of RLlib's own for vectors without memory, which the export takes for the same "
+            "network of the old stack: train again with a later Ray"
         )
 
 

@@ -284,7 +284,7 @@ def test_help_imports_nothing_that_takes_time(policies: Path) -> None:
           ("export", "prune", "inspect", "verify", "serve", "key", "rollout", "demo", "server-manager")),
         ("policy", "load", "--help"), ("policy", "promote", "--help"),
         ("robot-server", "ur", "--help"),
-        
+
     ]  # fmt: skip
     imported = modules_of(*plain, ("key", "cell-7"), ("inspect", policies))
     assert not imported[0] & {*HEAVY, "pydantic", "importlib.metadata"}

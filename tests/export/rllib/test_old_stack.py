@@ -441,7 +441,7 @@ def filter_of(state: dict[str, Any]) -> dict[str, Any]:
         (
             lambda state: filter_of(state)["running_stats"][0].pop("sum_sq_diff_array"),
             UnsupportedError,
-            "the observation filter's statistics are in an earlier Ray's form",
+            "the observation filter's statistics are in a form that is not known",
         ),
         (
             lambda state: filter_of(state)["running_stats"][0].update(mean_array="eJyb"),
