@@ -158,6 +158,25 @@ def serving(*versions: str, production: str = "1", **more: Any) -> dict[str, Any
     return {"policies": {"ur5": ur5, RECURRENT: {}}}
 
 
+def own_ports(folder: Path) -> dict[str, str]:
+    """Return variables that keep two of Ray's HAProxies on one machine apart: their ports and files."""
+    stats, metrics, fallback, fallback_grpc, first, second = free_ports(6)
+    return {
+        "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
+        "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
+        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
+        "RAY_SERVE_FALLBACK_PROXY_GRPC_PORT": str(fallback_grpc),
+        "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(first),
+        "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(first + 20),
+        "RAY_SERVE_DIRECT_INGRESS_MIN_GRPC_PORT": str(second),
+        "RAY_SERVE_DIRECT_INGRESS_MAX_GRPC_PORT": str(second + 20),
+        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
+        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "a.sock"),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "state"),
+    }
+
+
 @pytest.fixture(scope="session")
 def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     """The cluster, with two replicas, version 1 of ur5 deployed by `serve deploy`, and sessions in Redis."""
@@ -178,7 +197,7 @@ def _cluster(
         "policies": [str(cluster_repository)], "replicas": 2, "settings": {"api_keys": LINE, "session_store": redis.url}
     }  # fmt: skip
     own = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "RLSERVO_"))}
-    environment = own | SWITCHES | {"RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    environment = own | SWITCHES | own_ports(folder) | {"RAY_AUTH_TOKEN": secrets.token_hex(32)}
     plan = json.dumps({"dashboard": dashboard, "folder": str(folder)})
     errors = tmp_path_factory.mktemp("cluster") / "errors.txt"
     with errors.open("w") as stream:

@@ -75,8 +75,9 @@ def test_commands_run_as_written(checkout: Path) -> None:
         return done.stdout
 
     commands = blocks("sh")
-    train, export, serve, curl, policy, rollout = commands[1:7]
+    train, export, serve, curl, policy, on_ray, rollout = commands[1:8]
     assert "training_inference_ur.py" in train  # run by tests/examples
+    assert "serve run deploy/serve.yaml" in on_ray  # run by tests/system/test_demo.py, on a port of its own
     run(export)
     assert serve.strip() == "rlservo serve policies"
     server = subprocess.Popen(

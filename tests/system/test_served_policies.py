@@ -53,7 +53,7 @@ def test_random_targets_are_reached(
 
 
 @pytest.mark.parametrize(("name", "checkpoint", "env_id"), [
-    ("ur5", "ur5_positioning", UR5), ("mir100", "mir100_navigation", MIR100),
+    ("ur5", "ur_positioning", UR5), ("mir100", "mir100_navigation", MIR100),
 ])  # fmt: skip
 def test_returns_are_the_rllib_checkpoints_own(shipped: Path, name: str, checkpoint: str, env_id: str) -> None:
     result = verify_bundle(
