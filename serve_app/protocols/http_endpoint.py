@@ -168,7 +168,9 @@ class PolicyApp(FastAPI):
             match, below = route.matches(scope)
             if match is Match.FULL:
                 found = Found(route, access_of(route), below.get("path_params", {}))
-                if len(path) <= LONGEST_REMEMBERED and PATH.fullmatch(path) is not None:
+                # Only these match by method and path alone: the page at `/` asks the Accept header, too.
+                is_bare = isinstance(route, PostRoute | StreamRoute)
+                if is_bare and len(path) <= LONGEST_REMEMBERED and PATH.fullmatch(path) is not None:
                     if len(self._found) >= PATHS_REMEMBERED:
                         self._found.clear()
                     self._found[kind, path] = found
