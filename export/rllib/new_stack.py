@@ -218,14 +218,7 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     Raises CheckpointError when it cannot be read, UnsupportedError when exporting it would lose something.
     """
     module: Any = _restore(RLModule, files.module)
-    if files.has_pipelines and lists_connectors(files.env_to_module):
-        env_to_module, module_to_env = _restore_pipelines(files.runner)
-    else:
-        env_to_module, module_to_env = _build_pipelines(files, module, notify)
-        if files.has_pipelines:
-            for pipeline, folder in ((env_to_module, files.env_to_module), (module_to_env, files.module_to_env)):
-                with _explained(folder):
-                    set_saved_state(pipeline, folder)
+    env_to_module, module_to_env = _read_pipelines(files, files.runner, module, notify)
 
     name = type(module).__name__
     if not isinstance(module, TorchRLModule):
@@ -258,17 +251,26 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     module_class = f"{type(module).__module__}.{name}"
     if files.has_pipelines:
         # The gate's own copies, read from where RLlib reads them: what the recipe has wrong must not be in both.
-        env_to_module, module_to_env = _restore_pipelines(connectors_that_rllib_restores(files))
+        folder = connectors_that_rllib_restores(files)
+        env_to_module, module_to_env = _read_pipelines(files, folder, module, lambda _: None)
         read_observation_steps(env_to_module, files, slot)  # freezes the filter
         pipelines = pipelines_of(slot, module, env_to_module, module_to_env, observation_space, action_space)
     return RestoredPolicy(recipe, network, module_class, partial(NewStackLoop, pipelines, recipe, network), slot.agents)
 
 
-def _restore_pipelines(folder: Path) -> tuple[Any, Any]:
-    return (
-        _restore(EnvToModulePipeline, folder / ENV_TO_MODULE),
-        _restore(ModuleToEnvPipeline, folder / MODULE_TO_ENV),
-    )
+def _read_pipelines(
+    files: CheckpointFiles, runner: Path, module: Any, notify: Callable[[str], None]
+) -> tuple[Any, Any]:
+    """Return both pipelines as the folder `runner` has them; what it does not have comes from the configuration."""
+    folders = (runner / ENV_TO_MODULE, runner / MODULE_TO_ENV)
+    if files.has_pipelines and lists_connectors(folders[0]):
+        return _restore(EnvToModulePipeline, folders[0]), _restore(ModuleToEnvPipeline, folders[1])
+    pipelines = _build_pipelines(files, module, notify)
+    if files.has_pipelines:
+        for pipeline, folder in zip(pipelines, folders, strict=True):
+            with _explained(folder):
+                set_saved_state(pipeline, folder)
+    return pipelines
 
 
 def _second_module(module: Any, files: CheckpointFiles) -> Any:
