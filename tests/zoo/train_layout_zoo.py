@@ -2,8 +2,8 @@
 
 python train_layout_zoo.py OUT [NAME...]
 
-Each checkpoint is restored into a second algorithm, of which a training runner is recorded: what RLlib itself makes of
-the checkpoint, wherever it reads the statistics.
+A runner that acts in training is recorded after RLlib has restored the checkpoint: what RLlib itself makes of it,
+wherever it reads the statistics.
 """
 
 from __future__ import annotations
@@ -67,9 +67,8 @@ def configurations(out: Path) -> dict[str, Any]:
         "local_evaluated": evaluated(pendulum(), 0),
         "remote_evaluated": evaluated(pendulum(**REMOTE), 0),
         "remote_evaluated_remotely": evaluated(pendulum(**REMOTE), 1),
-        "no_local": pendulum(**NO_LOCAL),
         "no_local_evaluated": evaluated(pendulum(**NO_LOCAL), 0),
-        "no_local_evaluated_remotely": evaluated(pendulum(**NO_LOCAL), 1, create_local_env_runner=True),
+        "no_local_evaluated_remotely": evaluated(pendulum(**NO_LOCAL), 1),
         "no_local_team": evaluated(arms(), 0),
         "never_merged": evaluated(pendulum(**REMOTE, merge_env_runner_states=False), 0),
         "imitation": imitation.env_runners(env_to_module_connector=pieces(MeanStdFilter)),
@@ -83,12 +82,10 @@ def main(out: Path, only: list[str]) -> None:
         for name, config in configurations(out).items():
             if only and name not in only:
                 continue
-            algorithm = config.copy(copy_frozen=False).build_algo()
+            algorithm = config.build_algo()
             algorithm.train()
             algorithm.save_to_path(str(out / name))
             if config.is_online:  # RLlib restores no other (ray 2.60)
-                algorithm.stop()
-                algorithm = config.evaluation(evaluation_interval=None, evaluation_num_env_runners=0).build_algo()
                 algorithm.restore_from_path(str(out / name))
             record(algorithm, out, name)
             algorithm.stop()

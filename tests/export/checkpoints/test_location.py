@@ -60,7 +60,7 @@ def test_pipelines_that_were_not_saved_are_built_from_the_configuration(
     damaged = copy_of("clipped")
     shutil.rmtree(damaged / "env_runner")
     result = export_checkpoint(damaged, tmp_path / "out", notify=notices.append)
-    assert "no environment runner" in " ".join(notices)
+    assert "holds no connectors" in " ".join(notices)
     assert [step.step for step in result.contract.baked_in] == ["network", "mode", "clip"]  # as it was configured
     seen = np.load(zoo / "clipped.npz")
     found = run_onnx(result.path / "policy.onnx")({"obs": seen["obs"]})["action"]

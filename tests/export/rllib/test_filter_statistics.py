@@ -45,7 +45,7 @@ def assert_acts_as_restored(result: ExportResult, file: Path) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["local_evaluated", "remote_evaluated", "remote_evaluated_remotely", "no_local", "no_local_evaluated",
+    ["local_evaluated", "remote_evaluated", "remote_evaluated_remotely", "no_local_evaluated",
      "no_local_evaluated_remotely"],
 )  # fmt: skip
 def test_the_statistics_are_trainings_wherever_rllib_saved_them(
