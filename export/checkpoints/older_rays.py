@@ -34,13 +34,15 @@ MOVED = {
 
 
 class Gone:
-    """Stands for a value whose class, one of Ray's or gym's, is not there any more; it holds nothing."""
+    """Stands for a value whose class, one of Ray's or gym's, is not there any more; it holds the value's attributes."""
 
     def __init__(self, *_args: Any, **_kwargs: Any) -> None:
         """Take whatever the class took."""
 
-    def __setstate__(self, _state: Any) -> None:
+    def __setstate__(self, state: Any) -> None:
         """Take whatever the class took."""
+        if isinstance(state, dict):
+            self.__dict__.update(state)
 
 
 def find_class(find: Callable[[str, str], Any], module: str, name: str, *, missing_ok: bool) -> Any:

@@ -59,7 +59,11 @@ def _policy_class(found: Any) -> Any:
 
 
 def _replace_module(state: dict[str, Any], config: dict[str, Any]) -> None:
-    """Put the old model of the same network in place of an RLModule, where its weights are all known."""
+    """Put the old model of the same network in place of an RLModule of RLlib's own whose weights are all known."""
+    spec = config.get("rl_module_spec")
+    parts = [getattr(spec, name, None) for name in ("module_class", "catalog_class")]
+    if not all(str(getattr(part, "__module__", "")).startswith("ray.rllib.") for part in parts):
+        return  # a class of the user's own may compute something else with weights of the same names
     renamed: dict[str, Any] = {}
     for key, values in state["weights"].items():
         part, _, kind = key.rpartition(".")
@@ -67,7 +71,7 @@ def _replace_module(state: dict[str, Any], config: dict[str, Any]) -> None:
             if match := re.fullmatch(pattern, part):
                 layer = int(match[1]) // 2 if match.groups() else 0  # every second one is an activation
                 renamed[f"{name.format(layer)}.{kind}"] = values
-    if len(renamed) == len(state["weights"]) and config.get("model", {}).get("custom_model") is None:
+    if len(renamed) == len(state["weights"]):
         state["weights"] = renamed
         config.update(dict.fromkeys(MIXTURES, False), exploration_config={"type": "StochasticSampling"})
 

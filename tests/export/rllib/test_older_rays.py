@@ -8,10 +8,13 @@ import sys
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from ray.rllib.algorithms.ppo.ppo_catalog import PPOCatalog
+from ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module import DefaultPPOTorchRLModule
 
 from rlservo.export.checkpoints.facts import read_facts
 from rlservo.export.checkpoints.location import locate_checkpoint
@@ -113,6 +116,10 @@ def test_connectors_that_the_configuration_does_not_give_are_refused(
     [
         (lambda state: state["policy_spec"].update(policy_class="A3CTorchPolicy"), "A3CTorchPolicy .* no longer has"),
         (lambda state: state["weights"].update({"encoder.lstm.weight": 0}), "an RLModule inside an old-stack policy"),
+        (
+            lambda state: vars(state["policy_spec"]["config"]["rl_module_spec"]).update(module_class=Path),
+            "an RLModule inside an old-stack policy",
+        ),
     ],
 )
 def test_a_policy_that_has_no_successor_is_refused_by_name(
@@ -125,7 +132,8 @@ def test_a_policy_that_has_no_successor_is_refused_by_name(
     checkpoint = older_copy("2.7.2/ppo_old")
     file = checkpoint / "policies/default_policy/policy_state.pkl"
     state = unpickle(file, missing_ok=True)
-    state["policy_spec"]["config"] = {"_enable_rl_module_api": True, "framework": "torch"}  # the rest has no class
+    spec = SimpleNamespace(module_class=DefaultPPOTorchRLModule, catalog_class=PPOCatalog)  # its own class is gone
+    state["policy_spec"]["config"].update({"rl_module_spec": spec, "__marl_module_spec": None})
     change(state)
     file.write_bytes(pickle.dumps(state))
     with pytest.raises(UnsupportedError, match=words):
