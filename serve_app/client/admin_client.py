@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -39,6 +40,11 @@ class AdminClient(Closeable):
     def metrics(self) -> str:
         """Return the metrics as Prometheus reads them."""
         return self._transport.get_text("metrics", timeout_s=LOOK_TIMEOUT_S)
+
+    def plans(self) -> dict[str, int]:
+        """Return the number of the plan that each process follows, by name: every worker, or one replica."""
+        found = re.findall(r'^rlservo_plan_generation\{replica="([^"]*)"\} (\d+)', self.metrics(), re.MULTILINE)
+        return {process: int(number) for process, number in found}
 
     def load(self, name: str, version: str | None = None) -> dict[str, Any]:
         """Load and prove a version; None is the repository's newest."""

@@ -87,6 +87,14 @@ def test_every_worker_of_every_server_follows_whoever_changed_the_plan(servers: 
     )  # fmt: skip
     assert "default 10" in done.stdout and f"plan 3 in {repository}/.plan" in done.stdout
     until(lambda: all(defaults(run) == {"10"} for run in servers))
+    key_file, url = str(servers[0].key_file), f"http://127.0.0.1:{servers[0].port}"
+    listed = [*RLSERVO, "policy", "list", "--json", "--url", url, "--key-file", key_file]
+
+    def followed() -> dict[str, int]:
+        said = subprocess.run(listed, capture_output=True, text=True, check=True).stdout
+        return {process["replica"]: process["generation"] for process in json.loads(said)}
+
+    until(lambda: followed() == dict.fromkeys(listings(servers[0]), 3))  # workers share their metrics each second
     killed = int(next(iter(listings(servers[1]))))
     os.kill(killed, signal.SIGKILL)  # its successor comes up with the plan
     until(lambda: str(killed) not in listings(servers[1]), 60)
