@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -28,7 +29,7 @@ pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
 OBS = np.full(27, 0.5, np.float32)
 PATIENCE_S = 60
-WORKERS = 1
+WORKERS = 2
 
 
 @dataclass
@@ -47,11 +48,20 @@ class Server:
         with AdminClient(self.url, api_key=self.key_file.read_text().strip()) as client:
             yield client
 
-    def served(self) -> tuple[str, Any]:
-        """Return the version in production and the canary."""
+    def serves(self, production: str, canary: str | None) -> bool:
+        """Wait until a worker that is asked serves these; the others follow within a second."""
+        deadline = time.monotonic() + PATIENCE_S
         with self.admin() as admin:
-            (policy,) = admin.listing()["policies"]
-        return policy["version"], policy["canary"] and policy["canary"]["version"]
+            while time.monotonic() < deadline:
+                (policy,) = admin.listing()["policies"]
+                if (policy["version"], policy["canary"] and policy["canary"]["version"]) == (production, canary):
+                    return True
+                time.sleep(0.1)
+        return False
+
+    def workers(self) -> list[int]:
+        with self.admin() as admin:
+            return [int(pid) for pid in read_metrics(admin.metrics(), "ur5") if pid]
 
 
 @contextlib.contextmanager
@@ -151,11 +161,11 @@ def test_killed_half_way_and_started_again_it_promotes_and_no_client_sees_it(ser
             wait_for_checks(process, log, 3)
             process.kill()
             process.wait()
-        assert server.served() == ("1", "2")
+        assert server.serves("1", "2")
         with promoting(server, log, "2", "--for", "8s") as process:
             code, said = outcome_of(process)
     assert code == 0 and said.startswith("promoted: version 2 of 'ur5': failed requests: 0 of"), said
-    assert server.served() == ("2", None)
+    assert server.serves("2", None)
     assert load.failures == [] and load.versions["1"] > 30 < load.versions["2"]
 
 
@@ -163,7 +173,7 @@ def test_a_bad_canary_is_rolled_back_at_once(server: Server, tmp_path: Path) -> 
     with loaded(server) as load, promoting(server, tmp_path / "log.jsonl", "3", "--for", "10m") as process:
         code, said = outcome_of(process)
     assert code == 1 and "failed requests (unsafe-action)" in said, said
-    assert server.served() == ("1", None)
+    assert server.serves("1", None)
     assert set(load.failures) == {"unsafe-action"} and load.versions.keys() == {"1"}
 
 
@@ -175,7 +185,7 @@ def test_it_stops_when_another_operator_moves_the_alias(server: Server, tmp_path
             admin.alias("ur5", "production", "3")
         code, said = outcome_of(process)
     assert code == 4 and "'production' leads to 3 and no longer to 1" in said, said
-    assert server.served() == ("3", None)
+    assert server.serves("3", None)
 
 
 def test_ctrl_c_ends_the_canary_and_sigterm_leaves_it(server: Server, tmp_path: Path) -> None:
@@ -185,6 +195,24 @@ def test_ctrl_c_ends_the_canary_and_sigterm_leaves_it(server: Server, tmp_path: 
             wait_for_checks(process, log, len(checks_of(log)) + 1)
             process.send_signal(number)
             assert outcome_of(process)[0] == code
-        assert server.served() == left
-    with server.admin() as admin:  # what it read is what Prometheus reads
-        assert len(read_metrics(admin.metrics(), "ur5")) == WORKERS
+        assert server.serves(*left)
+
+
+def test_a_worker_that_dies_meanwhile_costs_no_promotion(server: Server, tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    with loaded(server) as load, promoting(server, log, "2", "--for", "10s") as process:
+        wait_for_checks(process, log, 2)
+        os.kill(server.workers()[0], signal.SIGKILL)
+        code, said = outcome_of(process)
+    assert code == 0, said
+    assert server.serves("2", None) and load.versions["2"] > 30
+
+
+def test_a_server_that_ends_leaves_it_unfinished_and_it_says_how_to_go_on(server: Server, tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    with promoting(server, log, "2", "--for", "2s") as process:
+        wait_for_checks(process, log, 1)
+        server.run.process.send_signal(signal.SIGTERM)
+        code, said = outcome_of(process)
+    assert code == 4 and "could not be judged for 60 s" in said and "'rlservo policy canary ur5 off'" in said, said
+    assert "end" not in log.read_text().split('"')
