@@ -150,11 +150,12 @@ def test_minari_recovers_the_environment_of_the_training_and_combines_datasets(
         record(policy, [5, 7, 3])
     done = rlservo_here("log", "export", "run.mcap", "--to", "minari", "--out", "sets", cwd=tmp_path)
     place = f"{PATH_VARIABLE}={tmp_path}/sets, then minari.load_dataset('rlservo/ur5-v0')"
-    assert done.stdout == f"written sets: 3 episodes of {UR5}; {place}\n", done.stderr
+    # The shipped policy was trained in the arm's environment with disturbances.
+    assert done.stdout == f"written sets: 3 episodes of rlservo/Randomized-v0; {place}\n", done.stderr
     monkeypatch.setenv(PATH_VARIABLE, str(tmp_path / "sets"))
     dataset = minari.load_dataset("rlservo/ur5-v0")
     env = dataset.recover_environment()
-    assert env.spec is not None and env.spec.id == UR5 and env.spec.kwargs["ur_model"] == "ur5"
+    assert env.spec is not None and env.spec.id == "rlservo/Randomized-v0" and env.spec.kwargs["env_id"] == UR5
     env.close()
     minari.combine_datasets([dataset, dataset], "rlservo/twice-v0")
     assert minari.load_dataset("rlservo/twice-v0").total_steps == 30
