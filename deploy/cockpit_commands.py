@@ -10,8 +10,8 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.serve_commands import parse_env_arguments
-from rlservo.deploy.terminal import needs_extra
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
 
 if TYPE_CHECKING:
     from rlservo.deploy.cockpit.policies import PolicySource

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlservo.deploy import terminal
-from rlservo.deploy.terminal import needs_extra, note
+from rlservo.deploy.terminal import note
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
 
 if TYPE_CHECKING:
     from rlservo.serve_app.rollout.disturbance_table import DisturbanceTable

@@ -11,8 +11,9 @@ import typer
 
 from rlservo.deploy import disturbance_commands, terminal
 from rlservo.deploy.serve_commands import parse_env_arguments
-from rlservo.deploy.terminal import Json, needs_extra, note, print_json
+from rlservo.deploy.terminal import Json, note, print_json
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
 
 
 def export(
@@ -52,14 +53,14 @@ def export(
 ) -> None:
     """Turn an RLlib checkpoint into a policy bundle. It is proven equal to RLlib's own actions, or nothing is written.
 
-    Examples: `rlservo export examples/checkpoints/ur5_positioning --out policies`,
+    Examples: `rlservo export examples/checkpoints/ur_positioning --out policies`,
     `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
     """
     start = time.perf_counter()
     if all_modules and (module_id is not None or agent_id is not None):
         raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
     with terminal.errors().status("importing") as status, ExitStack() as fetching:
-        with needs_extra("train"):
+        with needs_extra("train", "ray", "torch", "onnx", "onnxscript", "gymnasium"):
             from rlservo.export.rllib import quick_import
 
             quick_import.prepare()
@@ -129,7 +130,7 @@ def prune(
 
     Example: `rlservo prune runs/PPO-.../checkpoint_000015 --out examples/checkpoints/mine`
     """
-    with needs_extra("train"):
+    with needs_extra("train", "ray", "torch", "onnx", "onnxscript", "gymnasium"):
         from rlservo.export.commands.prune import prune_checkpoint
 
     prune_checkpoint(checkpoint, out, module_id=module_id, app_dir=app_dir, notify=note)
@@ -225,7 +226,7 @@ def _verify_against(
     checkpoint: str, bundle: Path, env: str | None, episodes: int, seed: int, app_dir: Path, as_json: bool
 ) -> dict[str, Any]:
     """Compare a bundle with its checkpoint; return the document for programs, and print it for people otherwise."""
-    with needs_extra("train"):
+    with needs_extra("train", "ray", "torch", "onnx", "onnxscript", "gymnasium"):
         from rlservo.export.commands.report import verification_report
         from rlservo.export.commands.verify import verify_bundle
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlservo.deploy import terminal
-from rlservo.deploy.terminal import Json, needs_extra, print_json
+from rlservo.deploy.terminal import Json, print_json
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
 
 if TYPE_CHECKING:
     from rich.table import Table

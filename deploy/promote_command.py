@@ -13,8 +13,9 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.policy_commands import LOCAL, KeyFile, Name
-from rlservo.deploy.terminal import Json, needs_extra, print_json
+from rlservo.deploy.terminal import Json, print_json
 from rlservo.export.contract.errors import RlservoError, UsageError
+from rlservo.export.contract.extras import needs_extra
 
 PERCENT = {"%": 0.01}
 SECONDS = {"ms": 1e-3, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}

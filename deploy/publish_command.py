@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from rlservo.deploy import terminal
-from rlservo.deploy.terminal import Json, needs_extra, print_json
+from rlservo.deploy.terminal import Json, print_json
+from rlservo.export.contract.extras import needs_extra
 
 
 def publish(
@@ -40,7 +41,7 @@ def publish(
         if version == "next":
             version = next_version(uri, chosen.contract.name)
         if version not in (None, chosen.contract.version):
-            with needs_extra("train"):
+            with needs_extra("train", "torch", "onnx"):
                 from rlservo.export.commands.renumber import renumber
 
                 chosen = renumber(chosen, str(version), Path(folder))

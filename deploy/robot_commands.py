@@ -11,6 +11,7 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
 
 if TYPE_CHECKING:
     from rlservo.envs.robot_server.settings import Settings
@@ -150,7 +151,7 @@ def _one_sentence_errors() -> Iterator[None]:
     """Turn what the simulators refuse into the command line's errors, and say which extra is missing."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     try:
-        with terminal.needs_extra("sim"):
+        with needs_extra("sim", "mujoco", "grpc"):
             yield
     except ValueError as error:
         raise UsageError(str(error)) from error

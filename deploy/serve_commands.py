@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from rlservo.deploy import policy_commands, terminal
-from rlservo.deploy.terminal import Json, needs_extra, note, print_json
+from rlservo.deploy.terminal import Json, note, print_json
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra, require
 
 if TYPE_CHECKING:
     from rlservo.serve_app.interface import ActingPolicy
@@ -188,7 +189,9 @@ def rollout(
         raise UsageError("--transport, --deadline-ms and --fallback are for a server (--url)")
     if video is not None:
         choose_gl_backend()
-    with needs_extra("sim"):
+    if record is not None:
+        require("record", "mcap", "orjson")
+    with needs_extra("sim", "gymnasium", *(("imageio", "imageio_ffmpeg") if video else ())):
         from rlservo.serve_app.rollout.control_loop import rollout as run_rollout
         from rlservo.serve_app.rollout.report import render_report
 
@@ -231,7 +234,7 @@ def demo(
     Example: `rlservo demo` in the checkout (`make demo` installs everything first)
     """
     choose_gl_backend()
-    with needs_extra("all"):
+    with needs_extra("all", "ray", "torch", "mujoco", "httpcore", *(("viser",) if cockpit else ())):
         from rlservo.deploy.demo.demo import run_demo
 
     def open_cockpit(url: str) -> None:

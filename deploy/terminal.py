@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rlservo.export.contract.errors import UsageError
-
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document for programs.")]
 
 if TYPE_CHECKING:
@@ -50,19 +48,6 @@ def output() -> Console:
 def errors() -> Console:
     """Return the console for errors, progress and notes, which a program that reads our output should not see."""
     return _console(stderr=True)
-
-
-@contextmanager
-def needs_extra(name: str) -> Iterator[None]:
-    """Say which extra to install when an import inside fails."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("rlservo"):
-            raise
-        raise UsageError(
-            f"this command needs the Python package {error.name!r}: pip install 'rlservo[{name}]'"
-        ) from error
 
 
 @contextmanager

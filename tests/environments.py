@@ -42,6 +42,7 @@ def wheel() -> Path:
             command = [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(source)]
             done = subprocess.run(command, capture_output=True, text=True, timeout=300)
             assert done.returncode == 0, done.stdout + done.stderr
+            assert "WARNING" not in done.stdout + done.stderr  # setuptools' are pages long
 
     made_of = [ROOT / name for name in PACKAGED]
     return next(cached("wheel", [*made_of, versions("build")], build).glob("*.whl"))
@@ -49,17 +50,21 @@ def wheel() -> Path:
 
 @pytest.fixture
 def image_environment(wheel: Path, tmp_path: Path) -> Path:
-    """The virtual environment of deploy/Dockerfile: the wheel and what its extra `serve` requires, nothing else.
+    """The virtual environment of deploy/Dockerfile: the wheel and what its extra `serve` requires, nothing else."""
+    return environment_with(wheel, tmp_path / "environment", "serve")
+
+
+def environment_with(wheel: Path, folder: Path, *extras: str) -> Path:
+    """Make a virtual environment of the wheel and what these extras require, nothing else.
 
     Linked to the packages that are installed here, file by file, so that it costs no download. Made anew each time, in
     a second: one that is kept may outlive the packages that it links to.
     """
-    folder = tmp_path / "environment"
     venv.create(folder)
     site = folder / "lib" / PYTHON / "site-packages"
     with zipfile.ZipFile(next(wheel.parent.glob("*.whl"))) as archive:
         archive.extractall(site)
-    for distribution in _required("rlservo", {"serve"}):
+    for distribution in _required("rlservo", set(extras)):
         own = distribution.name == "rlservo"  # its files are the wheel's
         for file in () if own else distribution.files or ():
             if ".." not in file.parts and "__pycache__" not in file.parts and not (site / file).exists():
@@ -71,6 +76,11 @@ def image_environment(wheel: Path, tmp_path: Path) -> Path:
             script.write_text(f"#!{folder / 'bin' / 'python'}\n{program}")
             script.chmod(0o755)
     return folder
+
+
+def required_by(*extras: str) -> set[str]:
+    """Return the names of all packages that these extras require."""
+    return {distribution.name.lower() for distribution in _required("rlservo", set(extras))}
 
 
 def _required(name: str, extras: set[str]) -> list[metadata.Distribution]:

@@ -55,7 +55,7 @@ def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -
     extras = {"PolicyClient": "client", "StreamClient": "client", "Recorder": "record", "export_checkpoint": "train"}
     for name, extra in extras.items():
         missing = run(str(python), "-c", f"from rlservo import {name}").stderr
-        assert f"pip install 'rlservo[{extra}]'" in missing.splitlines()[-1], missing
+        assert f"pip install '.[{extra}]'" in missing.splitlines()[-1], missing
     program = "import sys; print(*sorted(name for name in sys.modules if 'rlservo' in name), 'typing' in sys.modules)"
     started = run(str(python), "-c", program)
     assert started.stdout.split() == ["rlservo", "rlservo.envs", "rlservo.envs.discovery", "False"]
@@ -63,7 +63,7 @@ def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -
     assert run(rlservo, "--version").stdout.startswith("rlservo ")
     refused = run(rlservo, "serve", ".")
     assert refused.returncode == 2
-    assert "pip install 'rlservo[serve]'" in refused.stderr
+    assert "pip install '.[serve]'" in refused.stderr
     assert "Traceback" not in refused.stderr
     for folder in FOLDERS:
         assert run(str(python), "-c", f"import {folder}").returncode != 0

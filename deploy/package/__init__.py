@@ -94,10 +94,9 @@ def _load(name: str) -> object:
     except ModuleNotFoundError as error:
         if name not in _EXTRAS or (error.name or "").startswith("rlservo"):
             raise
-        raise ModuleNotFoundError(
-            f"rlservo.{name} needs the Python package {error.name!r}: pip install 'rlservo[{_EXTRAS[name]}]'",
-            name=error.name,
-        ) from None
+        from rlservo.export.contract.extras import missing
+
+        raise ModuleNotFoundError(missing(error.name, _EXTRAS[name], f"rlservo.{name}"), name=error.name) from None
 
 
 def _installed_version() -> str:

@@ -19,11 +19,10 @@ from urllib.request import getproxies, proxy_bypass
 import numpy as np
 
 from rlservo.export.contract.errors import DeadlineError, TooLargeError, UnavailableError, UsageError
+from rlservo.export.contract.extras import needs_extra
 
-try:
+with needs_extra("client", what="the HTTP client"):
     import httpcore
-except ModuleNotFoundError as missing:
-    raise UsageError("the HTTP client needs httpcore: pip install 'rlservo[client]'") from missing
 
 from rlservo.serve_app.client.deadline_backend import DeadlineBackend
 from rlservo.serve_app.client.error_replies import decode_error, excerpt

@@ -12,17 +12,16 @@ import ssl
 import time
 from typing import cast
 
-from rlservo.export.contract.errors import DeadlineError, UnavailableError, UsageError
+from rlservo.export.contract.errors import DeadlineError, UnavailableError
+from rlservo.export.contract.extras import needs_extra
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
-try:
+with needs_extra("client", what="the WebSocket client"):
     from websockets.client import ClientProtocol
     from websockets.exceptions import InvalidHandshake, InvalidStatus
     from websockets.frames import Frame, Opcode
     from websockets.http11 import Response
     from websockets.uri import parse_uri
-except ModuleNotFoundError as missing:
-    raise UsageError("the WebSocket client needs websockets: pip install 'rlservo[client]'") from missing
 
 MAX_FRAME_BYTES = 64 << 20  # far above any action or contract
 RECEIVE_BYTES = 65536

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -24,15 +22,6 @@ from rlservo.export.contract.spaces import (
 )
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording
-
-
-def optional_package(name: str, purpose: str) -> ModuleType:
-    """Import a package that only a conversion needs; raise UsageError where it is missing."""
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        package = (error.name or name).partition(".")[0]
-        raise UsageError(f"{purpose} needs the Python package {package!r}: pip install {package}") from error
 
 
 @contextmanager

@@ -13,8 +13,9 @@ import numpy as np
 
 from rlservo.export.contract.contract import Provenance
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import optional_package
 from rlservo.export.contract.nested import build_action
-from rlservo.serve_app.recording.conversion import episodes_of_one, gym_space, new_path, optional_package
+from rlservo.serve_app.recording.conversion import episodes_of_one, gym_space, new_path
 from rlservo.serve_app.recording.episodes import Episode
 from rlservo.serve_app.recording.reader import Recording
 

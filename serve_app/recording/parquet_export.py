@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from rlservo.serve_app.recording.conversion import episodes_of_one, new_path, optional_package
+from rlservo.export.contract.extras import optional_package
+from rlservo.serve_app.recording.conversion import episodes_of_one, new_path
 from rlservo.serve_app.recording.episodes import Episode
 from rlservo.serve_app.recording.own_actions import own_actions
 from rlservo.serve_app.recording.reader import Recording

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.recording.conversion import optional_package
+from rlservo.export.contract.extras import optional_package
 from rlservo.serve_app.recording.episodes import Columns, Episode, episodes
 from rlservo.serve_app.recording.policy_format import SpaceFormat
 from rlservo.serve_app.recording.reader import Recording

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
 from rlservo.serve_app.interface import ActingPolicy
 
 if TYPE_CHECKING:
@@ -22,10 +22,7 @@ def record_policy(
     act: Callable[..., Any] | None = None,
 ) -> WithRecording:
     """Return `WithRecording(policy, record)`; raise UsageError where a package is missing."""
-    try:
+    with needs_extra("record", what="recording"):
         from rlservo.serve_app.recording.recorded_policy import WithRecording
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("rlservo"):
-            raise
-        raise UsageError(f"recording needs the Python package {error.name!r}: pip install 'rlservo[record]'") from error
+
     return WithRecording(policy, record, wait=wait, act=act)

@@ -13,8 +13,8 @@ from rich.table import Table
 
 from rlservo.export.contract.contract import Evaluation
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import optional_package
 from rlservo.serve_app.interface import ActingPolicy
-from rlservo.serve_app.recording.conversion import optional_package
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.rollout.disturbance import DisturbanceError, disturb_env, parse_disturbance
 from rlservo.serve_app.rollout.environment import make_env

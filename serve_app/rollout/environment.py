@@ -10,6 +10,7 @@ import numpy as np
 
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import install, needs_extra
 from rlservo.export.contract.spaces import BoxSpec, DictSpec, MultiBinarySpec, MultiDiscreteSpec, SpaceSpec, TupleSpec
 
 if TYPE_CHECKING:
@@ -18,10 +19,8 @@ if TYPE_CHECKING:
 
 def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.Env[Any, Any]:
     """Return the environment, or raise UsageError: no such id (with close matches), a missing extra, bad arguments."""
-    try:
+    with needs_extra("sim", what="a rollout"):
         import gymnasium as gym
-    except ModuleNotFoundError as missing:
-        raise UsageError(f"a rollout needs {missing.name}: pip install 'rlservo[sim]'") from missing
     mode = {"render_mode": "rgb_array"} if render else {}
     try:
         # Gymnasium's checker looks at every step and warns on the terminal: that is for who writes an environment.
@@ -31,7 +30,7 @@ def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.
         hint = f"did you mean {' or '.join(close)}?" if close else "write 'module:Id' to import the module that has it"
         raise UsageError(f"environment {env_id!r} is not registered: {hint}", {"close_matches": close}) from error
     except (ModuleNotFoundError, gym.error.DependencyNotInstalled) as error:
-        hint = "pip install 'rlservo[sim]'" if env_id.startswith("rlservo/") else "install what it needs"
+        hint = install("sim") if env_id.startswith("rlservo/") else "install what it needs"
         raise UsageError(f"environment {env_id!r} cannot be made: {error}: {hint}") from error
     except Exception as error:  # a constructor is anyone's code
         raise UsageError(f"environment {env_id!r} cannot be made with {arguments}: {error}") from error

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
 from rlservo.serve_app.interface import Closeable
 
 if TYPE_CHECKING:
@@ -27,11 +28,9 @@ class VideoFile(Closeable):
             raise UsageError(f"the video file is {str(path)!r}: expected a name that ends in .mp4")
         if not self.path.parent.is_dir():
             raise UsageError(f"the video file's folder {str(self.path.parent)!r} does not exist: make it first")
-        try:
+        with needs_extra("sim", what="a video"):
             for module in ("imageio.v2", "imageio_ffmpeg"):
                 import_module(module)
-        except ModuleNotFoundError as missing:
-            raise UsageError(f"a video needs {missing.name}: pip install 'rlservo[sim]'") from missing
         self._fps = fps
         self._writer: Any = None
         self.frames = 0

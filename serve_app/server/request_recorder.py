@@ -20,7 +20,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import ObservationError, RequestError, RlservoError, UnknownPolicyError, UsageError
+from rlservo.export.contract.errors import ObservationError, RequestError, RlservoError, UnknownPolicyError
+from rlservo.export.contract.extras import needs_extra
 from rlservo.serve_app.episodes.request import Episode, Request, shorten_label
 from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
 from rlservo.serve_app.runtime.elements import parse_array
@@ -31,13 +32,9 @@ from rlservo.serve_app.server.row_count import count_rows
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 
-try:
+with needs_extra("record", what="recording"):
     from rlservo.serve_app.recording.recorder import Recorder
     from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
-except ModuleNotFoundError as error:
-    if (error.name or "").startswith("rlservo"):
-        raise
-    raise UsageError(f"recording needs the Python package {error.name!r}: pip install 'rlservo[record]'") from error
 
 logger = logging.getLogger(__name__)
 

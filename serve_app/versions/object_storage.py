@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from rlservo.export.contract.errors import BundleError, UnavailableError, UsageError, first_line
+from rlservo.export.contract.extras import install
 from rlservo.serve_app.versions.bounded_http import Reply, TooLongReplyError, request
 
 PAGE = 2 << 20  # [bytes] of a list: 1,000 names of at most 1,024 bytes
@@ -157,7 +158,7 @@ class ObjectStorage:
                 self._client = get_session().create_client("s3", config=Config(signature_version="s3v4"))
             url = self._client.generate_presigned_url(method, Params={"Bucket": self._bucket, **key, **given})
         except ImportError:
-            raise UsageError(f"{self.uri} cannot be opened here: pip install 'rlservo[remote]'") from None
+            raise UsageError(f"{self.uri} cannot be opened here: {install('remote')}") from None
         except Exception as error:  # botocore has a class for each thing that credentials may lack
             raise UnavailableError(f"{self.uri} cannot be signed for: {_hidden(first_line(error))}") from None
         return "PUT" if method == "put_object" else "GET", url

@@ -112,4 +112,4 @@ def test_without_viser_the_sentence_names_the_extra(shipped: Path) -> None:
         f"sys.argv = ['rlservo', 'cockpit', '--bundle', {str(shipped)!r}]; main()"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 2 and "pip install 'rlservo[cockpit]'" in done.stderr
+    assert done.returncode == 2 and "pip install '.[cockpit]'" in done.stderr

@@ -523,7 +523,7 @@ def test_uris_with_secrets_or_of_other_protocols_are_refused_without_showing_the
 
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
     monkeypatch.setitem(sys.modules, "botocore.session", None)
-    with pytest.raises(UsageError, match=r"s3://b/p cannot be opened here: pip install 'rlservo\[remote\]'"):
+    with pytest.raises(UsageError, match=r"s3://b/p cannot be opened here: pip install '\.\[remote\]'"):
         Repository(["s3://b/p"], cache=cache).find_digest("ur5", None)
 
 

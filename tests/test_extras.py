@@ -1,0 +1,101 @@
+"""Extras one at a time, with nothing else installed: what a command lacks is one sentence, before it does anything."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from environments import environment_with, required_by
+
+# The extras that a command needs (Gymnasium is in two), any of which it may name first.
+NEEDS: dict[str, tuple[str, ...]] = {
+    "inspect {bundle}": (),
+    "key robot": (),
+    "verify {bundle}": (),
+    "export nowhere --out out": ("train",),
+    "prune nowhere --out out": ("train",),
+    "verify {bundle} --checkpoint nowhere": ("train",),
+    "publish {bundle} bucket --version 7": ("train",),
+    "verify {bundle} --env CartPole-v1 --disturb": ("gymnasium",),
+    "rollout CartPole-v1 --bundle {bundle}": ("gymnasium",),
+    "rollout CartPole-v1 --bundle {bundle} --video out.mp4": ("sim",),
+    "rollout rlservo/EndEffectorPositioningURSim-v0 --bundle {bundle} --episodes 1": ("sim",),
+    "rollout CartPole-v1 --bundle {bundle} --record out.mcap": ("gymnasium", "record"),
+    "rollout CartPole-v1 --url http://127.0.0.1:1 --policy ur5": ("gymnasium", "client"),
+    "rollout CartPole-v1 --url http://127.0.0.1:1 --policy ur5 --transport ws": ("gymnasium", "client"),
+    "policy list --url http://127.0.0.1:1": ("client",),
+    "policy promote ur5 2 --canary 10% --for 1s --max-error-rate 1% --url http://127.0.0.1:1": ("client",),
+    "log info nowhere.mcap": ("record",),
+    "log plot nowhere.mcap --out out.png": ("record",),
+    "log export nowhere.mcap --to parquet --out out.parquet": ("record",),
+    "replay nowhere.mcap --bundle {bundle}": ("record",),
+    "estimate nowhere.mcap --bundle {bundle}": ("record",),
+    "publish {bundle} s3://127.0.0.1/bucket": ("remote",),
+    "cockpit --robot-server 127.0.0.1:1": ("cockpit",),
+    "server-manager --host 203.0.113.7": ("sim",),
+    "robot-server ur --host 203.0.113.7": ("sim",),
+    "demo --out out": ("all", "client", "serve", "train", "sim"),
+}
+EXTRAS = sorted(set(metadata.metadata("rlservo").get_all("Provides-Extra") or ()) - {"dev", "all"})
+
+# Each command in a process forked from one that has imported the command line: a tenth of the time of a start.
+PROGRAM = """
+import json, os, sys, tempfile
+from rlservo.deploy import cli
+ends = []
+for words in json.load(sys.stdin):
+    with tempfile.TemporaryFile("w+") as out:
+        child = os.fork()
+        if child == 0:
+            os.dup2(out.fileno(), 1)
+            os.dup2(out.fileno(), 2)
+            sys.argv = ["rlservo", *words]
+            code = 70
+            try:
+                cli.main()
+                code = 0
+            except SystemExit as end:
+                code = end.code or 0
+            except BaseException:
+                import traceback
+                traceback.print_exc()
+            finally:
+                sys.stdout.flush()
+                sys.stderr.flush()
+                os._exit(code)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        out.seek(0)
+        ends.append((code, out.read()))
+json.dump(ends, sys.stdout)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", ["", *EXTRAS])
+def test_every_command_says_at_once_which_extra_it_lacks(extra: str, wheel: Path, ur5: Path, tmp_path: Path) -> None:
+    environment = environment_with(wheel, tmp_path / "environment", *filter(None, [extra]))
+    commands = [command.format(bundle=ur5).split() for command in NEEDS]
+    done = subprocess.run(
+        [environment / "bin" / "python", "-I", "-c", PROGRAM],
+        input=json.dumps(commands), capture_output=True, text=True, timeout=500, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    packages = required_by(*filter(None, [extra]))
+    has = {other for other in EXTRAS if required_by(other) <= packages} | packages
+    wrong: list[Any] = []
+    for (command, needs), (code, text) in zip(NEEDS.items(), json.loads(done.stdout), strict=True):
+        said = re.findall(r"pip install '\.\[(\w+)\]' in the checkout", " ".join(text.split()))
+        lacks = ["sim" if need == "gymnasium" else need for need in needs if need not in has]
+        if (
+            "Traceback" in text
+            or (lacks and (code != 2 or len(said) != 1 or said[0] not in lacks))
+            or set(said) - set(lacks)
+        ):
+            wrong.append((command, lacks, code, text[-600:]))
+    assert wrong == [], json.dumps(wrong, indent=1)
