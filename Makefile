@@ -3,6 +3,7 @@ VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+PIP_QUIET := $(if $(MAKE_TERMOUT),,-qq)
 
 # Unit tests: what starts no Ray, simulator, robot server, proxy or storage, opens no browser, trains nothing, does not
 # wait for time to pass.
@@ -11,7 +12,7 @@ UNITS := tests/serve_app tests/envs/test_registration.py tests/export/checkpoint
 NOT_UNITS := $(addprefix --ignore=tests/serve_app/, engines client/test_bad_line.py client/test_client_faults.py replay \
 	versions/test_remote_repository.py)
 
-.PHONY: demo test quick check bench wheel setup clean
+.PHONY: demo test quick check bench wheel setup python clean
 
 demo: setup  ## Export the two shipped checkpoints, serve them, drive both simulators; a table and a picture in demo/
 	$(BIN)/rlservo demo --out demo
@@ -39,12 +40,18 @@ bench: setup  ## Simulator, training, and export speed, printed and written to b
 wheel: setup  ## Build the wheel into dist/
 	$(BIN)/python -m build --wheel --outdir dist .
 
-setup: $(STAMP)  ## Only the set-up
+setup: $(if $(filter file,$(origin PYTHON)),,python) $(STAMP)  ## Only the set-up
 
+python:  # where one was named
+	$(PYTHON) .ci/check_python.py $(VENV)
+
+# pip's own lines and bars on a terminal; elsewhere errors alone.
 $(STAMP): pyproject.toml constraints.txt setup.py envs/rlservo-gymnasium.pth
+	$(PYTHON) .ci/check_python.py $(VENV)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt --upgrade pip  # Debian's resolves for ten minutes and more
-	$(BIN)/python -m pip install -qq -c constraints.txt -e '.[all,dev]'  # errors alone: no page of setuptools' warnings
+	@echo "installing some 200 packages into $(VENV): a few minutes"
+	$(BIN)/python -m pip install $(PIP_QUIET) -c constraints.txt --upgrade pip  # Debian's resolves for ten minutes and more
+	$(BIN)/python -m pip install $(PIP_QUIET) -c constraints.txt -e '.[all,dev]'
 	touch $(STAMP)
 
 clean:  ## Remove what the other targets made, .venv included

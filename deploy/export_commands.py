@@ -59,7 +59,7 @@ def export(
     start = time.perf_counter()
     if all_modules and (module_id is not None or agent_id is not None):
         raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
-    with terminal.errors().status("importing") as status, ExitStack() as fetching:
+    with terminal.status("importing") as show, ExitStack() as fetching:
         with needs_extra("train", "ray", "torch", "onnx", "onnxscript", "gymnasium"):
             from rlservo.export.rllib import quick_import
 
@@ -71,7 +71,7 @@ def export(
 
         if metric is not None:
             note(LOADING_RUNS_CODE.format(path=checkpoint))
-            local = fetching.enter_context(fetch(checkpoint, status.update))
+            local = fetching.enter_context(fetch(checkpoint, show))
             best = best_checkpoint(local, metric, mode, app_dir=app_dir, notify=note)
             note(f"{best.path} has the {mode} {metric}: {best.score:g}")
             checkpoint = str(best.path)
@@ -86,7 +86,7 @@ def export(
                 value=value,
                 untrained_filter=untrained_filter,
                 notify=note,
-                progress=status.update,
+                progress=show,
             )
         else:
             one = export_checkpoint(
@@ -101,7 +101,7 @@ def export(
                 value=value,
                 untrained_filter=untrained_filter,
                 notify=note,
-                progress=status.update,
+                progress=show,
             )
             results = [one]
     cost = {"seconds": round(time.perf_counter() - start, 2), "peak_memory_mb": round(peak_memory_mb())}
@@ -230,7 +230,7 @@ def _verify_against(
         from rlservo.export.commands.report import verification_report
         from rlservo.export.commands.verify import verify_bundle
 
-    with terminal.errors().status("reading the bundle") as status:
+    with terminal.status("reading the bundle") as show:
         result = verify_bundle(
             bundle,
             checkpoint,
@@ -239,7 +239,7 @@ def _verify_against(
             first_seed=seed,
             app_dir=app_dir,
             notify=note,
-            progress=status.update,
+            progress=show,
         )
     if not as_json:
         terminal.output().print(verification_report(result.parity, result.evaluation))

@@ -144,7 +144,8 @@ def replay(
         from rlservo.serve_app.replay.replay import replay as run_replay
 
     began = time.perf_counter()
-    report = run_replay(Recording(files), bundle, tolerance=tolerance, name=policy)
+    with terminal.status("replaying the recordings"):
+        report = run_replay(Recording(files), bundle, tolerance=tolerance, name=policy)
     seconds = time.perf_counter() - began
     if as_json:
         print_json({**report.as_dict(), "seconds": round(seconds, 3)})
@@ -178,7 +179,10 @@ def estimate(
         from rlservo.serve_app.recording.reader import Recording
         from rlservo.serve_app.replay.estimate import estimate as run_estimate
 
-    report = run_estimate(Recording(files), bundle, explore=explore, gamma=gamma, name=policy, seed=seed)
+    with terminal.status("reading the recordings") as show:
+        report = run_estimate(
+            Recording(files), bundle, explore=explore, gamma=gamma, name=policy, seed=seed, progress=show
+        )
     if as_json:
         print_json(report.as_dict())
     else:

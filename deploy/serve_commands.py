@@ -195,7 +195,10 @@ def rollout(
         from rlservo.serve_app.rollout.control_loop import rollout as run_rollout
         from rlservo.serve_app.rollout.report import render_report
 
-    with _acting_policy(url, policy, bundle, transport, deadline_ms, server_state, api_key) as acting:
+    with (
+        terminal.status(f"0 of {episodes} episodes") as show,
+        _acting_policy(url, policy, bundle, transport, deadline_ms, server_state, api_key) as acting,
+    ):
         report = run_rollout(
             _with_fallback(acting, fallback),
             env,
@@ -206,6 +209,7 @@ def rollout(
             env_kwargs=parse_env_arguments(env_arg or []),
             video=video,
             record=record,
+            on_episode=lambda row: show(f"{row.index + 1} of {episodes} episodes"),
             disturb=disturb,
         )
     if as_json:

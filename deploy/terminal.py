@@ -6,7 +6,9 @@ Importing rich takes as long as everything else that `rlservo --help` needs.
 from __future__ import annotations
 
 import json
+import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+NO_TERMINAL_COLUMNS = 200
+SAID_AFTER_S = 10.0
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document for programs.")]
 
 if TYPE_CHECKING:
@@ -25,7 +29,7 @@ ESCAPES = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if 
 """Control characters, which a bundle's or a policy's names may hold, as they are shown."""
 
 
-def _console(*, stderr: bool) -> Console:
+def _console(*, stderr: bool, width: int | None = None) -> Console:
     """Return a console that shows the control characters of what it prints instead of sending them."""
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
@@ -35,19 +39,54 @@ def _console(*, stderr: bool) -> Console:
             for segment in super().render(renderable, options):
                 yield segment if segment.control else Segment(segment.text.translate(ESCAPES), segment.style)
 
-    return EscapingConsole(stderr=stderr)
+    return EscapingConsole(stderr=stderr, width=width)
 
 
 @cache
 def output() -> Console:
     """Return the console for results."""
-    return _console(stderr=False)
+    # Without a terminal rich takes 80 columns, and cuts tables for a reader who has no such limit.
+    width = None if sys.stdout.isatty() or "COLUMNS" in os.environ else NO_TERMINAL_COLUMNS
+    return _console(stderr=False, width=width)
 
 
 @cache
 def errors() -> Console:
     """Return the console for errors, progress and notes, which a program that reads our output should not see."""
     return _console(stderr=True)
+
+
+@contextmanager
+def status(text: str) -> Iterator[Callable[[str], None]]:
+    """Show what is being done until it is done; gives the function that replaces the text.
+
+    On a terminal a line that moves; elsewhere a line when nothing else was said for 10 s, 20 s, 40 s ...
+    """
+    if errors().is_terminal:
+        from rich.live import Live
+        from rich.spinner import Spinner
+        from rich.text import Text
+
+        spinner = Spinner("dots", Text(text))
+        # What is printed meanwhile comes above the line, unless it goes somewhere else.
+        with Live(spinner, console=errors(), transient=True, redirect_stdout=sys.stdout.isatty()):
+            yield lambda text: spinner.update(text=Text(text))
+        return
+    said, done = [text], threading.Event()
+
+    def repeat() -> None:
+        before, wait_s = said[0], SAID_AFTER_S
+        while not done.wait(wait_s):
+            note(f"{said[0]} ...")
+            before, wait_s = said[0], 2 * wait_s if said[0] == before else SAID_AFTER_S
+
+    thread = threading.Thread(target=repeat, name="status", daemon=True)
+    thread.start()
+    try:
+        yield lambda text: said.__setitem__(0, text)
+    finally:
+        done.set()
+        thread.join()
 
 
 @contextmanager

@@ -38,6 +38,7 @@ from shared.help_text import DefaultsFormatter
 from shared.recorded_episodes import Choice, Recorded, RecordedEpisodes
 
 from rlservo import errors
+from rlservo.deploy.terminal import status
 from rlservo.export.checkpoints.location import (
     ENV_TO_MODULE,
     MODULE_TO_ENV,
@@ -272,7 +273,8 @@ def main() -> None:
     training_run.pickle_by_value(sys.modules[__name__], recorded_episodes)
     torch.set_num_threads(1)
     choice = Choice(rewards=args.run != "BC", status=args.status, modes=args.modes, ahead=args.ahead)
-    recorded = recorded_episodes.read_recordings(Recording(args.recordings), choice, name=args.policy)
+    with status("reading the recordings"):
+        recorded = recorded_episodes.read_recordings(Recording(args.recordings), choice, name=args.policy)
     report(recorded)
     with training_run.ray_session(num_cpus=1):
         config, start, sentence = configure(args, recorded)

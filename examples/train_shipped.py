@@ -32,7 +32,6 @@ import evaluate_shipped
 import gymnasium
 import numpy as np
 import shared.failures as failures
-import shared.resources as resources
 import torch
 import yaml
 from ray import cloudpickle
@@ -46,7 +45,7 @@ from ray.rllib.utils.filter import RunningStat
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from ray.rllib.utils.schedules.scheduler import Scheduler
 from ray.tune.registry import ENV_CREATOR, _global_registry, get_trainable_cls, register_env
-from shared.training_run import iterate, main_with_sentences, ray_session
+from shared.training_run import build, iterate, main_with_sentences, ray_session
 
 from rlservo import Policy, errors, export_checkpoint
 from rlservo.envs.disturbances import HasExtremes
@@ -431,8 +430,7 @@ def train(
     rows: list[Row] = []
     best, reached_milestone = float("-inf"), False
     checkpoint = folder / "checkpoint"
-    resources.check_room(resources.request_of(config), resources.ray_room("the one process that trains"), config=config)
-    algorithm = config.build_algo()
+    algorithm = build(config)
     if beginning is not None:
         beginning.apply(algorithm, settings)
     try:

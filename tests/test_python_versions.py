@@ -117,3 +117,25 @@ def test_unit_tests_pass_on_the_newest_python(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr
     passed = re.search(r"(\d+) passed", done.stdout)
     assert passed is not None and int(passed[1]) > 1350, done.stdout[-500:]
+
+
+@pytest.mark.parametrize(
+    ("minor", "sentence"),
+    [
+        ("10", r"Python 3\.10: the versions in constraints\.txt need 3\.11"),
+        ("12", r"has Python 3\.11, and PYTHON=.*3\.12"),
+    ],
+)
+def test_set_up_says_that_a_python_is_too_old_or_not_the_environments(
+    minor: str, sentence: str, tmp_path: Path
+) -> None:
+    for name in ("Makefile", ".ci", "pyproject.toml", "constraints.txt", "setup.py", "envs"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    theirs = tmp_path / ".venv" / "bin" / "python"
+    theirs.parent.mkdir(parents=True)
+    theirs.write_text("#!/bin/sh\necho 3.11\n")
+    theirs.chmod(0o755)
+    command = ["make", "setup", f"PYTHON={interpreter(minor)}"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0 and "Traceback" not in done.stderr
+    assert re.search(sentence, done.stderr.splitlines()[0]), done

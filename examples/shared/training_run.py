@@ -41,6 +41,7 @@ from rich.table import Table
 import shared.failures as failures
 import shared.resources as resources
 from rlservo import errors
+from rlservo.deploy.terminal import SAID_AFTER_S, status
 from shared.failures import metric
 
 assert ray_settings
@@ -169,14 +170,16 @@ def ray_session(
                 # A short path: Ray's sockets live below it, and a socket's path may have 107 characters.
                 folder = tempfile.mkdtemp(prefix="train-", dir="/tmp" if Path("/tmp").is_dir() else None)
                 os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(16))
-                _start(folder, num_cpus, num_gpus, quiet)
+                with status("starting Ray"):
+                    _start(folder, num_cpus, num_gpus, quiet)
             else:
-                _join(address, quiet)
+                with status(f"joining the cluster at {address}"):
+                    _join(address, quiet)
             take_sigterm()  # Ray has set a handler of its own
             with resources.waiting_is_said():
                 yield
         finally:
-            with _ignore_signals():
+            with _ignore_signals(), status("stopping Ray"):
                 ray.shutdown()
                 if folder is not None:
                     shutil.rmtree(folder, ignore_errors=True)
@@ -262,13 +265,15 @@ def _ignore_signals() -> Iterator[None]:
 def build(config: AlgorithmConfig) -> Any:
     """Build an algorithm without Tune, in the Ray that runs. Raises UsageError when there is not the room for it."""
     resources.check_room(resources.request_of(config), resources.ray_room("this machine"), config=config)
-    return config.build_algo()
+    with status("building the algorithm"):
+        return config.build_algo()
 
 
 def iterate(algorithm: Any) -> dict[str, Any]:
     """Train an algorithm that was built without Tune for an iteration. Raises RlservoError with the cause."""
     try:
-        result: dict[str, Any] = algorithm.train()
+        with status(f"iteration {algorithm.iteration + 1}"):
+            result: dict[str, Any] = algorithm.train()
     except Exception as error:  # an environment is anyone's code
         raise errors.RlservoError(f"training failed: {failures.in_a_line(error)}") from error
     return result
@@ -332,8 +337,17 @@ class ProgressTable(tune.Callback):
         self._failures = folder / failures.FILE
         self._failed, _ = failures.read(self._failures)
         self._told_at = time.monotonic()
+        self._row_at, self._silence_s = time.monotonic(), SAID_AFTER_S
 
     def on_step_end(self, iteration: int, trials: Any, **info: Any) -> None:
+        self._tell_failures(trials)
+        if time.monotonic() - self._row_at >= self._silence_s:
+            building = all(trial.status == "PENDING" for trial in trials)
+            what = "the algorithm is built, in a process of its own" if building else "an iteration is trained"
+            print(f"{what}, {time.monotonic() - self._row_at:.0f} s so far", file=sys.stderr, flush=True)
+            self._silence_s *= 2
+
+    def _tell_failures(self, trials: Any) -> None:
         if self._failed and time.monotonic() - self._told_at < failures.PRINT_EVERY_S:
             return
         count, last = failures.read(self._failures)
@@ -345,6 +359,7 @@ class ProgressTable(tune.Callback):
             raise RuntimeError(f"{last}, after which the algorithm was not built")  # RLlib sometimes waits for good
 
     def on_trial_result(self, iteration: int, trials: Any, trial: Any, result: dict[str, Any], **info: Any) -> None:
+        self._row_at, self._silence_s = time.monotonic(), SAID_AFTER_S
         if self._rows % 25 == 0:
             print(self.HEADER)
         self._rows += 1
@@ -648,11 +663,20 @@ def export_and_run(
     from rlservo import Policy, export_checkpoint, rollout
     from rlservo.serve_app.rollout.report import render_report
 
-    bundle = export_checkpoint(checkpoint, out, app_dir=app_dir, notify=print)
+    with status("exporting") as show:
+        bundle = export_checkpoint(checkpoint, out, app_dir=app_dir, notify=print, progress=show)
     print(f"bundle: {bundle.path}", flush=True)
     if episodes:
-        with Policy.load(bundle.path) as policy:
-            result = rollout(policy, env_id, episodes=episodes, seed=seed, explore=explore, env_kwargs=env_config)
+        with Policy.load(bundle.path) as policy, status(f"0 of {episodes} episodes") as show:
+            result = rollout(
+                policy,
+                env_id,
+                episodes=episodes,
+                seed=seed,
+                explore=explore,
+                env_kwargs=env_config,
+                on_episode=lambda row: show(f"{row.index + 1} of {episodes} episodes"),
+            )
         _out.print(render_report(result))
         if result.interrupted:
             raise KeyboardInterrupt

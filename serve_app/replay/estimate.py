@@ -7,7 +7,7 @@ value is fitted (`fitted_q.py`). Each estimate says whether the recordings can s
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -89,10 +89,12 @@ def estimate(
     gamma: float = 1.0,
     name: str | None = None,
     seed: int = 0,
+    progress: Callable[[str], object] = lambda _: None,
 ) -> EstimateReport:
     """Estimate the mean return of a bundle's deterministic policy, or with `explore` of its exploring one.
 
-    Raises OtherContractError where the recording does not fit the bundle, and UsageError where no episode can be used.
+    `progress` gets what is being done. Raises OtherContractError where the recording does not fit the bundle, and
+    UsageError where no episode can be used.
     """
     if not 0 < gamma <= 1:
         raise UsageError(f"gamma must be above 0 and at most 1, got {gamma:g}")
@@ -104,7 +106,8 @@ def estimate(
         f"{contract.name}/{contract.version}", "exploring" if explore else "deterministic", gamma=gamma
     )
     trajectories: list[Trajectory] = []
-    for followed in follower.follow(recording, name):
+    for count, followed in enumerate(follower.follow(recording, name), 1):
+        progress(f"{count} episodes read")
         if followed.episode.policy.title not in report.policies:
             report.policies.append(followed.episode.policy.title)
         reason = _why_not(followed)
@@ -133,6 +136,7 @@ def estimate(
             f"log-probabilities, and {contract.name}'s did not all: leave --explore out, or record with it"
         )
     if not explore:
+        progress(f"fitting the value of actions to {len(trajectories)} episodes")
         report.estimates.append(fitted_estimate(trajectories, gamma, rng))
     return report
 
