@@ -230,11 +230,20 @@ def _verify_against(
         from rlservo.export.commands.report import verification_report
         from rlservo.export.commands.verify import verify_bundle
 
+    env_config = None
+    if env is not None:  # the policy may have been trained with disturbances around this environment
+        from rlservo.envs.randomization import wrapped_env
+        from rlservo.export.contract.bundle import load_bundle
+
+        trained = load_bundle(bundle).contract.provenance
+        if env != trained.env_id:
+            env_config = wrapped_env(trained.env_id or "", trained.env_config)[1]
     with terminal.status("reading the bundle") as show:
         result = verify_bundle(
             bundle,
             checkpoint,
             env_id=env,
+            env_config=env_config,
             episodes=episodes,
             first_seed=seed,
             app_dir=app_dir,

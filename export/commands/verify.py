@@ -7,7 +7,7 @@ does not grow into another episode that matters.
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -52,6 +52,7 @@ def verify_bundle(
     checkpoint: str | Path,
     *,
     env_id: str | None = None,
+    env_config: Mapping[str, Any] | None = None,
     episodes: int = 20,
     first_seed: int = 0,
     app_dir: str | Path = ".",
@@ -60,8 +61,9 @@ def verify_bundle(
 ) -> VerifyResult:
     """Compare a bundle with a checkpoint and, given `env_id`, run both for `episodes` seeds from `first_seed`.
 
-    The environment is made with the `env_config` the policy was trained with. The evaluation is added to contract.json
-    and SHA256SUMS is written anew; the copy of the contract inside policy.onnx stays as exported.
+    The environment is made with `env_config`, by default the one that the policy was trained with. The evaluation is
+    added to contract.json and SHA256SUMS is written again; the copy of the contract inside policy.onnx stays as
+    exported.
 
     Raises ParityError when they differ, BundleError, CheckpointError or UsageError.
     """
@@ -70,15 +72,19 @@ def verify_bundle(
     loaded = load_bundle(bundle)
     with fetch(checkpoint, progress) as local:
         origin = loaded.contract.provenance
+        arguments = origin.env_config if env_config is None else env_config
         files = locate_checkpoint(local, origin.module_id, origin.agents[0] if origin.agents else None)
         notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else files.root))
-        return _verify(loaded, files, env_id, range(first_seed, first_seed + episodes), app_dir, notify, progress)
+        return _verify(
+            loaded, files, env_id, arguments, range(first_seed, first_seed + episodes), app_dir, notify, progress
+        )
 
 
 def _verify(
     loaded: Bundle,
     files: Files,
     env_id: str | None,
+    arguments: Mapping[str, Any],
     seeds: range,
     app_dir: str | Path,
     notify: Notify,
@@ -104,7 +110,7 @@ def _verify(
             run, recipe = formats["onnx"], restored.recipe
             progress(f"running {len(seeds)} episodes with each")
             bundle, checkpoint = (
-                _rollout(_LoopPolicy(loaded.contract, recipe, start_loop), env_id, seeds)
+                _rollout(_LoopPolicy(loaded.contract, recipe, start_loop), env_id, arguments, seeds)
                 for start_loop in (lambda: GraphLoop(run, recipe.state), restored.start_loop)
             )
             evaluation = _evaluation(bundle, checkpoint, seeds)
@@ -147,8 +153,7 @@ def _shapes(leaves: dict[str, tuple[int, ...]]) -> str:
     return ", ".join(f"{name} {shape}" for name, shape in leaves.items())
 
 
-def _rollout(policy: _LoopPolicy, env_id: str, seeds: range) -> RolloutReport:
-    arguments = policy.contract.provenance.env_config
+def _rollout(policy: _LoopPolicy, env_id: str, arguments: Mapping[str, Any], seeds: range) -> RolloutReport:
     report = rollout(policy, env_id, episodes=len(seeds), seed=seeds.start, env_kwargs=arguments)
     if report.interrupted:  # half a comparison is none
         raise KeyboardInterrupt

@@ -13,6 +13,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
+from bundles import SHIPPED
 from rlservo.export.commands.export import export_checkpoint
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording
@@ -21,7 +22,7 @@ from rlservo.serve_app.replay.replay import replay
 from rlservo.serve_app.runtime.policy import Policy
 from trainings import OneRay
 
-UR5 = Path(__file__).resolve().parents[2] / "examples" / "checkpoints" / "ur5_positioning"
+UR5 = Path(__file__).resolve().parents[2] / "examples" / "checkpoints" / SHIPPED["ur5"]
 SCRIPT = "learn_from_recordings.py"
 WHOLE = ("--epochs", "1", "--batch-size", "100000")  # one minibatch
 
