@@ -116,7 +116,7 @@ def test_unit_tests_pass_on_the_newest_python(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr
     passed = re.search(r"(\d+) passed", done.stdout)
-    assert passed is not None and int(passed[1]) > 1350, done.stdout[-500:]
+    assert passed is not None and int(passed[1]) > 1250, done.stdout[-500:]
 
 
 @pytest.mark.parametrize(

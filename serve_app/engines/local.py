@@ -12,6 +12,7 @@ import logging
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 import socket
 import threading
@@ -37,7 +38,7 @@ from rlservo.serve_app.engines.ports import BACKLOG, listen
 from rlservo.serve_app.engines.serving import Serving
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure
-from rlservo.serve_app.server.metrics import shared_by_workers
+from rlservo.serve_app.server.metrics import FOLDER_VARIABLE, shared_by_workers
 from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
@@ -236,10 +237,18 @@ class _Application:
 
 
 def _stop_with_parent() -> None:
-    """Stop this worker when its supervisor has died."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        asyncio.get_running_loop().add_reader(parent.sentinel, os.kill, os.getpid(), signal.SIGTERM)
+    """Stop this worker when its supervisor has died, and remove what that would have removed."""
+    loop, parent = asyncio.get_running_loop(), multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def stop() -> None:
+        loop.remove_reader(parent.sentinel)
+        if (folder := os.environ.get(FOLDER_VARIABLE)) is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    loop.add_reader(parent.sentinel, stop)
 
 
 class _Server(uvicorn.Server):
