@@ -297,13 +297,14 @@ def leaky_policy() -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def policies(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A repository: ur5 in versions 1, 2 and 10 (different weights), gridworld in version 1."""
     root = tmp_path_factory.mktemp("policies")
     for seed, version in enumerate(("1", "2", "10")):
         write_box_policy(root, version=version, seed=seed)
     write_discrete_policy(root)
-    return root
+    yield root
+    assert not (root / ".plan").exists(), "a test has written a plan into the folder that tests share"
 
 
 @pytest.fixture(scope="session")

@@ -34,6 +34,7 @@ MAX_CONNECTIONS = 4096  # of one process
 SPARE = 32  # connections of an address beyond its bound that are answered 429; further ones are closed at once
 UNREAD_MS = 30_000  # [ms] that a client may leave a reply unread
 SLICE_BYTES = 4096  # of a WebSocket's data, read before its bounds are checked again
+LINGER_S = 5.0  # [s] that a refused client may still send what is dropped
 MAX_UNANSWERED = 64  # messages of a WebSocket
 MAX_FRAMES = 1000  # pings, pongs and fragments of a WebSocket in a second
 VIOLATION = 1008  # WebSocket's close code for a client that does not keep to what a server allows
@@ -223,15 +224,31 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
 
     _frames = 0
     _second = 0.0
+    _is_refused = False
 
     def data_received(self, data: bytes) -> None:
         """Read what came, as long as the client keeps to the bounds."""
         for start in range(0, len(data), SLICE_BYTES):
-            if self.transport.is_closing():
+            if self._is_refused or self.transport.is_closing():
                 return
             super().data_received(data[start : start + SLICE_BYTES])
             if self.queue.qsize() > MAX_UNANSWERED:
                 self._end(f"more than {MAX_UNANSWERED} requests are unanswered")
+
+    def handle_parser_exception(self) -> None:
+        """Send the close code, and drop what the client still sends.
+
+        Closed at once with data unread, the connection would be reset, and the client would lose the close code.
+        """
+        closed = self.conn.close_sent
+        assert closed is not None
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": closed.code, "reason": closed.reason})
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.close_sent = self._is_refused = True
+        if self.transport.can_write_eof():
+            self.transport.write_eof()
+        self.transport.resume_reading()
+        self.close_timer = self.loop.call_later(LINGER_S, self.transport.close)
 
     def handle_ping(self) -> None:
         """Answer a ping."""
@@ -271,10 +288,7 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         if self.close_sent or self.transport.is_closing():
             return
         self.conn.fail(VIOLATION, reason)
-        self.transport.write(b"".join(self.conn.data_to_send()))
-        self.close_sent = True
-        self.queue.put_nowait({"type": "websocket.disconnect", "code": VIOLATION, "reason": reason})
-        self.transport.close()
+        self.handle_parser_exception()
 
 
 async def _answer(send: Send, status: int, content: bytes) -> None:

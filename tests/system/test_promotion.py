@@ -59,6 +59,13 @@ class Server:
                 time.sleep(0.1)
         return False
 
+    def wait_until_all_follow(self, plan: int) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        with self.admin() as admin:
+            while [each.plan for each in read_metrics(admin.metrics(), "ur5").values()] != [plan] * WORKERS:
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+
     def workers(self) -> list[int]:
         with self.admin() as admin:
             return [int(pid) for pid in read_metrics(admin.metrics(), "ur5") if pid]
@@ -83,7 +90,8 @@ def server(box_policy: Callable[..., Path], tmp_path: Path) -> Iterator[Server]:
     (tmp_path / "runtime").mkdir()
     with started(tmp_path / "policies", tmp_path / "runtime") as server:
         with server.admin() as admin:
-            admin.alias("ur5", "production", "1")
+            plan = admin.alias("ur5", "production", "1")["generation"]
+        server.wait_until_all_follow(plan)
         yield server
 
 

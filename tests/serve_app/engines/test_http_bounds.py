@@ -324,7 +324,7 @@ def test_a_flood_of_frames_ends_the_stream_with_the_reason(server: Run, flood: b
         with contextlib.suppress(OSError):
             while piece := stream.recv(65536):
                 received += piece
-        assert reason in received or received == b""  # closed while the client still sends, the reason may be lost
+        assert reason in received
     assert memory_mb(server) - before < 64
 
 
@@ -342,9 +342,9 @@ def test_pings_of_a_client_that_reads_nothing_take_bounded_memory(server: Run) -
 
 def test_a_message_too_large_is_closed_with_its_code(server: Run) -> None:
     with web_socket(server) as stream:
-        size = (5 << 20).to_bytes(8, "big")
+        size = (50 << 20).to_bytes(8, "big")
         with contextlib.suppress(OSError):
-            stream.sendall(b"\x82\xff" + size + bytes(4) + bytes(5 << 20))
+            stream.sendall(b"\x82\xff" + size + bytes(4) + bytes(50 << 20))
         received = b""
         with contextlib.suppress(OSError):
             while piece := stream.recv(65536):

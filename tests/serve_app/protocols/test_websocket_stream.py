@@ -179,16 +179,6 @@ def test_arrays_of_msgpack_numpy_are_read_as_data(port: int, store: PolicyStore)
             client.infer({"obs": as_msgpack_numpy(OBS, **changes)})
 
 
-def test_a_message_beyond_what_a_connection_takes_is_told_by_a_close_code(port: int) -> None:
-    with websockets.sync.client.connect(f"ws://127.0.0.1:{port}/", compression=None) as socket:
-        socket.recv()
-        with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
-            for _ in range(2):
-                socket.send(b"\0" * (17 << 20))
-                socket.recv()
-        assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
-
-
 def test_a_reset_is_taken_where_nothing_is_remembered(port: int, store: PolicyStore) -> None:
     named = {f"element_{i}": value for i, value in enumerate(OBS)}
     with OpenpiClient(port) as client:

@@ -76,7 +76,7 @@ def aliasing(version: str, alias: str = "production") -> Change:
 
 @pytest.fixture
 def folder(policies: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(policies, tmp_path / "node"))
+    return Path(shutil.copytree(policies, tmp_path / "node", ignore=shutil.ignore_patterns(FOLDER)))
 
 
 def break_weights(folder: Path, version: str) -> None:
