@@ -10,7 +10,7 @@ PIP_QUIET := $(if $(MAKE_TERMOUT),,-qq)
 UNITS := tests/serve_app tests/envs/test_registration.py tests/export/checkpoints/test_experiment.py \
 	tests/test_layout.py tests/test_package.py
 NOT_UNITS := $(addprefix --ignore=tests/serve_app/, engines client/test_bad_line.py client/test_client_faults.py replay \
-	versions/test_remote_repository.py)
+	repository/test_remote_repository.py)
 
 .PHONY: demo test quick check bench wheel setup python clean
 

@@ -14,17 +14,21 @@ from typing import Annotated
 import typer
 
 import rlservo
-from rlservo.deploy import (
-    cockpit_commands,
-    export_commands,
-    log_commands,
-    policy_commands,
-    promote_command,
-    publish_command,
-    robot_commands,
-    serve_commands,
-    terminal,
-)
+from rlservo.deploy import terminal
+from rlservo.deploy.commands.cockpit import cockpit
+from rlservo.deploy.commands.demo import demo
+from rlservo.deploy.commands.export import export, prune
+from rlservo.deploy.commands.inspect import inspect
+from rlservo.deploy.commands.key import key
+from rlservo.deploy.commands.log import log
+from rlservo.deploy.commands.policy import policy
+from rlservo.deploy.commands.promote import promote
+from rlservo.deploy.commands.publish import publish
+from rlservo.deploy.commands.replay import estimate, replay
+from rlservo.deploy.commands.robot_server import robot_server, server_manager
+from rlservo.deploy.commands.rollout import rollout
+from rlservo.deploy.commands.serve import serve
+from rlservo.deploy.commands.verify import verify
 from rlservo.export.contract.errors import RlservoError, UsageError
 
 app = typer.Typer(
@@ -66,25 +70,25 @@ def _root(show_version: Annotated[bool, typer.Option("--version", help="Print th
 
 
 for command in (
-    export_commands.export,
-    export_commands.prune,
-    export_commands.inspect,
-    export_commands.verify,
-    publish_command.publish,
-    serve_commands.serve,
-    serve_commands.key,
-    serve_commands.rollout,
-    serve_commands.demo,
-    cockpit_commands.cockpit,
-    robot_commands.server_manager,
-    log_commands.replay,
-    log_commands.estimate,
+    export,
+    prune,
+    inspect,
+    verify,
+    publish,
+    serve,
+    key,
+    rollout,
+    demo,
+    cockpit,
+    server_manager,
+    replay,
+    estimate,
 ):
     app.command()(command)
-app.add_typer(robot_commands.robot_server, name="robot-server")
-policy_commands.policy.command()(promote_command.promote)
-app.add_typer(policy_commands.policy, name="policy")
-app.add_typer(log_commands.log, name="log")
+policy.command()(promote)
+app.add_typer(robot_server, name="robot-server")
+app.add_typer(policy, name="policy")
+app.add_typer(log, name="log")
 
 
 if __name__ == "__main__":

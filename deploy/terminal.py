@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
@@ -134,6 +135,12 @@ def _ends_handled_by(handler: Callable[[int, object], None]) -> Iterator[None]:
 def note(line: str) -> None:
     """Print a line that a program reading our output should not see."""
     errors().print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+
+
+def show_command(words: Sequence[str]) -> None:
+    """Print a command as a user would type it."""
+    line = f"$ rlservo {shlex.join(words)}"
+    output().print(line, style="bold", markup=False, highlight=False, soft_wrap=True)
 
 
 def print_json(document: Any) -> None:

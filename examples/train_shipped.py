@@ -505,7 +505,7 @@ def draw(rows: list[Row], title: str, path: Path) -> None:
 
 def install(name: str, folder: Path) -> None:
     """Replace the shipped checkpoint and curve by those of `folder`."""
-    from rlservo.export.commands.prune import prune_checkpoint
+    from rlservo.export.prune_checkpoint import prune_checkpoint
 
     small = folder / "pruned"
     shutil.rmtree(small, ignore_errors=True)

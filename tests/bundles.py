@@ -35,13 +35,13 @@ from rlservo.export.contract.contract import (
     TensorSpec,
 )
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, Element
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
-from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.repository.repository import Repository
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.version_loader import VersionLoader
 from stores import plan_files
 
 if TYPE_CHECKING:
-    from rlservo.export.commands.export import ExportResult
+    from rlservo.export.export_checkpoint import ExportResult
 
 ROOT = Path(__file__).resolve().parents[1]
 OBS = 27
@@ -349,7 +349,7 @@ def _exporting_code() -> str:
 @functools.cache
 def _exported_checkpoint(checkpoint: Path, module_id: str | None) -> Path:
     def export(out: Path) -> None:
-        from rlservo.export.commands.export import export_checkpoint
+        from rlservo.export.export_checkpoint import export_checkpoint
 
         how: dict[str, Any] = {"name": "policy", "app_dir": APP, "module_id": module_id}
         export_checkpoint(checkpoint, out, notify=lambda line: None, **how)
@@ -364,7 +364,7 @@ def exported() -> Callable[..., ExportResult]:
 
     Tests of the exporting itself, of what it says and of its other options, call `export_checkpoint`.
     """
-    from rlservo.export.commands.export import ExportResult
+    from rlservo.export.export_checkpoint import ExportResult
 
     def export(checkpoint: Path, module_id: str | None = None) -> ExportResult:
         path = _exported_checkpoint(checkpoint, module_id)
@@ -389,7 +389,7 @@ def recurrent(wide_zoo: Path) -> Path:
     """
 
     def export(out: Path) -> None:
-        from rlservo.export.commands.export import export_checkpoint
+        from rlservo.export.export_checkpoint import export_checkpoint
 
         for name in RECURRENT:
             export_checkpoint(wide_zoo / name, out, name=name, app_dir=APP, notify=lambda line: None)
@@ -403,7 +403,7 @@ def _exported(name: str, checkpoints: Mapping[str, str]) -> Path:
     folders = {served: ROOT / "examples" / "checkpoints" / checkpoint for served, checkpoint in checkpoints.items()}
 
     def export(out: Path) -> None:
-        from rlservo.export.commands.export import export_checkpoint
+        from rlservo.export.export_checkpoint import export_checkpoint
 
         for served, folder in folders.items():
             export_checkpoint(folder, out, name=served, notify=lambda line: None)
@@ -425,14 +425,14 @@ def all_shipped() -> Path:
 
 
 @pytest.fixture(scope="session")
-def controlled() -> Callable[..., AbstractContextManager[ReplicaVersions]]:
+def controlled() -> Callable[..., AbstractContextManager[PlanFollower]]:
     """Control over what is served of some folders, for an application that can be administered."""
 
     @contextlib.contextmanager
-    def control_of(*folders: Path, config: Any = None, **loader: Any) -> Iterator[ReplicaVersions]:
+    def control_of(*folders: Path, config: Any = None, **loader: Any) -> Iterator[PlanFollower]:
         loads = VersionLoader(Repository(list(folders)), **loader)
         with tempfile.TemporaryDirectory() as plans:
-            control = ReplicaVersions(loads, plan_files(Path(plans)), replica="only")
+            control = PlanFollower(loads, plan_files(Path(plans)), replica="only")
             asyncio.run(control.configure({} if config is None else config))
             yield control
 

@@ -262,6 +262,6 @@ def closing_sessions(app: Any) -> Any:
     async def run(scope: Any, receive: Any, send: Any) -> None:
         await app(scope, receive, send)
         if scope["type"] == "lifespan":
-            await app.state.core.close()
+            await app.state.handler.close()
 
     return run

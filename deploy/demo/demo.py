@@ -26,9 +26,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from rlservo.deploy.demo.commands import show
 from rlservo.deploy.demo.picture import Frame, Robot, RobotRun, Trace, draw_picture, film
-from rlservo.deploy.terminal import ends_like_ctrl_c
+from rlservo.deploy.terminal import ends_like_ctrl_c, show_command
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
@@ -135,7 +134,7 @@ class _Recorder(ActingPolicy):
 
 def _run(commands: Iterable[list[str]]) -> None:
     """Show and run rlservo commands in one process; their output goes to the terminal."""
-    result = subprocess.run([sys.executable, "-m", "rlservo.deploy.demo.commands", json.dumps(list(commands))])
+    result = subprocess.run([sys.executable, "-m", "rlservo.deploy.demo.one_process", json.dumps(list(commands))])
     if result.returncode != 0:
         raise RlservoError(f"the export ended with exit code {result.returncode}")
 
@@ -145,7 +144,7 @@ def _drive(console: Console, url: str, episodes: int, *, with_pictures: bool) ->
     runs: list[RobotRun] = []
     counts = ("--episodes", str(episodes), "--seed", str(FIRST_SEED))
     for robot in ROBOTS:
-        show(console, ["rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts])
+        show_command(["rollout", robot.env_id, "--url", url, "--policy", robot.policy, *counts])
         with PolicyClient(url, robot.policy) as policy, console.status("driving ..."):
             traces: list[Trace] = []
             report = rollout(_Recorder(policy, traces), robot.env_id, episodes=episodes, seed=FIRST_SEED)

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 TYPE_CHECKING = False  # type checkers read the name as true; importing it from `typing` takes milliseconds
 if TYPE_CHECKING:
-    from rlservo.export.commands.export import export_checkpoint
     from rlservo.export.contract import errors
+    from rlservo.export.export_checkpoint import export_checkpoint
     from rlservo.serve_app.client.admin_client import AdminClient
     from rlservo.serve_app.client.policy_client import PolicyClient
     from rlservo.serve_app.client.stream_client import StreamClient
@@ -55,7 +55,7 @@ _MODULES = {
     "WithFallback": "rlservo.serve_app.rollout.fallback",
     "WithRecording": "rlservo.serve_app.recording.recorded_policy",
     "errors": "rlservo.export.contract",
-    "export_checkpoint": "rlservo.export.commands.export",
+    "export_checkpoint": "rlservo.export.export_checkpoint",
     "rollout": "rlservo.serve_app.rollout.control_loop",
 }
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:  # MuJoCo is imported where a robot is made
-    from rlservo.envs.robot_server.mir100_robot import Mir100Robot
-    from rlservo.envs.robot_server.ur_robot import URRobot
+    from rlservo.envs.rendering import Camera
 
 CLOCKS = ("fast", "real")
 
@@ -23,5 +22,29 @@ class RobotState:
     string_params: Mapping[str, str] = field(default_factory=dict)
 
 
-Robot: TypeAlias = "URRobot | Mir100Robot"
-"""A simulated robot with the server's vocabulary. Every method raises ValueError for what it cannot honour."""
+class Robot(Protocol):
+    """A simulated robot with the server's vocabulary. Every method raises ValueError for what it cannot honour."""
+
+    @property
+    def camera(self) -> Camera: ...
+
+    @property
+    def cycle_s(self) -> float:
+        """How long a control cycle lasts [s]."""
+        ...
+
+    def state(self) -> RobotState:
+        """Return the state, as a list and, where the original has names, by names."""
+        ...
+
+    def set_state(self, target: RobotState) -> int:
+        """Put the robot and its scene as `target` has them; return how many cycles that counts as."""
+        ...
+
+    def act(self, action: Sequence[float]) -> None:
+        """Command the robot for one cycle."""
+        ...
+
+    def idle(self, cycles: int) -> None:
+        """Let cycles pass without a command."""
+        ...

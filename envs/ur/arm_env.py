@@ -28,6 +28,7 @@ from rlservo.envs.checks import (
 from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
 from rlservo.envs.ur.model import BASE_HEIGHT
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, cycle_of
+from rlservo.envs.ur.server_state import state_dict
 from rlservo.envs.ur.simulation import VIEW, URSimulation
 
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
@@ -147,7 +148,7 @@ class URArmEnv(RenderedEnv):
         if status is not None:
             info = {"final_status": status, "is_success": status == "success", **self._final_info(status)}
         if self._rs_state_to_info:
-            info["rs_state"] = self.simulation.state(self.RS_MODE)
+            info["rs_state"] = state_dict(self.simulation, self.RS_MODE)
         self._refresh_window()
         return observation, reward, terminated, truncated, info
 

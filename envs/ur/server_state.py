@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.envs.ur.rs_modes import ROS_ORDER, rs_mode_of, state_names
-
-if TYPE_CHECKING:
-    from rlservo.envs.ur.simulation import URSimulation
+from rlservo.envs.ur.simulation import URSimulation
 
 Vector = NDArray[np.float64]
 Transform = tuple[float, float, float, float, float, float, float]  # x, y, z [m], quaternion x, y, z, w

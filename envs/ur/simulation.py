@@ -19,7 +19,6 @@ from rlservo.envs.disturbances import MAX_MODEL_ERROR
 from rlservo.envs.ur.model import BASE_HEIGHT, TIMESTEP, build_model
 from rlservo.envs.ur.object_paths import UPDATE_RATE_HZ, Path
 from rlservo.envs.ur.parameters import JOINTS, ur_parameters
-from rlservo.envs.ur.server_state import state_dict
 
 MIN_TRAJECTORY_S = 0.5  # [s], the robot server never plans a shorter one
 SETTLE_CYCLES = 20  # the robot server lets so many pass after it has set a state
@@ -298,10 +297,6 @@ class URSimulation:
     def object_count(self) -> int:
         """How many objects the scene holds."""
         return len(self._objects)
-
-    def state(self, rs_mode: str = "1object") -> dict[str, float]:
-        """Return the robot server's `state_dict` of a mode."""
-        return state_dict(self, rs_mode)
 
     def contacts(self) -> list[tuple[str, str]]:
         """Return the names of the bodies that touch now, for messages ('world' is the table and the ground)."""

@@ -18,7 +18,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from rlservo import Policy, errors
-from rlservo.export.commands.export import LOADING_RUNS_CODE
+from rlservo.export.export_checkpoint import LOADING_RUNS_CODE
 from rlservo.serve_app.rollout.environment import check_fit, make_env
 from rlservo.serve_app.rollout.episode import success_of
 from shared.help_text import DefaultsFormatter

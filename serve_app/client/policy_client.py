@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import StateNeededError, UnavailableError, UnknownPolicyError, UsageError
-from rlservo.serve_app.client.episode_state import EpisodeState
+from rlservo.serve_app.client.client_episode import ClientEpisode
 from rlservo.serve_app.client.http_transport import Transport, encode
 from rlservo.serve_app.client.remote_policy import RemotePolicy
 from rlservo.serve_app.client.replies import answering_version, decode_action
@@ -78,7 +78,7 @@ class PolicyClient(RemotePolicy):
             version=version,
             timeout_s=timeout_s,
             deadline_ms=deadline_ms,
-            episode=EpisodeState(server_state=server_state, is_stream=False),
+            episode=ClientEpisode(server_state=server_state, is_stream=False),
             record=record,
         )
 

@@ -26,8 +26,8 @@ from rlservo.export.contract.errors import (
     UnknownVersionError,
     UsageError,
 )
-from rlservo.serve_app.client.episode_state import EpisodeState
-from rlservo.serve_app.client.observations import encode_observation
+from rlservo.serve_app.client.client_episode import ClientEpisode
+from rlservo.serve_app.client.observation_encoding import encode_observation
 from rlservo.serve_app.client.replies import answering_version, check_successor
 from rlservo.serve_app.interface import ActingPolicy, Observation
 from rlservo.serve_app.recording.start import record_policy
@@ -54,7 +54,7 @@ class RemotePolicy(ActingPolicy):
         version: str | None,
         timeout_s: float,
         deadline_ms: float | None,
-        episode: EpisodeState,
+        episode: ClientEpisode,
         record: str | Path | Recorder | None,
     ) -> None:
         """Check the arguments, then open the recording: a client that cannot be made leaves no file behind."""

@@ -12,7 +12,7 @@ from rlservo.export.contract.contract import REWARD, Contract
 from rlservo.export.contract.errors import ActionError, SessionLostError, UnavailableError
 from rlservo.export.contract.nested import build_action
 from rlservo.export.contract.spaces import LeafSpec, leaf_specs
-from rlservo.serve_app.wire.state_names import MARK
+from rlservo.serve_app.wire.request_names import MARK
 
 
 def answering_version(url: str, reply: Any, number: int, contract: Contract) -> str:

@@ -27,7 +27,7 @@ from rlservo.export.contract.errors import (
     UsageError,
 )
 from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.serve_app.client.episode_state import EpisodeState
+from rlservo.serve_app.client.client_episode import ClientEpisode
 from rlservo.serve_app.client.error_replies import decode_error, error_of
 from rlservo.serve_app.client.remote_policy import RemotePolicy
 from rlservo.serve_app.client.replies import decode_action
@@ -82,7 +82,7 @@ class StreamClient(RemotePolicy):
             version=version,
             timeout_s=timeout_s,
             deadline_ms=deadline_ms,
-            episode=EpisodeState(server_state=server_state, is_stream=True),
+            episode=ClientEpisode(server_state=server_state, is_stream=True),
             record=record,
         )
         self._api_key = api_key

@@ -2,7 +2,7 @@
 
 Ray Serve counts requests that are being worked on. A policy's request is over before anybody counts it, so a replica at
 its limit looks idle, while one with a hundred silent streams looks busy; hence this measure instead. In serve.yaml:
-`autoscaling_config: {policy: {policy_function: rlservo.serve_app.ray_serve.autoscaling:by_load}, ...}`. It imports
+`autoscaling_config: {policy: {policy_function: rlservo.serve_app.engines.autoscaling:by_load}, ...}`. It imports
 nothing of Ray: Serve's controller imports it.
 """
 

@@ -11,7 +11,7 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from rlservo.export.contract.errors import UnavailableError
 from rlservo.serve_app.protocols.oip_grpc import METHODS, Grpc
 from rlservo.serve_app.protocols.oip_messages import SERVICE, messages
-from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.wire.loopback import is_loopback
 
 LONGEST_S = 86400.0  # [s] gRPC expresses "no deadline" as one far away
@@ -23,11 +23,11 @@ MAX_CALLS = 1024
 class GrpcServer:
     """Serves gRPC calls of one process."""
 
-    def __init__(self, core: Core, host: str, port: int, *, is_shared: bool) -> None:
+    def __init__(self, handler: RequestHandler, host: str, port: int, *, is_shared: bool) -> None:
         """`is_shared`: whether several processes listen on the port, which the kernel then shares out."""
-        settings = core.settings
+        settings = handler.settings
         self._address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        self._grpc = Grpc(core, local_only=is_loopback(host))
+        self._grpc = Grpc(handler, local_only=is_loopback(host))
         self._server = grpc.aio.server(
             maximum_concurrent_rpcs=MAX_CALLS,
             options=[

@@ -23,7 +23,7 @@ from uvicorn.server import ServerState
 
 from rlservo.export.contract.errors import DeadlineError, OverloadedError, RequestError
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 
 LIMITS = "rlservo.limits"  # in the application's lifespan state, which uvicorn hands to each connection
@@ -50,15 +50,15 @@ CHECK_S = 1.0  # [s] between two looks at a connection's phase
 class ConnectionLimits:
     """Limits that differ from server to server."""
 
-    def __init__(self, settings: ServerSettings, core: Core) -> None:
+    def __init__(self, settings: ServerSettings, handler: RequestHandler) -> None:
         self.per_address = settings.max_connections_per_address
         self.body_s = settings.body_timeout_s
-        self._core = core
+        self._handler = handler
 
     def record(self, status: int, sentence: str, peer: str | None) -> None:
         """Count and log what was refused before the application had it."""
         request = Request("http", "", None, time.perf_counter())
-        self._core.record_failure(request, ERROR_CODES[status], sentence, peer=peer)
+        self._handler.record_failure(request, ERROR_CODES[status], sentence, peer=peer)
 
 
 class _Refused(Exception):

@@ -36,14 +36,14 @@ from rlservo.serve_app.engines.http_bounds import (
 )
 from rlservo.serve_app.engines.ports import BACKLOG, listen
 from rlservo.serve_app.engines.serving import Serving
+from rlservo.serve_app.repository.object_storage import place_of
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure
 from rlservo.serve_app.server.metrics import FOLDER_VARIABLE, shared_by_workers
 from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
-from rlservo.serve_app.versions.object_storage import place_of
-from rlservo.serve_app.versions.plan import ServedConfig
+from rlservo.serve_app.versions.serving_plan import ServedConfig
 from rlservo.serve_app.wire.loopback import is_loopback
 
 logger = logging.getLogger(__name__)
@@ -215,7 +215,7 @@ class _Application:
             server.places, settings, replica=self._replica, host=server.host, is_alone=not self._is_worker
         )
         await serving.start(server.served)
-        store = serving.core.store()
+        store = serving.handler.store()
         if settings.default_policy not in (None, *store.names):
             raise UsageError(
                 f"the default policy '{settings.default_policy}' is not among those to serve: {', '.join(store.names)}"
@@ -224,9 +224,9 @@ class _Application:
         if server.grpc_port is not None:
             from rlservo.serve_app.engines.grpc_server import GrpcServer  # takes a quarter of the start
 
-            self._grpc = GrpcServer(serving.core, server.host, server.grpc_port, is_shared=self._is_worker)
+            self._grpc = GrpcServer(serving.handler, server.host, server.grpc_port, is_shared=self._is_worker)
             await self._grpc.start()
-        state[LIMITS] = ConnectionLimits(settings, serving.core)
+        state[LIMITS] = ConnectionLimits(settings, serving.handler)
         self._serving, self._app = serving, serving.app
 
     async def _stop(self) -> None:

@@ -25,11 +25,11 @@ from rlservo.serve_app.engines.serving import Serving
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import Grpc
 from rlservo.serve_app.protocols.oip_messages import SERVICE, STREAM, UNARY
+from rlservo.serve_app.repository.object_storage import place_of
 from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.object_storage import place_of
-from rlservo.serve_app.versions.plan import ServedConfig
+from rlservo.serve_app.versions.serving_plan import ServedConfig
 from rlservo.serve_app.wire.loopback import is_loopback
 
 logger = logging.getLogger(__name__)
@@ -133,7 +133,7 @@ class PolicyServer(InferenceMethods):
             )
         except RlservoError as error:
             raise _plain(error) from None
-        self._grpc = Grpc(self._serving.core, local_only=is_loopback(host))
+        self._grpc = Grpc(self._serving.handler, local_only=is_loopback(host))
         if os.environ.get(SWITCHES[0]) != "1":
             logger.warning(
                 "requests reach this replica through Serve's Python proxy, ten times slower than HAProxy: set %s=1 and "

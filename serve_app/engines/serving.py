@@ -12,7 +12,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.sampled_metrics import keep_sampled
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import plan_files, version_loader
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 
 class Serving:
@@ -34,7 +34,7 @@ class Serving:
         """
         self.settings = settings
         loader, files = version_loader(places, settings), plan_files(places, settings)
-        self.control = ReplicaVersions(loader, files, replica=replica)
+        self.control = PlanFollower(loader, files, replica=replica)
         self.app = create_app(
             lambda: self.control.store,
             settings,
@@ -44,7 +44,7 @@ class Serving:
             is_alone=is_alone,
             is_behind_serve=is_behind_serve,
         )
-        self.core = self.app.state.core
+        self.handler = self.app.state.handler
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self, served: Any) -> None:
@@ -53,10 +53,10 @@ class Serving:
         Raises UsageError, BundleError and UnavailableError.
         """
         await self.control.configure(served)
-        self.core.admission.loop_clock.start()
+        self.handler.admission.loop_clock.start()
         self._tasks.append(asyncio.create_task(self.control.poll_plan()))
-        if self.core.metrics.is_shared:
-            self._tasks.append(asyncio.create_task(keep_sampled(self.core)))
+        if self.handler.metrics.is_shared:
+            self._tasks.append(asyncio.create_task(keep_sampled(self.handler)))
         if self.settings.poll_s is not None:
             self._tasks.append(asyncio.create_task(self.control.poll_repository(self.settings.poll_s)))
         # What is loaded by now stays: a collection that walks it would hold requests up.
@@ -70,6 +70,6 @@ class Serving:
         for task in self._tasks:
             with contextlib.suppress(asyncio.CancelledError):
                 await task
-        await self.core.close()
-        if self.core.recorder is not None:
-            await asyncio.to_thread(self.core.recorder.close)
+        await self.handler.close()
+        if self.handler.recorder is not None:
+            await asyncio.to_thread(self.handler.recorder.close)

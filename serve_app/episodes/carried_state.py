@@ -14,7 +14,7 @@ from typing import Any
 from rlservo.export.contract.errors import RequestError
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import EpisodeStep
-from rlservo.serve_app.wire.state_names import BELONGS_TO, LAST_ACTION, MARK
+from rlservo.serve_app.wire.request_names import BELONGS_TO, LAST_ACTION, MARK
 
 MARK_BEGINS = "~"  # no policy's identity has one
 LONGEST_EPISODE_ID = 256

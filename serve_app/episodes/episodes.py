@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
 from rlservo.serve_app.episodes.carried_state import NO_STATE, CarriedState, carry, split_identity
+from rlservo.serve_app.episodes.memory_sessions import MemorySessions, shorten
 from rlservo.serve_app.episodes.request import Episode, Request, SessionId, new_episode_id
-from rlservo.serve_app.episodes.sessions import Session, Sessions, shorten
+from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import (
     NEEDS_LAST,
@@ -26,7 +27,7 @@ from rlservo.serve_app.versions.policy_store import (
     PolicyStore,
     take_step,
 )
-from rlservo.serve_app.wire.state_names import BELONGS_TO
+from rlservo.serve_app.wire.request_names import BELONGS_TO
 
 if TYPE_CHECKING:
     from rlservo.serve_app.episodes.redis_sessions import RedisSessions
@@ -43,11 +44,11 @@ class Episodes:
     def __init__(
         self, *, max_sessions: int, idle_s: float, store: RedisSessions | None = None, is_alone: bool = True
     ) -> None:
-        """`max_sessions` and `idle_s` bound what `Sessions` remembers.
+        """`max_sessions` and `idle_s` bound what `MemorySessions` remembers.
 
         A `store` keeps the sessions instead. `is_alone` says whether this is the only process that requests reach.
         """
-        self.sessions = Sessions(most=max_sessions, idle_s=idle_s)
+        self.sessions = MemorySessions(most=max_sessions, idle_s=idle_s)
         self._idle_s = idle_s
         self.store = store
         self._has_sessions = is_alone or store is not None

@@ -26,8 +26,9 @@ from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import RedisError
 
 from rlservo.export.contract.errors import OverloadedError, UnavailableError, UsageError
+from rlservo.serve_app.episodes.memory_sessions import StepSession, overtaken
 from rlservo.serve_app.episodes.request import Request, SessionId, check_client, check_deadline
-from rlservo.serve_app.episodes.sessions import Session, StepSession, overtaken
+from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.versions.policy_store import Decision, EpisodeNote, PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 

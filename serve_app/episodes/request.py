@@ -7,12 +7,10 @@ import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 from rlservo.export.contract.errors import DeadlineError
-
-if TYPE_CHECKING:
-    from rlservo.serve_app.episodes.sessions import Session
+from rlservo.serve_app.episodes.session import Session
 
 SessionId: TypeAlias = str | int
 """Triton's clients number their sequences; 7 and "7" are two."""

@@ -21,15 +21,15 @@ from rlservo.serve_app.protocols.oip_models import TAG
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.audit import AUDIT, OK, AuditEntry
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.versions.commands import COMMANDS, Changed, Command, Load, Unload
-from rlservo.serve_app.versions.plan import Plan
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+from rlservo.serve_app.server.request_handler import RequestHandler
+from rlservo.serve_app.versions.plan_commands import COMMANDS, Changed, Command, Load, Unload
+from rlservo.serve_app.versions.plan_follower import PlanFollower
+from rlservo.serve_app.versions.serving_plan import Plan
 
 STATUSES = (404, 409, 415, 503)
 
 
-def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
+def add_admin(app: FastAPI, handler: RequestHandler, control: PlanFollower) -> None:
     """Add /v1/admin and the repository extension's load and unload to the application."""
     post = partial(add_route, app, Access.admin, "POST")
 
@@ -52,7 +52,7 @@ def add_admin(app: FastAPI, core: Core, control: ReplicaVersions) -> None:
         response_model=list[listing.PolicyList],
     )
     async def status() -> Response:
-        return Response(orjson.dumps([listing.describe(core)]), media_type="application/json")
+        return Response(orjson.dumps([listing.describe(handler)]), media_type="application/json")
 
     def add_command(command: str, kind: type[Command]) -> None:
         async def endpoint(request: Request, name: str, given: Command) -> Response:

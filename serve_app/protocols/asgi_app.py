@@ -1,4 +1,4 @@
-"""ASGI application of the server: JSON, Open Inference Protocol, WebSocket and health over one `Core`."""
+"""ASGI application of the server: JSON, Open Inference Protocol, WebSocket and health over one `RequestHandler`."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ from rlservo.serve_app.protocols.status_page import add_status_page
 from rlservo.serve_app.server.access_checks import AccessChecks, Hosts
 from rlservo.serve_app.server.api_keys import Access, grant
 from rlservo.serve_app.server.audit import AUDIT
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_path import StoreProvider
+from rlservo.serve_app.server.request_handler import RequestHandler, StoreProvider
 from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 DESCRIPTION = "Actions from exported RLlib policies. Every error is a sentence, a code and, where it helps, details."
 
@@ -33,23 +32,23 @@ def create_app(
     settings: ServerSettings,
     *,
     replica: str = "",
-    control: ReplicaVersions | None = None,
+    control: PlanFollower | None = None,
     host: str = "127.0.0.1",
     is_behind_serve: bool = False,
     is_alone: bool = True,
 ) -> PolicyApp:
     """Return the application; `store_provider` gives None for as long as the policies are being loaded.
 
-    With a `control` what is served can be administered. `replica` is the `Core`'s, which is the application's
-    `state.core`; `host` is the address that is listened on; `is_behind_serve` is `PolicyApp`'s; `is_alone` says that
+    With a `control` what is served can be administered. `replica` is the `RequestHandler`'s, which is the application's
+    `state.handler`; `host` is the address that is listened on; `is_behind_serve` is `PolicyApp`'s; `is_alone` says that
     this is the only process that requests reach. Raises UsageError when the API keys that `settings` name cannot be
     read.
     """
-    core = Core(store_provider, settings, replica=replica, control=control, is_alone=is_alone)
-    checks = AccessChecks(Hosts(host, settings, keyed=bool(core.keys.accepted.keys)), core.keys)
+    handler = RequestHandler(store_provider, settings, replica=replica, control=control, is_alone=is_alone)
+    checks = AccessChecks(Hosts(host, settings, keyed=bool(handler.keys.accepted.keys)), handler.keys)
     # A redirect would be an answer to a path that no route has: there is none.
     app = PolicyApp(
-        core,
+        handler,
         checks,
         is_behind_serve=is_behind_serve,
         title="rlservo",
@@ -62,14 +61,14 @@ def create_app(
     (document,) = app.routes  # FastAPI's own, /openapi.json: it tells nothing of policies
     grant(Access.open)(document)
     add = app.router.routes.append
-    app.state.core = core  # for gRPC and the replica, which are no part of the application
-    json_routes.add_routes(app, core, add)
-    websocket_stream.add_routes(core, add)
-    _add_health(app, core)
+    app.state.handler = handler  # for gRPC and the replica, which are no part of the application
+    json_routes.add_routes(app, handler, add)
+    websocket_stream.add_routes(handler, add)
+    _add_health(app, handler)
     if control is not None:
-        add_admin(app, core, control)
-    oip_config.add_routes(app, core)
-    oip_models.add_routes(app, core, add)
+        add_admin(app, handler, control)
+    oip_config.add_routes(app, handler)
+    oip_models.add_routes(app, handler, add)
     if settings.docs:
         add_docs(app)
         add_status_page(app)
@@ -80,7 +79,7 @@ def create_app(
     return app
 
 
-def _add_health(app: FastAPI, core: Core) -> None:
+def _add_health(app: FastAPI, handler: RequestHandler) -> None:
     @add_route(app, Access.open, "GET", "/healthz", "health", "The process answers", response_class=Response)
     async def healthz() -> Response:
         return Response("OK", media_type="text/plain")
@@ -89,7 +88,7 @@ def _add_health(app: FastAPI, core: Core) -> None:
 
     @add_route(app, Access.act, "GET", "/metrics", "health", counted, response_class=Response)
     async def metrics() -> Response:
-        return Response(await exposition(core), media_type=CONTENT_TYPE_LATEST)
+        return Response(await exposition(handler), media_type=CONTENT_TYPE_LATEST)
 
 
 # Errors of the routes that FastAPI runs; `http_errors.py` has the table.

@@ -49,8 +49,7 @@ from rlservo.serve_app.server.access_checks import (
 )
 from rlservo.serve_app.server.api_keys import Access, Key, access_of
 from rlservo.serve_app.server.audit import AUDIT, AuditEntry
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_path import Codec
+from rlservo.serve_app.server.request_handler import Codec, RequestHandler
 
 PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
 HANG_UP_TURNS = 4
@@ -79,10 +78,12 @@ class PolicyApp(FastAPI):
     the others.
     """
 
-    def __init__(self, core: Core, checks: AccessChecks, *, is_behind_serve: bool = False, **options: Any) -> None:
+    def __init__(
+        self, handler: RequestHandler, checks: AccessChecks, *, is_behind_serve: bool = False, **options: Any
+    ) -> None:
         """`is_behind_serve`: Ray Serve gives replies their request id, and its connections take trailers for headers"""
         super().__init__(**options)
-        self._core = core
+        self._handler = handler
         self._checks = checks
         self._is_behind_serve = is_behind_serve
         self._found: dict[tuple[str, str], Found] = {}
@@ -127,7 +128,7 @@ class PolicyApp(FastAPI):
                 varying = {"Vary": "Accept"} if path == ROOT else None
                 await http_error(404, scope, headers=varying)(scope, receive, send)
                 return
-            body = await receive_body(self._core, headers, receive)
+            body = await receive_body(self._handler, headers, receive)
             await super().__call__(scope, replay(body, receive), with_headers(send, scope[REPLY_HEADERS]))
         except RlservoError as error:
             entry.code = error.code
@@ -151,7 +152,7 @@ class PolicyApp(FastAPI):
         self, scope: Scope, headers: Mapping[bytes, bytes], receive: Receive, send: Send, error: RlservoError
     ) -> None:
         request = Request(scope["type"], "", None, time.perf_counter(), request_id=header_text(headers, REQUEST_ID))
-        self._core.record_failure(request, error.code, error.message, peer=peer_of(scope))
+        self._handler.record_failure(request, error.code, error.message, peer=peer_of(scope))
         await _send_refusal(scope, receive, send, error)
 
     def find(self, scope: Scope, path: str) -> Found:
@@ -187,11 +188,11 @@ class PolicyApp(FastAPI):
 class HttpEndpoint:
     """Answers the POST requests of one protocol."""
 
-    def __init__(self, protocol: str, codec: Codec[Receive, tuple[bytes, Headers]], core: Core) -> None:
+    def __init__(self, protocol: str, codec: Codec[Receive, tuple[bytes, Headers]], handler: RequestHandler) -> None:
         """Take the protocol's name, as metrics and log have it."""
         self._protocol = protocol
         self._codec = codec
-        self._core = core
+        self._handler = handler
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request, errors included."""
@@ -209,7 +210,7 @@ class HttpEndpoint:
         )
         status = 200
         try:
-            content, reply_headers = await self._core.answer(self._codec, request, receive)
+            content, reply_headers = await self._handler.answer(self._codec, request, receive)
         except RlservoError as error:
             status, content, reply_headers = error_answer(error)
         except ClientGoneError:
@@ -234,20 +235,20 @@ async def has_hung_up(receive: Receive) -> bool:
     return bool(message.result()["type"] == "http.disconnect")
 
 
-async def receive_body(core: Core, headers: Mapping[bytes, bytes], receive: Receive) -> Body:
+async def receive_body(handler: RequestHandler, headers: Mapping[bytes, bytes], receive: Receive) -> Body:
     """Return a request's body within the server's limits. The first message usually holds all of it.
 
     The one way in which a body gets into this process; how long it may take is the connection's affair
     (`engines/http_bounds.py`). Raises TooLargeError, OverloadedError and ClientGoneError.
     """
-    max_bytes = core.settings.max_body_bytes
+    max_bytes = handler.settings.max_body_bytes
     length = headers.get(b"content-length", b"")
     if length.isdigit() and len(length) < 20 and int(length) > max_bytes:
         raise too_large(max_bytes)
     message = await receive()
     body: Body = message.get("body", b"")
     if message.get("more_body", False):
-        with core.admission.reading_body():
+        with handler.admission.reading_body():
             body = bytearray(body)
             while message.get("more_body", False) and len(body) <= max_bytes:
                 message = await receive()

@@ -29,7 +29,7 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
 )
 from rlservo.serve_app.protocols import json_messages
-from rlservo.serve_app.server.request_path import BUG
+from rlservo.serve_app.server.request_handler import BUG
 
 logger = logging.getLogger(__name__)
 

@@ -29,8 +29,8 @@ from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.json_messages import json_type, parse_json
 from rlservo.serve_app.protocols.media_types import check_media_type
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.reply import reply_fields
+from rlservo.serve_app.server.reply_fields import reply_fields
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
@@ -40,8 +40,8 @@ SUCH_AS = '{"obs": [...]}'
 class JsonCodec:
     """The JSON protocol's bytes (`Codec`)."""
 
-    def __init__(self, core: Core) -> None:
-        self._core = core
+    def __init__(self, handler: RequestHandler) -> None:
+        self._handler = handler
 
     async def receive(self, request: Request, source: Receive) -> Body:
         """Return the body. Raises MediaTypeError, and what `receive_body` raises."""
@@ -53,7 +53,7 @@ class JsonCodec:
             raise MediaTypeError(
                 f"the content encoding '{encoding[:32].decode('latin-1')}' is not read: send plain JSON"
             )
-        return await receive_body(self._core, headers, source)
+        return await receive_body(self._handler, headers, source)
 
     def parse(self, request: Request, content: Body) -> None:
         """Fill the request; the observation itself is the policy's to judge.
@@ -62,7 +62,7 @@ class JsonCodec:
         not a JSON object of the known fields, ObservationError when it has no `obs`.
         """
         if len(content) > SMALL:
-            check_json(self._core.store(), request.policy, content, self._core.settings.max_batch)
+            check_json(self._handler.store(), request.policy, content, self._handler.settings.max_batch)
         try:
             document = orjson.loads(content)
         except orjson.JSONDecodeError:

@@ -19,8 +19,8 @@ from rlservo.export.contract.spaces import DictSpec
 from rlservo.serve_app.episodes.request import REQUEST_FIELDS, Episode, Request
 from rlservo.serve_app.protocols.json_codec import parse_episode, parse_options
 from rlservo.serve_app.server.content_bounds import SMALL, check_length
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.reply import reply_fields
+from rlservo.serve_app.server.reply_fields import reply_fields
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 
@@ -31,9 +31,9 @@ IGNORED = frozenset({"prompt", "env_id"})
 class MsgpackCodec:
     """The stream's bytes (`Codec`)."""
 
-    def __init__(self, core: Core) -> None:
-        self._core = core
-        self._max_bytes = core.settings.max_body_bytes
+    def __init__(self, handler: RequestHandler) -> None:
+        self._handler = handler
+        self._max_bytes = handler.settings.max_body_bytes
 
     async def receive(self, request: Request, source: Message) -> Mapping[Any, Any]:
         """Return the map in a frame; its `seq` is known from then on, for an error's frame. Raises RequestError."""
@@ -75,13 +75,13 @@ class MsgpackCodec:
         return pack(fields)
 
     def _most_values(self, request: Request, content: bytes) -> int:
-        store, max_batch = self._core.store(), self._core.settings.max_batch
+        store, max_batch = self._handler.store(), self._handler.settings.max_batch
         return max(bounds.values for bounds in check_length(store, request.policy, content, max_batch))
 
     def _names(self, request: Request, name: str) -> bool:
         """Whether an observation of the request's policy has a part or an element of that name."""
         stream = request.stream
-        policy = self._core.store().get(request.policy, request.version) if stream is None else stream.policy
+        policy = self._handler.store().get(request.policy, request.version) if stream is None else stream.policy
         space = policy.contract.observation_space
         if isinstance(space, DictSpec):
             return name in space.spaces or name in space.ignored

@@ -23,36 +23,36 @@ from rlservo.serve_app.protocols.fastapi_routes import add_route
 from rlservo.serve_app.protocols.oip_tensors import datatype_of
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Access
-from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.metrics import Totals
+from rlservo.serve_app.server.request_handler import RequestHandler
 
 BACKEND = "onnxruntime"
 LARGEST_INT32 = 2**31 - 1
 NOTHING = {"count": 0, "ns": 0}
 
 
-def model_config(core: Core, name: str, version: str | None) -> dict[str, Any]:
+def model_config(handler: RequestHandler, name: str, version: str | None) -> dict[str, Any]:
     """Return how a model is run, as ModelConfig; `version` None is the default.
 
     Raises UnknownPolicyError, UnknownVersionError, UnavailableError.
     """
-    policy = core.store().get(name, version)
+    policy = handler.store().get(name, version)
     config: dict[str, Any] = {
         "name": name,
         "platform": oip_models.PLATFORM,
         "backend": BACKEND,
-        "max_batch_size": min(core.settings.max_batch, LARGEST_INT32),
+        "max_batch_size": min(handler.settings.max_batch, LARGEST_INT32),
         "input": [_input(tensor) for tensor in oip_infer.offered_inputs(policy)],
         "output": [_tensor(tensor) for tensor in oip_infer.offered_outputs(policy.contract)],
         "default_model_filename": ONNX_FILE,
         "model_transaction_policy": {"decoupled": False},  # a request has one reply
     }
-    if core.store().batcher_of(policy) is not None:
+    if handler.store().batcher_of(policy) is not None:
         # So many are run at once as soon as they are there, and nobody waits for others to come.
         most = policy.options.micro_batch
         config["dynamic_batching"] = {"preferred_batch_size": [most], "max_queue_delay_microseconds": 0}
     elif policy.is_stateful:
-        config["sequence_batching"] = _sequences(core, policy)
+        config["sequence_batching"] = _sequences(handler, policy)
     return config
 
 
@@ -68,9 +68,9 @@ def _tensor(tensor: TensorSpec) -> dict[str, Any]:
     return {"name": tensor.name, "data_type": f"TYPE_{datatype_of(tensor.dtype)}", "dims": list(tensor.shape[1:])}
 
 
-def _sequences(core: Core, policy: Policy) -> dict[str, Any]:
+def _sequences(handler: RequestHandler, policy: Policy) -> dict[str, Any]:
     return {
-        "max_sequence_idle_microseconds": round(core.settings.session_idle_s * 1e6),
+        "max_sequence_idle_microseconds": round(handler.settings.session_idle_s * 1e6),
         "state": [
             {
                 "input_name": oip_infer.STATE_IN + state.name,
@@ -83,7 +83,7 @@ def _sequences(core: Core, policy: Policy) -> dict[str, Any]:
     }
 
 
-def statistics(core: Core, name: str | None = None, version: str | None = None) -> list[dict[str, Any]]:
+def statistics(handler: RequestHandler, name: str | None = None, version: str | None = None) -> list[dict[str, Any]]:
     """Return what this replica has counted of each version since its start, as ModelStatistics.
 
     Without a `version` of every version of the model, without a `name` of every model. All protocols count.
@@ -91,14 +91,14 @@ def statistics(core: Core, name: str | None = None, version: str | None = None) 
     """
     if name is None and version is not None:
         raise RequestError(f"the version '{version[:32]}' is of no model: name one")
-    store = core.store()
+    store = handler.store()
     if name is None:
         wanted = [(each, known) for each in store.names for known in store.versions(each)]
     elif version is None:
         wanted = [(name, known) for known in store.versions(name)]
     else:
         wanted = [(name, store.get(name, version).contract.version)]
-    return [_statistics(core.metrics.totals(*which), *which) for which in wanted]
+    return [_statistics(handler.metrics.totals(*which), *which) for which in wanted]
 
 
 def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
@@ -127,13 +127,13 @@ def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
     }
 
 
-def add_routes(app: FastAPI, core: Core) -> None:
+def add_routes(app: FastAPI, handler: RequestHandler) -> None:
     """Add both to the application: before /v2/models/{name}, which would take /v2/models/stats for a model."""
     get = partial(add_route, app, Access.act, "GET")
     model, one_version = oip_models.MODEL, oip_models.VERSION
 
     def statistics_reply(name: str | None = None, version: str | None = None) -> Response:
-        return oip_models.json_response({"model_stats": statistics(core, name, version)})
+        return oip_models.json_response({"model_stats": statistics(handler, name, version)})
 
     @get("/v2/models/stats", oip_models.TAG, "Statistics of every model", 503)
     async def all_statistics() -> Response:
@@ -149,8 +149,8 @@ def add_routes(app: FastAPI, core: Core) -> None:
 
     @get(f"{model}/config", oip_models.TAG, "How a model is run", 404, 503)
     async def config(name: str) -> Response:
-        return oip_models.json_response(model_config(core, name, None))
+        return oip_models.json_response(model_config(handler, name, None))
 
     @get(f"{one_version}/config", oip_models.TAG, "How a version is run", 404, 503)
     async def version_config(name: str, version: str) -> Response:
-        return oip_models.json_response(model_config(core, name, version))
+        return oip_models.json_response(model_config(handler, name, version))

@@ -43,8 +43,7 @@ from rlservo.serve_app.protocols.oip_tensors import DTYPES, as_datatype, check_f
 from rlservo.serve_app.server.access_checks import StreamKey, authorize, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, SPARE, check_length
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.request_path import BUG
+from rlservo.serve_app.server.request_handler import BUG, RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
@@ -92,12 +91,12 @@ FIELD_DTYPES = {
 
 
 class Grpc:
-    """Answers gRPC calls from the core."""
+    """Answers gRPC calls from the handler."""
 
-    def __init__(self, core: Core, *, local_only: bool = False) -> None:
-        """Take the core. `local_only`: Serve binds its gRPC ports to every interface, whatever host it is given."""
-        self._core = core
-        self._codec = OipGrpcCodec(core)
+    def __init__(self, handler: RequestHandler, *, local_only: bool = False) -> None:
+        """Take the handler. `local_only`: Serve binds its gRPC ports to every interface, whatever host it is given."""
+        self._handler = handler
+        self._codec = OipGrpcCodec(handler)
         self._local_only = local_only
 
     async def answer(self, method: str, incoming: Incoming, context: Any) -> Any:
@@ -107,8 +106,8 @@ class Grpc:
             if request.request_id is not None:
                 context.set_trailing_metadata([(REQUEST_ID, request.request_id)])
             if method == "ModelInfer":
-                return await self._core.answer(self._codec, request, incoming)
-            return METHODS[method](self._core, incoming)
+                return await self._handler.answer(self._codec, request, incoming)
+            return METHODS[method](self._handler, incoming)
         except Exception as error:
             _fail(context, error)
             return messages.ServerLiveResponse()
@@ -118,16 +117,16 @@ class Grpc:
 
         A stream that says nothing for `stream_idle_s` is ended.
         """
-        core = self._core
-        idle_s = core.settings.stream_idle_s
+        handler = self._handler
+        idle_s = handler.settings.stream_idle_s
         try:
             opening = self._begin("ModelStreamInfer", context)
             opening.label = opening.label or secrets.token_hex(8)  # one version for all where a canary runs
-            core.open_stream(opening)
+            handler.open_stream(opening)
         except Exception as error:
             _fail(context, error)
             return
-        key = StreamKey(core.keys, presented_key(opening.headers))
+        key = StreamKey(handler.keys, presented_key(opening.headers))
         try:
             while True:
                 try:
@@ -144,19 +143,19 @@ class Grpc:
                     key.check()
                 except RlservoError as error:
                     peer = context.peer()
-                    core.record_failure(request, error.code, error.message, peer=peer)
+                    handler.record_failure(request, error.code, error.message, peer=peer)
                     if not isinstance(error, RateLimitError):  # the key is no longer accepted
                         _fail(context, error)
                         return
                     yield _error_reply(error, content)
                     continue
                 try:
-                    reply = await core.answer(self._codec, request, (content, None))
+                    reply = await handler.answer(self._codec, request, (content, None))
                     yield messages.ModelStreamInferResponse(infer_response=reply)
                 except RlservoError as error:
                     yield _error_reply(error, content)
         finally:
-            core.close_stream(opening)
+            handler.close_stream(opening)
 
     def _begin(self, method: str, context: Any) -> Request:
         """Return a call's request, whose content is still to be read. Raises ForbiddenError, UnauthenticatedError."""
@@ -183,45 +182,45 @@ class Grpc:
             headers=headers,
         )
         try:
-            authorize(self._core.keys, presented_key(headers), Access.open if method in OPEN else Access.act)
+            authorize(self._handler.keys, presented_key(headers), Access.open if method in OPEN else Access.act)
         except RlservoError as error:
             peer = context.peer()
-            self._core.record_failure(request, error.code, error.message, peer=peer)
+            self._handler.record_failure(request, error.code, error.message, peer=peer)
             raise
         return request
 
 
-def _model_ready(core: Core, incoming: Incoming) -> Any:
+def _model_ready(handler: RequestHandler, incoming: Incoming) -> Any:
     message = _parse(messages.ModelReadyRequest, incoming[0])
-    return messages.ModelReadyResponse(ready=core.has(message.name, message.version or None))
+    return messages.ModelReadyResponse(ready=handler.has(message.name, message.version or None))
 
 
-def _model_metadata(core: Core, incoming: Incoming) -> Any:
+def _model_metadata(handler: RequestHandler, incoming: Incoming) -> Any:
     message = _parse(messages.ModelMetadataRequest, incoming[0])
-    return messages.ModelMetadataResponse(**oip_models.model_metadata(core, message.name, message.version or None))
+    return messages.ModelMetadataResponse(**oip_models.model_metadata(handler, message.name, message.version or None))
 
 
-def _model_config(core: Core, incoming: Incoming) -> Any:
+def _model_config(handler: RequestHandler, incoming: Incoming) -> Any:
     message = _parse(messages.ModelConfigRequest, incoming[0])
-    config = oip_config.model_config(core, message.name, message.version or None)
+    config = oip_config.model_config(handler, message.name, message.version or None)
     return messages.ModelConfigResponse(config=_numbered(config))
 
 
-def _model_statistics(core: Core, incoming: Incoming) -> Any:
+def _model_statistics(handler: RequestHandler, incoming: Incoming) -> Any:
     message = _parse(messages.ModelStatisticsRequest, incoming[0])
-    found = oip_config.statistics(core, message.name or None, message.version or None)
+    found = oip_config.statistics(handler, message.name or None, message.version or None)
     return messages.ModelStatisticsResponse(model_stats=found)
 
 
-def _index(core: Core, incoming: Incoming) -> Any:
+def _index(handler: RequestHandler, incoming: Incoming) -> Any:
     message = _parse(messages.RepositoryIndexRequest, incoming[0])
-    return messages.RepositoryIndexResponse(models=oip_models.repository_index(core, ready=message.ready))
+    return messages.RepositoryIndexResponse(models=oip_models.repository_index(handler, ready=message.ready))
 
 
-METHODS: dict[str, Callable[[Core, Incoming], Any]] = {
-    "ServerLive": lambda _core, _incoming: messages.ServerLiveResponse(live=True),
-    "ServerReady": lambda core, _incoming: messages.ServerReadyResponse(ready=core.ready),
-    "ServerMetadata": lambda _core, _incoming: messages.ServerMetadataResponse(**oip_models.server_metadata()),
+METHODS: dict[str, Callable[[RequestHandler, Incoming], Any]] = {
+    "ServerLive": lambda _handler, _incoming: messages.ServerLiveResponse(live=True),
+    "ServerReady": lambda handler, _incoming: messages.ServerReadyResponse(ready=handler.ready),
+    "ServerMetadata": lambda _handler, _incoming: messages.ServerMetadataResponse(**oip_models.server_metadata()),
     "ModelReady": _model_ready,
     "ModelMetadata": _model_metadata,
     "ModelConfig": _model_config,
@@ -233,13 +232,13 @@ METHODS: dict[str, Callable[[Core, Incoming], Any]] = {
 class OipGrpcCodec:
     """The protocol's bytes over gRPC (`Codec`)."""
 
-    def __init__(self, core: Core) -> None:
-        self._core = core
+    def __init__(self, handler: RequestHandler) -> None:
+        self._handler = handler
 
     async def receive(self, request: Request, source: Incoming) -> bytes:
         """Return the message. Raises TooLargeError."""
         content, remaining_s = source
-        limit = self._core.settings.max_body_bytes
+        limit = self._handler.settings.max_body_bytes
         if len(content) > limit:
             raise TooLargeError(f"the message is larger than {limit} bytes", {"max_bytes": limit})
         request.deadline_ms = None if remaining_s is None else remaining_s * 1e3
@@ -249,9 +248,9 @@ class OipGrpcCodec:
         """Fill the request. Raises RequestError, ObservationError, UnknownPolicyError."""
         message = _parse(messages.ModelInferRequest, content)
         request.policy, request.version = message.model_name, message.model_version or None
-        self._core.store().get(request.policy, request.version)
+        self._handler.store().get(request.policy, request.version)
         if len(content) > SMALL:
-            check_length(self._core.store(), request.policy, content, self._core.settings.max_batch)
+            check_length(self._handler.store(), request.policy, content, self._handler.settings.max_batch)
         for field in ("inputs", "outputs", "parameters", "raw_input_contents"):
             if len(getattr(message, field)) > SPARE:
                 raise TooLargeError(f"the message has more than {SPARE} {field}")
@@ -261,7 +260,7 @@ class OipGrpcCodec:
                 {"name": output.name, "parameters": _parameters(output.parameters)} for output in message.outputs
             ],
         }
-        oip_infer.fill_request(self._core, request, document, _inputs(message))
+        oip_infer.fill_request(self._handler, request, document, _inputs(message))
         request.reply_options.request_id = message.id
         request.reply_options.binary = bool(message.raw_input_contents)
 

@@ -44,10 +44,10 @@ from rlservo.serve_app.protocols.oip_tensors import (
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.access_checks import HEADERS
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.server.reply import reply_fields
+from rlservo.serve_app.server.reply_fields import reply_fields
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
-from rlservo.serve_app.wire.state_names import BELONGS_TO
+from rlservo.serve_app.wire.request_names import BELONGS_TO
 
 LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
 BINARY = b"application/octet-stream"
@@ -122,8 +122,8 @@ class ReplyOptions:
 class OipHttpCodec:
     """The protocol's bytes over HTTP (`Codec`): JSON and raw tensors in, JSON and raw tensors out."""
 
-    def __init__(self, core: Core) -> None:
-        self._core = core
+    def __init__(self, handler: RequestHandler) -> None:
+        self._handler = handler
 
     async def receive(self, request: Request, source: Receive) -> Body:
         """Return the body, compressed as it came. Raises MediaTypeError, and what `receive_body` raises.
@@ -136,24 +136,24 @@ class OipHttpCodec:
             raise MediaTypeError(
                 f"the content encoding '{encoding[:32].decode('latin-1')}' is not read: send gzip, deflate or none"
             )
-        return await receive_body(self._core, request.headers, source)
+        return await receive_body(self._handler, request.headers, source)
 
     def parse(self, request: Request, content: Body) -> None:
         """Fill the request. Raises RequestError, ObservationError, TooLargeError, UnknownPolicyError."""
-        contract = self._core.store().get(request.policy, request.version).contract
+        contract = self._handler.store().get(request.policy, request.version).contract
         length = _parse_length(request.headers.get(LENGTH_HEADER))
         encoding = request.headers.get(b"content-encoding", b"").strip().lower()
         if encoding not in (b"", b"identity"):
-            content = _decompress(content, encoding, self._core.settings.max_body_bytes)
+            content = _decompress(content, encoding, self._handler.settings.max_body_bytes)
         view = memoryview(content)
         if length == 0 and len(view):
             document: dict[str, Any] = {}
             inputs = {contract.inputs[0].name: _raw_input(contract, view)}
         else:
             if len(view) > SMALL:
-                check_json(self._core.store(), request.policy, view[:length], self._core.settings.max_batch)
+                check_json(self._handler.store(), request.policy, view[:length], self._handler.settings.max_batch)
             document, inputs, request.non_finite = _parse_document(view, length, request.policy)
-        fill_request(self._core, request, document, inputs)
+        fill_request(self._handler, request, document, inputs)
         request.reply_options.request_id = document.get("id")
 
     def encode(self, request: Request, decision: Decision) -> tuple[bytes, Headers]:
@@ -179,7 +179,9 @@ class OipHttpCodec:
         return content, headers
 
 
-def fill_request(core: Core, request: Request, document: Mapping[str, Any], inputs: dict[str, NDArray[Any]]) -> None:
+def fill_request(
+    handler: RequestHandler, request: Request, document: Mapping[str, Any], inputs: dict[str, NDArray[Any]]
+) -> None:
     """Fill a request of either transport, whose `parameters` and `outputs` are in `document`.
 
     A deadline that the request has already is the transport's own: the earlier one holds. Raises RequestError and
@@ -194,7 +196,7 @@ def fill_request(core: Core, request: Request, document: Mapping[str, Any], inpu
         identity = None  # there is no state that it could be of
     session_id = _session_id(sequence) if sequence else None
     # Of the session, or of the state of that identity, whatever the default is meanwhile.
-    policy = core.episodes.policy_of(core.store(), request.policy, request.version, session_id, identity)
+    policy = handler.episodes.policy_of(handler.store(), request.policy, request.version, session_id, identity)
     contract = policy.contract
     binary = bool(parse_flag(parameters, "binary_data_output")) if parameters else False
     outputs = _wanted_outputs(contract, document, parameters, binary=binary)

@@ -29,8 +29,8 @@ from rlservo.serve_app.protocols.oip_infer import (
 from rlservo.serve_app.protocols.oip_tensors import datatype_of, parse_flag
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL
-from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.listing import states_of
+from rlservo.serve_app.server.request_handler import RequestHandler
 
 TAG = "open inference protocol"
 MODEL, VERSION = "/v2/models/{name}", "/v2/models/{name}/versions/{version}"
@@ -75,11 +75,11 @@ class ModelState(BaseModel):
     reason: str
 
 
-def add_routes(app: FastAPI, core: Core, add: Callable[[PostRoute], None]) -> None:
+def add_routes(app: FastAPI, handler: RequestHandler, add: Callable[[PostRoute], None]) -> None:
     """Add /v2 to the application; `add` adds routes that FastAPI only documents."""
-    infer = HttpEndpoint("oip", OipHttpCodec(core), core)
-    _add_health(app, core)
-    _add_models(app, core)
+    infer = HttpEndpoint("oip", OipHttpCodec(handler), handler)
+    _add_health(app, handler)
+    _add_models(app, handler)
     body = {
         "application/json": {"schema": _request_schema()},
         "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
@@ -95,7 +95,7 @@ def _request_schema() -> dict[str, Any]:
     return schema
 
 
-def _add_health(app: FastAPI, core: Core) -> None:
+def _add_health(app: FastAPI, handler: RequestHandler) -> None:
     get = partial(add_route, app, Access.open, "GET")
 
     @get("/v2/health/live", "health", "The process answers (Open Inference Protocol)")
@@ -104,11 +104,11 @@ def _add_health(app: FastAPI, core: Core) -> None:
 
     @get("/v2/health/ready", "health", "The policies are loaded and proven", 503)
     async def ready() -> Response:
-        core.store()
+        handler.store()
         return json_response({"ready": True})
 
 
-def _add_models(app: FastAPI, core: Core) -> None:
+def _add_models(app: FastAPI, handler: RequestHandler) -> None:
     get = partial(add_route, app, Access.act, "GET")
 
     @get("/v2", TAG, "The server and the extensions it speaks", response_model=ServerMetadata)
@@ -117,19 +117,19 @@ def _add_models(app: FastAPI, core: Core) -> None:
 
     @get(MODEL, TAG, "A model", 404, 503, response_model=ModelMetadata)
     async def model(name: str) -> Response:
-        return json_response(model_metadata(core, name, None))
+        return json_response(model_metadata(handler, name, None))
 
     @get(VERSION, TAG, "One version of a model", 404, 503, response_model=ModelMetadata)
     async def model_version(name: str, version: str) -> Response:
-        return json_response(model_metadata(core, name, version))
+        return json_response(model_metadata(handler, name, version))
 
     @get(f"{MODEL}/ready", TAG, "The model is loaded and proven", 404, 503)
     async def model_ready(name: str) -> Response:
-        return json_response({"name": core.store().get(name).contract.name, "ready": True})
+        return json_response({"name": handler.store().get(name).contract.name, "ready": True})
 
     @get(f"{VERSION}/ready", TAG, "The version is loaded", 404, 503)
     async def model_version_ready(name: str, version: str) -> Response:
-        return json_response({"name": core.store().get(name, version).contract.name, "ready": True})
+        return json_response({"name": handler.store().get(name, version).contract.name, "ready": True})
 
     @add_route(
         app,
@@ -151,7 +151,7 @@ def _add_models(app: FastAPI, core: Core) -> None:
         if body:
             document, _ = parse_json(body, such_as='{"ready": true}')
             ready = bool(parse_flag(document, "ready"))
-        return json_response(repository_index(core, ready=ready))
+        return json_response(repository_index(handler, ready=ready))
 
 
 # What can be asked, as the protocol's documents; gRPC's messages have the same fields.
@@ -162,22 +162,22 @@ def server_metadata() -> dict[str, Any]:
     return {"name": "rlservo", "version": rlservo.__version__, "extensions": EXTENSIONS}
 
 
-def repository_index(core: Core, *, ready: bool = False) -> list[dict[str, str]]:
+def repository_index(handler: RequestHandler, *, ready: bool = False) -> list[dict[str, str]]:
     """Return every version of every model and how it stands; `ready` leaves the others out."""
-    core.store()
+    handler.store()
     return [
         {"name": name, "version": version, "state": STATES[state.state], "reason": state.reason}
-        for name, versions in states_of(core).items()
+        for name, versions in states_of(handler).items()
         for version, state in versions.items()
         if state.state == "ready" or not ready
     ]
 
 
-def model_metadata(core: Core, name: str, version: str | None) -> dict[str, Any]:
+def model_metadata(handler: RequestHandler, name: str, version: str | None) -> dict[str, Any]:
     """Return a model's inputs and outputs; `version` None is the default."""
-    policy = core.store().get(name, version)
+    policy = handler.store().get(name, version)
     contract = policy.contract
-    versions = core.store().versions(name) if version is None else (contract.version,)
+    versions = handler.store().versions(name) if version is None else (contract.version,)
 
     def described(tensor: TensorSpec) -> dict[str, Any]:
         return {"name": tensor.name, "datatype": datatype_of(tensor.dtype), "shape": tensor.shape}

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError
 from rlservo.serve_app.protocols.json_messages import json_type
-from rlservo.serve_app.runtime.elements import NUMBER_KINDS, find_unfit, to_array
-from rlservo.serve_app.runtime.observation_error_text import describe, first_non_number
+from rlservo.serve_app.runtime.input_numbers import NUMBER_KINDS, describe, find_unfit, first_non_number, to_array
 
 DTYPES: dict[str, np.dtype[Any]] = {
     "BOOL": np.dtype("?"),

@@ -30,7 +30,7 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
 )
 from rlservo.serve_app.episodes.request import Request, new_episode_id
-from rlservo.serve_app.episodes.sessions import Session
+from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.protocols.action_routes import StreamRoute
 from rlservo.serve_app.protocols.http_errors import encode_bug, error_answer, fail_stream, refuse_upgrade
 from rlservo.serve_app.protocols.json_messages import encode_json
@@ -44,8 +44,8 @@ from rlservo.serve_app.server.access_checks import (
     header_text,
     presented_key,
 )
-from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.metrics import IDLE
+from rlservo.serve_app.server.request_handler import RequestHandler
 
 logger = logging.getLogger(__name__)
 
@@ -57,9 +57,9 @@ SILENT = "silent for too long"
 REVOKED = (UnauthenticatedError, ForbiddenError)  # what the key of a stream may come to
 
 
-def add_routes(core: Core, add: Callable[[StreamRoute], None]) -> None:
+def add_routes(handler: RequestHandler, add: Callable[[StreamRoute], None]) -> None:
     """Add the streams to the application."""
-    stream = StreamEndpoint(core)
+    stream = StreamEndpoint(handler)
     for path in STREAM_PATHS:
         add(StreamRoute(path, stream))
 
@@ -67,13 +67,13 @@ def add_routes(core: Core, add: Callable[[StreamRoute], None]) -> None:
 class StreamEndpoint:
     """Answers WebSocket connections."""
 
-    def __init__(self, core: Core) -> None:
-        self._core = core
-        self._codec = MsgpackCodec(core)
+    def __init__(self, handler: RequestHandler) -> None:
+        self._handler = handler
+        self._codec = MsgpackCodec(handler)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection until the client closes it."""
-        core, headers = self._core, scope[HEADERS]
+        handler, headers = self._handler, scope[HEADERS]
         opening = Request(
             PROTOCOL,
             "",
@@ -86,9 +86,9 @@ class StreamEndpoint:
             opening.policy, opening.version = self._address(scope["path_params"])
             opening.stream_id = new_episode_id(opening.label)
             opening.label = opening.label or opening.stream_id  # where a canary runs they all get the same version
-            policy = core.store().choose(opening.policy, opening.version, opening.label)
+            policy = handler.store().choose(opening.policy, opening.version, opening.label)
         except RlservoError as error:
-            core.record_failure(opening, error.code, error.message)
+            handler.record_failure(opening, error.code, error.message)
             await refuse_upgrade(scope, receive, send, error)
             return
         await receive()  # websocket.connect
@@ -97,15 +97,15 @@ class StreamEndpoint:
         except OSError:  # the client has gone already
             return
         try:
-            core.open_stream(opening)
+            handler.open_stream(opening)
         except OverloadedError as error:
             await fail_stream(send, error_answer(error)[1])
             return
-        idle = IdleTimer(core.settings.stream_idle_s)
+        idle = IdleTimer(handler.settings.stream_idle_s)
         opening.stream = Session(policy) if policy.is_stateful else None
         try:
             await send(_binary(encode_metadata(policy.contract)))
-            conversation = _Conversation(core, self._codec, opening, scope, idle)
+            conversation = _Conversation(handler, self._codec, opening, scope, idle)
             while (message := await receive())["type"] != "websocket.disconnect":
                 await send(await conversation.answer(message))
         except asyncio.CancelledError:
@@ -113,27 +113,27 @@ class StreamEndpoint:
                 raise
             if sys.version_info >= (3, 11) and (task := asyncio.current_task()) is not None:
                 task.uncancel()  # Python counts cancellations
-            core.record_failure(opening, IDLE, SILENT)
+            handler.record_failure(opening, IDLE, SILENT)
             await _close_idle(send)
         except RlservoError as error:
             await fail_stream(send, error_answer(error)[1])
         except OSError:  # the client went while its reply was being sent: nobody is left to tell
             logger.debug("a stream's client went before its reply could be sent")
         except Exception:
-            core.record_bug(opening)
+            handler.record_bug(opening)
             await fail_stream(send, encode_bug())
         finally:
             idle.stop()
             if opening.stream is not None:
-                core.episodes.sessions.release(opening.stream)
-            core.close_stream(opening)
+                handler.episodes.sessions.release(opening.stream)
+            handler.close_stream(opening)
 
     def _address(self, params: Mapping[str, str]) -> tuple[str, str | None]:
         """Return (policy, version) that a path's parameters name; without any it is the default policy."""
         if "name" in params:
             return params["name"], params.get("version")
-        names = self._core.store().names
-        default = self._core.settings.default_policy or (names[0] if len(names) == 1 else None)
+        names = self._handler.store().names
+        default = self._handler.settings.default_policy or (names[0] if len(names) == 1 else None)
         if default is None:
             raise UnknownPolicyError(
                 f"this server has no default policy, but {', '.join(names)}: connect to /v1/policies/NAME/stream, or "
@@ -146,16 +146,18 @@ class StreamEndpoint:
 class _Conversation:
     """Answers the messages of one connection, one after the other."""
 
-    def __init__(self, core: Core, codec: MsgpackCodec, opening: Request, scope: Scope, idle: IdleTimer) -> None:
-        self._core, self._codec, self._opening, self._idle = core, codec, opening, idle
+    def __init__(
+        self, handler: RequestHandler, codec: MsgpackCodec, opening: Request, scope: Scope, idle: IdleTimer
+    ) -> None:
+        self._handler, self._codec, self._opening, self._idle = handler, codec, opening, idle
         self._keeps = KEEP in scope.get("query_string", b"").split(b"&")
-        self._key = StreamKey(core.keys, presented_key(scope[HEADERS]))
+        self._key = StreamKey(handler.keys, presented_key(scope[HEADERS]))
         self._timings: dict[str, float] | None = None
         self._is_fresh = False
 
     async def answer(self, message: Message) -> Message:
         """Return the reply. Raises RlservoError, which has been recorded, where it ends the stream."""
-        core, opening = self._core, self._opening
+        handler, opening = self._handler, self._opening
         request = Request(
             PROTOCOL,
             opening.policy,
@@ -174,16 +176,16 @@ class _Conversation:
             try:
                 self._key.check()
             except RlservoError as error:
-                core.record_failure(request, error.code, error.message)
+                handler.record_failure(request, error.code, error.message)
                 raise
-            reply = await core.answer(self._codec, request, message)
+            reply = await handler.answer(self._codec, request, message)
         except RlservoError as error:
             if not self._keeps or isinstance(error, REVOKED):  # which ends every stream
                 raise
             return {"type": "websocket.send", "text": _with_seq(error_answer(error)[1], request.seq)}
         taken_s = time.perf_counter() - request.received
         self._timings = {"prev_total_ms": taken_s * 1e3}
-        if taken_s > core.admission.max_wait_s:
+        if taken_s > handler.admission.max_wait_s:
             self._is_fresh = True  # the loop was blocked by this reply, and the next request comes after it
         return _binary(reply)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ActionError
 from rlservo.export.contract.spaces import LeafSpec
-from rlservo.serve_app.runtime.elements import first_element, rounding_slack
+from rlservo.serve_app.runtime.input_numbers import first_element, rounding_slack
 
 SMALL_ACTION = 32  # elements up to which a Python loop checks bounds faster than numpy does
 

@@ -38,7 +38,7 @@ from rlservo.serve_app.runtime.loading import (
     leaves_value_out,
     open_graph,
 )
-from rlservo.serve_app.runtime.observations import ObservationParser, Observed
+from rlservo.serve_app.runtime.observation_check import ObservationParser, Observed
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.recurrent_state import State, StateTensors
 from rlservo.serve_app.runtime.step_limit import StepLimit

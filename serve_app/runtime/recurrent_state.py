@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rlservo.export.contract.contract import REWARD, Contract, StateSpec
 from rlservo.export.contract.errors import RequestError
 from rlservo.export.contract.spaces import DiscreteSpec
-from rlservo.serve_app.runtime.elements import parse_array
+from rlservo.serve_app.runtime.input_numbers import parse_array
 
 State: TypeAlias = dict[str, NDArray[Any]]
 """Arrays `[batch, *shape]` by state name."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ActionError, RequestError, UsageError
 from rlservo.export.contract.spaces import BoxSpec, LeafSpec
-from rlservo.serve_app.runtime.elements import first_element, parse_array, rounding_slack
+from rlservo.serve_app.runtime.input_numbers import first_element, parse_array, rounding_slack
 from rlservo.serve_app.runtime.options import PolicyOptions
 
 ROUNDING = 1e-6  # relative to the step: what float32 may add to a step that is allowed

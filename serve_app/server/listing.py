@@ -9,9 +9,9 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from rlservo.serve_app.server.core import Core
-from rlservo.serve_app.versions.plan import Canary
-from rlservo.serve_app.versions.replica_versions import VersionState
+from rlservo.serve_app.server.request_handler import RequestHandler
+from rlservo.serve_app.versions.plan_follower import VersionState
+from rlservo.serve_app.versions.serving_plan import Canary
 
 
 class VersionStatus(BaseModel):
@@ -60,11 +60,11 @@ class PolicyList(BaseModel):
     behind: list[str] = Field(description="What this process could not follow, a sentence each; usually empty.")
 
 
-def describe(core: Core) -> dict[str, Any]:
+def describe(handler: RequestHandler) -> dict[str, Any]:
     """Return what `GET /v1/policies` answers, as `PolicyList`."""
-    store, control = core.store(), core.control
+    store, control = handler.store(), handler.control
     plan = control.plan if control is not None else None
-    states = states_of(core)
+    states = states_of(handler)
     policies = []
     for name in store.names:
         contract = store.get(name).contract
@@ -79,7 +79,7 @@ def describe(core: Core) -> dict[str, Any]:
                     "reason": state.reason,
                     "aliases": [alias for alias, target in arranged.aliases.items() if target == version],
                     "loaded_at": state.loaded_at,
-                    "requests": core.metrics.requests(name, version),
+                    "requests": handler.metrics.requests(name, version),
                 }
             )
         policies.append(
@@ -92,13 +92,13 @@ def describe(core: Core) -> dict[str, Any]:
                 "aliases": arranged.aliases,
                 "previous": {alias: earlier[-1] for alias, earlier in arranged.history.items() if earlier},
                 "canary": arranged.canary and arranged.canary.model_dump(),
-                "shadow": shadow and core.shadows.describe(name, shadow.of, shadow.version),
+                "shadow": shadow and handler.shadows.describe(name, shadow.of, shadow.version),
                 "version_states": versions,
             }
         )
     return {
         "policies": policies,
-        "replica": core.replica,
+        "replica": handler.replica,
         "generation": plan.generation if plan is not None else 0,
         "changed_at": plan and plan.changed_at,
         "changed_by": plan and plan.changed_by,
@@ -106,9 +106,9 @@ def describe(core: Core) -> dict[str, Any]:
     }
 
 
-def states_of(core: Core) -> dict[str, dict[str, VersionState]]:
+def states_of(handler: RequestHandler) -> dict[str, dict[str, VersionState]]:
     """Return how every version stands, by name."""
-    if core.control is not None:
-        return core.control.states()
-    store = core.store()
+    if handler.control is not None:
+        return handler.control.states()
+    store = handler.store()
     return {name: {version: VersionState("ready") for version in store.versions(name)} for name in store.names}

@@ -24,8 +24,8 @@ from rlservo.export.contract.errors import ObservationError, RequestError, Rlser
 from rlservo.export.contract.extras import needs_extra
 from rlservo.serve_app.episodes.request import Episode, Request, shorten_label
 from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
-from rlservo.serve_app.runtime.elements import parse_array
 from rlservo.serve_app.runtime.exploration import Draw
+from rlservo.serve_app.runtime.input_numbers import parse_array
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.row_count import count_rows

@@ -10,8 +10,8 @@ import logging
 
 import numpy as np
 
-from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.metrics import SUCCESS
+from rlservo.serve_app.server.request_handler import RequestHandler
 
 EVERY_S = 1.0
 MAX_ELEMENTS = 128  # an image's pixels are no series each: only the largest is shown
@@ -20,32 +20,32 @@ LARGEST = "largest"
 logger = logging.getLogger(__name__)
 
 
-async def exposition(core: Core) -> bytes:
+async def exposition(handler: RequestHandler) -> bytes:
     """Return all metrics as Prometheus reads them."""
-    sample(core)
-    return await asyncio.to_thread(core.metrics.text)  # thousands of series take a while
+    sample(handler)
+    return await asyncio.to_thread(handler.metrics.text)  # thousands of series take a while
 
 
-async def keep_sampled(core: Core) -> None:
+async def keep_sampled(handler: RequestHandler) -> None:
     """Sample until it is cancelled, for the other workers to read."""
     while True:
         try:
-            sample(core)
+            sample(handler)
         except Exception:  # a fault in one metric must not freeze all others
             logger.exception("the metrics could not be sampled")
         await asyncio.sleep(EVERY_S)
 
 
-def sample(core: Core) -> None:
+def sample(handler: RequestHandler) -> None:
     """Bring all counters and gauges up to date."""
     for part in (requests, versions, queue, keys, recording, sessions, shadows):
-        part(core)
-    core.metrics.sampled.end_round()
+        part(handler)
+    handler.metrics.sampled.end_round()
 
 
-def requests(core: Core) -> None:
+def requests(handler: RequestHandler) -> None:
     """Sample what was counted of requests, streams and episodes."""
-    metrics, show = core.metrics, core.metrics.sampled
+    metrics, show = handler.metrics, handler.metrics.sampled
     outcomes = {(*key, "ok"): answers.count for key, answers in metrics.answers.items()} | metrics.failures
     for (policy, version, protocol, code), count in outcomes.items():
         which = {"policy": policy, "version": version, "protocol": protocol, "code": code}
@@ -57,15 +57,15 @@ def requests(core: Core) -> None:
         show.counter("rlservo_episode_ends", "Episodes whose end clients reported (`final_status`)", count, **which)
 
 
-def versions(core: Core) -> None:
+def versions(handler: RequestHandler) -> None:
     """Sample the plan that this process follows, and of each version whether it is the default, batches and drift."""
-    show = core.metrics.sampled
-    if core.control is not None and core.control.plan is not None:
-        show.gauge("rlservo_plan_generation", "Plan that this process follows", core.control.plan.generation)
-    for name, version, policy in core.policies():
-        which, is_default = {"policy": name, "version": version}, version == core.store().default(name)
+    show = handler.metrics.sampled
+    if handler.control is not None and handler.control.plan is not None:
+        show.gauge("rlservo_plan_generation", "Plan that this process follows", handler.control.plan.generation)
+    for name, version, policy in handler.policies():
+        which, is_default = {"policy": name, "version": version}, version == handler.store().default(name)
         show.gauge("rlservo_policy_loaded", "1 for the default version, 0 for the others", is_default, **which)
-        batcher = core.store().batcher_of(policy)
+        batcher = handler.store().batcher_of(policy)
         if batcher is not None:
             runs = "Runs of the network for single observations"
             show.counter("rlservo_micro_batch_runs", runs, batcher.runs, **which)
@@ -85,37 +85,37 @@ def versions(core: Core) -> None:
             show.gauge("rlservo_observation_spread", spread, deviation, **which, element=element)
 
 
-def queue(core: Core) -> None:
+def queue(handler: RequestHandler) -> None:
     """Sample what waits for this process."""
-    admission, show = core.admission, core.metrics.sampled
+    admission, show = handler.admission, handler.metrics.sampled
     waited = "Most requests that waited for the processor at once, since the start"
     show.gauge("rlservo_queue_longest", waited, admission.longest)
     show.gauge("rlservo_requests_incoming", "Requests whose body is on its way", admission.incoming)
 
 
-def keys(core: Core) -> None:
+def keys(handler: RequestHandler) -> None:
     """Sample whether the API keys in use are those of their file, and the refusals by rate."""
-    show = core.metrics.sampled
+    show = handler.metrics.sampled
     current = "1 while the API keys in use are those of their file; 0: the file cannot be used, and older keys stay"
-    show.gauge("rlservo_api_keys_current", current, core.keys.current)
-    for label, count in core.keys.limits.refused.items():
+    show.gauge("rlservo_api_keys_current", current, handler.keys.current)
+    for label, count in handler.keys.limits.refused.items():
         show.counter("rlservo_rate_limited", "Requests refused because their key asked too often", count, key=label)
 
 
-def recording(core: Core) -> None:
+def recording(handler: RequestHandler) -> None:
     """Sample what is recorded and what is missing, where a recording was asked for."""
-    if core.recorder is None:
+    if handler.recorder is None:
         return
-    recorder, show = core.recorder.recorder, core.metrics.sampled
+    recorder, show = handler.recorder.recorder, handler.metrics.sampled
     goes_on = "1 while decisions are recorded; 0: the folder could not be written to"
     show.gauge("rlservo_recording", goes_on, recorder.failure is None)
     show.counter("rlservo_records_written", "Decisions, and what came of them, in the recording", recorder.written)
     show.counter("rlservo_records_dropped", "Decisions that the recording's buffer had no room for", recorder.dropped)
 
 
-def sessions(core: Core) -> None:
+def sessions(handler: RequestHandler) -> None:
     """Sample the episodes in memory."""
-    episodes, kept, show = core.episodes, core.episodes.sessions, core.metrics.sampled
+    episodes, kept, show = handler.episodes, handler.episodes.sessions, handler.metrics.sampled
     now = kept.count()
     for name in sorted({*now, *episodes.begun, *episodes.lost}):
         show.gauge("rlservo_sessions", "Sessions kept under an id in this process", now[name], policy=name)
@@ -128,8 +128,8 @@ def sessions(core: Core) -> None:
     show.gauge("rlservo_episodes_remembered", "Episodes in memory, in sessions and on streams", kept.rows)
 
 
-def shadows(core: Core) -> None:
+def shadows(handler: RequestHandler) -> None:
     """Sample the actions that shadows are not compared by."""
-    for policy, version, shadow, reason, count in core.shadows.missed():
+    for policy, version, shadow, reason, count in handler.shadows.missed():
         which = {"policy": policy, "version": version, "shadow": shadow, "reason": reason}
-        core.metrics.sampled.counter("rlservo_shadow_missed", "Actions without a comparison", count, **which)
+        handler.metrics.sampled.counter("rlservo_shadow_missed", "Actions without a comparison", count, **which)

@@ -8,12 +8,12 @@ from functools import partial
 from pathlib import Path
 
 from rlservo.export.contract.errors import UnavailableError
+from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.plan import ServedConfig
 from rlservo.serve_app.versions.plan_files import PlanFiles
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.policy_store import PolicyStore, load_policy
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
-from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.versions.serving_plan import ServedConfig
 from rlservo.serve_app.versions.version_loader import VersionLoader
 
 
@@ -25,7 +25,7 @@ def load_served(
     Raises UsageError or BundleError, and UnavailableError where a file system or storage does not answer.
     """
     settings = settings or ServerSettings.from_environment(environment={})
-    control = ReplicaVersions(version_loader(paths, settings), plan_files(paths, settings))
+    control = PlanFollower(version_loader(paths, settings), plan_files(paths, settings))
     asyncio.run(control.configure(config.model_dump(exclude_unset=True)))
     if control.store is None:
         raise UnavailableError("no policies were loaded")

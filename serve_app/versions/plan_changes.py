@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import ConflictError, RlservoError, UnknownPolicyError, UnknownVersionError
-from rlservo.serve_app.versions.plan import PRODUCTION, Canary, Plan, PolicyConfig, PolicyPlan, ServedConfig
+from rlservo.serve_app.versions.serving_plan import PRODUCTION, Canary, Plan, PolicyConfig, PolicyPlan, ServedConfig
 
 LONGEST_HISTORY = 16  # earlier versions of an alias that a rollback can go back through
 

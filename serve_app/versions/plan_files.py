@@ -21,9 +21,9 @@ from pydantic import ValidationError
 from rlservo.export.contract.bundle import CONTRACT_FILE
 from rlservo.export.contract.errors import UnavailableError
 from rlservo.export.contract.regular_files import blocks, open_regular
-from rlservo.serve_app.versions.bundle_cache import default_folder
-from rlservo.serve_app.versions.object_storage import ObjectStorage, is_uri, place_of
-from rlservo.serve_app.versions.plan import Plan
+from rlservo.serve_app.repository.bundle_cache import default_folder
+from rlservo.serve_app.repository.object_storage import ObjectStorage, is_uri, place_of
+from rlservo.serve_app.versions.serving_plan import Plan
 
 FOLDER = ".plan"
 FOLDER_POLL_S = 0.5

@@ -18,8 +18,8 @@ from rlservo.export.contract.errors import (
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.plan import Plan, PolicyPlan, ServedConfig, now
 from rlservo.serve_app.versions.plan_files import PlanFiles
+from rlservo.serve_app.versions.serving_plan import Plan, PolicyPlan, ServedConfig, now
 from rlservo.serve_app.versions.version_loader import VersionLoader
 
 logger = logging.getLogger(__name__)

@@ -28,7 +28,7 @@ from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.micro_batching import Batcher
-from rlservo.serve_app.versions.plan import PolicyPlan
+from rlservo.serve_app.versions.serving_plan import PolicyPlan
 
 
 class EpisodeStep(NamedTuple):

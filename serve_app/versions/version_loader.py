@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import weakref
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,11 +18,11 @@ from rlservo.export.contract.errors import (
     RlservoError,
     UnavailableError,
 )
+from rlservo.serve_app.repository.remote_repository import Key
+from rlservo.serve_app.repository.repository import Repository, raise_all
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.plan import PolicyPlan, ServedConfig
-from rlservo.serve_app.versions.remote_repository import Key
-from rlservo.serve_app.versions.repository import Repository, raise_all
+from rlservo.serve_app.versions.serving_plan import PolicyPlan, ServedConfig
 
 Loadable = tuple[str, str, str]  # (name, version, hash)
 Result = TypeVar("Result")
@@ -64,7 +65,7 @@ class VersionLoader:
 
     async def available(self, config: ServedConfig) -> dict[str, dict[str, str]]:
         """Return every bundle's hash by name and version, as `Repository.available`. Raises UnavailableError, too."""
-        return await self._look(self._repository.available, config)
+        return await self._look(partial(self._repository.available, needs_all=config.wants_all))
 
     async def look(self) -> tuple[dict[Key, str], list[RlservoError]]:
         """Return what the repository holds now and what is wrong with it, as `Repository.look`."""

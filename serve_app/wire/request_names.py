@@ -7,3 +7,13 @@ LABEL_HEADER = "x-session-id"
 
 LONGEST_STATUS = 64
 """Characters of a `final_status`."""
+
+MARK = "@"
+"""Begins each name in a carried recurrent state that is no array of the policy's graph; no recurrent state's name does.
+A client sends them back as they came."""
+
+BELONGS_TO = "@policy"
+"""`<name>/<version>#<the graph's hash>`: `Policy.identity`."""
+
+LAST_ACTION = "@last_action"
+"""Where the step from one action to the next is limited."""

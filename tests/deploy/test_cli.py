@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from command_line import rlservo, rlservo_here
-from rlservo.deploy.serve_commands import parse_env_arguments
+from rlservo.deploy.commands.environment_options import parse_env_arguments
 from rlservo.export.contract.bundle import load_bundle, read_contract
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.spaces import BoxSpec, Element

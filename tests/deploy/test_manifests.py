@@ -19,7 +19,7 @@ from compose_spec import PyCompose
 from rayservice_schema import POD_MONITOR, RAY_SERVICE
 from rlservo.serve_app.server.api_keys import Keys
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
-from rlservo.serve_app.versions.plan import ServedConfig
+from rlservo.serve_app.versions.serving_plan import ServedConfig
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 KUBERAY = DEPLOY / "kuberay"

@@ -91,7 +91,7 @@ def test_waiting_is_a_line_that_goes_away_on_a_terminal_and_leaves_results_where
 def test_list_of_policies_is_whole_at_80_columns() -> None:
     from rich.console import Console
 
-    from rlservo.deploy.policy_commands import _table
+    from rlservo.deploy.commands.policy import _table
 
     version = {
         "version": "12", "state": "serving", "aliases": ["production", "candidate"],

@@ -10,6 +10,7 @@ import pytest
 
 from rlservo.envs.ur.model import BASE_HEIGHT
 from rlservo.envs.ur.parameters import UR_PARAMETERS, URParameters, cycle_of
+from rlservo.envs.ur.server_state import state_dict
 from rlservo.envs.ur.simulation import URSimulation
 
 MODELS = list(UR_PARAMETERS)
@@ -221,7 +222,7 @@ def test_state_has_exactly_the_keys_of_the_mode_1object() -> None:
     sim = URSimulation("ur5")
     sim.place(START)
     sim.place_object(0, [0.3, 0.2, 0.5])
-    state = sim.state()
+    state = state_dict(sim, "1object")
     joints = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
     expected = {f"{j}_joint_{kind}" for j in joints for kind in ("position", "velocity")}
     expected |= {f"{frame}_to_ref_translation_{a}" for frame in ("ee", "object_0") for a in "xyz"}

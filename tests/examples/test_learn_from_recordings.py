@@ -14,7 +14,7 @@ import onnxruntime
 import pytest
 
 from bundles import SHIPPED
-from rlservo.export.commands.export import export_checkpoint
+from rlservo.export.export_checkpoint import export_checkpoint
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.recording.recorded_policy import WithRecording

@@ -12,7 +12,7 @@ import pytest
 from checkpoints import APP
 
 if TYPE_CHECKING:
-    from rlservo.export.commands.export import ExportResult
+    from rlservo.export.export_checkpoint import ExportResult
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -42,7 +42,7 @@ def exported_copy(exported: Callable[..., ExportResult], tmp_path: Path) -> Call
     """Return a function that gives a checkpoint's export, as `exported`, where a test may write to its files."""
 
     def copy(checkpoint: Path) -> ExportResult:
-        from rlservo.export.commands.export import ExportResult
+        from rlservo.export.export_checkpoint import ExportResult
 
         kept = exported(checkpoint)
         path = shutil.copytree(kept.path, tmp_path / "exported" / checkpoint.name / "1")

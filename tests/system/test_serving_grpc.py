@@ -188,7 +188,7 @@ def test_bytes_that_are_no_message_are_a_bad_request(call: Call) -> None:
 
 
 def test_a_deadline_that_has_passed_is_not_worked_for(ur5: Path) -> None:
-    from rlservo.serve_app.server.core import Core
+    from rlservo.serve_app.server.request_handler import RequestHandler
     from rlservo.serve_app.server.settings import ServerSettings
 
     store = load_store(ur5)
@@ -211,7 +211,7 @@ def test_a_deadline_that_has_passed_is_not_worked_for(ur5: Path) -> None:
 
     async def ask(remaining: float | None) -> list[Any]:
         context = Context()
-        service = Grpc(Core(lambda: store, ServerSettings()))
+        service = Grpc(RequestHandler(lambda: store, ServerSettings()))
         await service.answer("ModelInfer", (asked.SerializeToString(), remaining), context)
         return context.status
 

@@ -10,9 +10,9 @@ import fsspec
 import pytest
 
 from rlservo.export.checkpoints.remote import fetch
-from rlservo.export.commands.export import export_checkpoint
-from rlservo.export.commands.verify import verify_bundle
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError, UsageError
+from rlservo.export.export_checkpoint import export_checkpoint
+from rlservo.export.verify_bundle import verify_bundle
 
 
 @pytest.fixture(autouse=True)

@@ -20,8 +20,8 @@ from ray.rllib.policy.sample_batch import SampleBatch
 from rlservo.export.checkpoints.location import CheckpointFiles, locate_checkpoint
 from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.commands.export import ExportResult
 from rlservo.export.contract.errors import RequestError
+from rlservo.export.export_checkpoint import ExportResult
 from rlservo.export.recipe.trees import named_leaves
 from rlservo.export.rllib.restore import restore
 from rlservo.serve_app.runtime.policy import Policy

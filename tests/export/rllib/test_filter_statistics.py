@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from rlservo.export.checkpoints.location import CheckpointFiles
-from rlservo.export.commands.export import ExportResult, export_checkpoint
-from rlservo.export.commands.prune import prune_checkpoint
-from rlservo.export.commands.report import export_report
 from rlservo.export.contract.errors import CheckpointError, ParityError
+from rlservo.export.export_checkpoint import ExportResult, export_checkpoint
+from rlservo.export.prune_checkpoint import prune_checkpoint
+from rlservo.export.reports import export_report
 from rlservo.serve_app.runtime.policy import Policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*PPOTorchRLModule.*:DeprecationWarning")

@@ -18,12 +18,12 @@ import torch
 
 from rlservo.export.checkpoints.location import locate_checkpoint
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.commands.export import ExportResult, export_checkpoint
 from rlservo.export.contract.bundle import load_bundle
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import ObservationError, ParityError, RequestError, RlservoError, UnsupportedError
 from rlservo.export.contract.nested import build_action
 from rlservo.export.contract.spaces import leaf_specs
+from rlservo.export.export_checkpoint import ExportResult, export_checkpoint
 from rlservo.export.graph.onnx_file import run_onnx, write_onnx
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.torchscript_file import run_torchscript

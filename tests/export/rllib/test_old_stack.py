@@ -19,22 +19,22 @@ from numpy.typing import NDArray
 from rlservo.export.checkpoints.location import locate_checkpoint
 from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.commands.export import ExportResult, export_checkpoint
-from rlservo.export.commands.prune import prune_checkpoint
-from rlservo.export.commands.verify import verify_bundle
 from rlservo.export.contract.bundle import load_bundle
 from rlservo.export.contract.contract import Parity
 from rlservo.export.contract.errors import CheckpointError, ParityError, RequestError, RlservoError, UnsupportedError
+from rlservo.export.export_checkpoint import ExportResult, export_checkpoint
 from rlservo.export.graph.onnx_file import run_onnx, write_onnx
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.torchscript_file import run_torchscript
 from rlservo.export.proof.parity import GraphLoop, prove, record, record_perturbed
+from rlservo.export.prune_checkpoint import prune_checkpoint
 from rlservo.export.recipe.recipe import ObservationFilter, Preprocess, Recipe, StateLeaf
 from rlservo.export.recipe.runners import Loop, first_step
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.rllib.old_models import Registration, find_registrations
 from rlservo.export.rllib.restore import restore
 from rlservo.export.rllib.restored_policy import RestoredPolicy
+from rlservo.export.verify_bundle import verify_bundle
 from rlservo.serve_app.runtime.policy import Policy
 
 STATE = "policies/default_policy/policy_state.pkl"

@@ -19,7 +19,7 @@ import sys
 from rlservo.export.rllib import quick_import
 
 quick_import.prepare()
-from rlservo.export.commands.export import export_checkpoint
+from rlservo.export.export_checkpoint import export_checkpoint
 
 export_checkpoint("examples/checkpoints/ur5_positioning", sys.argv[1], notify=lambda _: None)
 unused = {"pandas", "ray.data", "ray.tune.tuner", "ray.rllib.algorithms.ppo.ppo"} & set(sys.modules)

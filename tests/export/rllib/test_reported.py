@@ -14,13 +14,13 @@ from gymnasium.spaces import Box
 
 from command_line import rlservo_here
 from rlservo.export.checkpoints.unpickle import unpickle
-from rlservo.export.commands.export import ExportResult, export_all_modules, export_checkpoint
-from rlservo.export.commands.verify import verify_bundle
 from rlservo.export.contract.bundle import read_contract
 from rlservo.export.contract.errors import CheckpointError, ObservationError, UnsupportedError
 from rlservo.export.contract.spaces import DictSpec
+from rlservo.export.export_checkpoint import ExportResult, export_all_modules, export_checkpoint
 from rlservo.export.recipe.recipe import Recipe, StateLeaf
 from rlservo.export.recipe.samples import draw_batches
+from rlservo.export.verify_bundle import verify_bundle
 from rlservo.serve_app.runtime.policy import Policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*PPOTorchRLModule.*:DeprecationWarning")

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import register, registry
 
-from rlservo.export.commands.renumber import renumber
 from rlservo.export.contract.bundle import load_bundle
 from rlservo.export.contract.errors import SessionLostError, UnavailableError
 from rlservo.export.contract.spaces import BoxSpec
+from rlservo.export.renumber_bundle import renumber
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.remote_policy import RemotePolicy
 from rlservo.serve_app.client.stream_client import StreamClient
@@ -26,10 +26,10 @@ from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.rollout.fallback import WithFallback
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.plan import PRODUCTION, Canary, PolicyPlan
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.serving_plan import PRODUCTION, Canary, PolicyPlan
 
 OBS = np.linspace(-1, 1, 27).astype(np.float32)
 CLIENTS = pytest.mark.parametrize("kind", [PolicyClient, StreamClient])
@@ -43,7 +43,7 @@ class Server:
     policies: list[Policy]
     store: PolicyStore
     url: str = ""
-    core: Core | None = None
+    handler: RequestHandler | None = None
 
     def move(self, production: str, canary: str | None = None, share: float = 0.5, without: str = "") -> None:
         kept = [policy for policy in self.policies if policy.contract.version != without]
@@ -58,8 +58,8 @@ class Server:
         return next(policy for policy in self.policies if policy.contract.version == version).act(OBS)
 
     def ends(self, name: str) -> dict[str, list[int]]:
-        assert self.core is not None
-        counts, versions = self.core.metrics.ends, {policy.contract.version for policy in self.policies}
+        assert self.handler is not None
+        counts, versions = self.handler.metrics.ends, {policy.contract.version for policy in self.policies}
         return {version: [counts.get((name, version, each), 0) for each in (True, False)] for version in versions}
 
 
@@ -73,7 +73,7 @@ def serve(served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[Call
             server.move("1")
             app = create_app(lambda: server.store, ServerSettings())
             server.url = f"http://127.0.0.1:{stack.enter_context(served(app))}"
-            server.core = app.state.core
+            server.handler = app.state.handler
             return server
 
         yield start
@@ -133,7 +133,7 @@ def test_canary_gets_its_share_of_recurrent_episodes(recurrents: Server, server_
             client.outcome(1.0, terminated=True, final_obs=obs)
             chosen.append(first)
     assert 10 <= chosen.count("2") <= 50
-    assert recurrents.core is not None and len(recurrents.core.episodes.sessions) == 0
+    assert recurrents.handler is not None and len(recurrents.handler.episodes.sessions) == 0
     ends = recurrents.ends("lstm_box")
     assert [sum(ends[version]) for version in "12"] == [chosen.count("1"), chosen.count("2")]
 

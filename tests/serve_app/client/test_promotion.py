@@ -42,10 +42,10 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Keys, new_key
-from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions import plan
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+from rlservo.serve_app.versions import serving_plan
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 KEY, LINE = new_key("boss", admin=True)
@@ -59,7 +59,7 @@ CONFIG = {"policies": {"ur5": {"aliases": {"production": "1"}}}}
 class Server:
     """A server with ur5 in 1, 2 (the same network), 3 (its actions leave the space) and 4 (another network)."""
 
-    control: ReplicaVersions
+    control: PlanFollower
     port: int = 0
     replica: str = "only"
     app: Any = None
@@ -73,9 +73,9 @@ class Server:
         self.app = create_app(lambda: control.store, SETTINGS, replica=self.replica, control=control)
 
     @property
-    def core(self) -> Core:
-        core: Core = self.app.state.core
-        return core
+    def handler(self) -> RequestHandler:
+        handler: RequestHandler = self.app.state.handler
+        return handler
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Answer as the application, and lie."""
@@ -119,14 +119,14 @@ class Server:
             headers = {"content-type": "application/json", "x-session-id": f"cell-{next(self.numbers)}"}
             connection.request("POST", "/v1/policies/ur5/act", json.dumps({"obs": OBS, **fields}), headers)
             connection.getresponse().read()
-            while self.core.shadows._waiting.qsize() > 30:  # more would be left out on a busy machine
+            while self.handler.shadows._waiting.qsize() > 30:  # more would be left out on a busy machine
                 time.sleep(0.01)
         connection.close()
-        while not self.core.shadows._waiting.empty():
+        while not self.handler.shadows._waiting.empty():
             time.sleep(0.01)
 
     def failed(self, version: str, code: str) -> int:
-        return self.core.metrics.failures.get(("ur5", version, "json", code), 0)
+        return self.handler.metrics.failures.get(("ur5", version, "json", code), 0)
 
 
 @pytest.fixture(scope="module")
@@ -302,14 +302,14 @@ def test_ends_of_sessions_that_chance_sends_anywhere_are_not_counted(server: Ser
     with server.admin() as admin:
         admin.canary("ur5", "2", 0.5)
     for version, expected in ((None, 0), ("2", 1)):
-        before = sum(server.core.metrics.ends.values())
+        before = sum(server.handler.metrics.ends.values())
         path = "act" if version is None else f"versions/{version}/act"
         connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
         document = json.dumps({"obs": OBS, "final_status": "success"})
         connection.request("POST", f"/v1/policies/ur5/{path}", document, {"content-type": "application/json"})
         assert connection.getresponse().status == 200
         connection.close()
-        assert sum(server.core.metrics.ends.values()) - before == expected
+        assert sum(server.handler.metrics.ends.values()) - before == expected
 
 
 @pytest.mark.parametrize(
@@ -591,7 +591,7 @@ def test_a_key_that_is_revoked_leaves_it_unfinished_and_the_way_on_is_said(
 
     def revoke() -> None:
         server.ask(200)
-        monkeypatch.setattr(server.core.keys, "accepted", Keys.from_settings(others))
+        monkeypatch.setattr(server.handler.keys, "accepted", Keys.from_settings(others))
 
     promotion = run()
     outcome = promotion(revoke)
@@ -794,4 +794,4 @@ def test_a_clock_that_was_set_meanwhile_adds_no_time(
 
 def test_the_alias_that_a_promotion_moves_is_the_one_that_servers_follow() -> None:
     """Two constants: the client imports nothing of the server."""
-    assert promotion.PRODUCTION == plan.PRODUCTION
+    assert promotion.PRODUCTION == serving_plan.PRODUCTION

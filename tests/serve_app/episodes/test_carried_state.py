@@ -25,8 +25,8 @@ from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.runtime.recurrent_state import StateTensors
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.plan import PolicyPlan
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.serving_plan import PolicyPlan
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 from stores import store_of
 
@@ -189,7 +189,7 @@ class Call:
 
 
 def test_so_does_grpc(server: Server, versions: dict[str, Policy]) -> None:
-    grpc = Grpc(server.app.state.core)
+    grpc = Grpc(server.app.state.handler)
 
     def infer(state: bytes | None, **parameters: Any) -> tuple[Any, Call]:
         request = messages.ModelInferRequest(model_name="leaky")

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from rlservo.export.contract.bundle import read_contract
-from rlservo.serve_app.client.episode_state import EpisodeState
+from rlservo.serve_app.client.client_episode import ClientEpisode
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
@@ -194,7 +194,7 @@ def test_our_client_begins_under_another_id_after_a_start_without_an_answer(
     bundle: Path, ur5: Path, reply: dict[str, Any]
 ) -> None:
     contract = read_contract(bundle if reply else ur5)
-    state = EpisodeState(server_state=True, is_stream=False)
+    state = ClientEpisode(server_state=True, is_stream=False)
     given_up, begun = (state.request_fields(contract, ()) for _ in range(2))
     assert given_up["reset"] and begun["reset"] and given_up["session_id"] != begun["session_id"]
     state.advance(reply, [0.0, 0.0], contract)

@@ -22,7 +22,7 @@ from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from storages import RedisServer, closing_sessions
@@ -335,5 +335,5 @@ def test_several_processes_without_a_store_refuse_sessions_and_name_the_ways_out
 @pytest.mark.parametrize("url", ["localhost:6379", "redis://:secret@127.0.0.1:port/0", "http://127.0.0.1"])
 def test_an_unusable_store_is_one_sentence_without_the_password(store: PolicyStore, url: str) -> None:
     with pytest.raises(UsageError, match="redis://") as caught:
-        Core(lambda: store, ServerSettings.from_environment({"session_store": url}, environment={}))
+        RequestHandler(lambda: store, ServerSettings.from_environment({"session_store": url}, environment={}))
     assert "secret" not in caught.value.message

@@ -16,7 +16,7 @@ import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
 
 from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.episodes.sessions import Sessions
+from rlservo.serve_app.episodes.memory_sessions import MemorySessions
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
@@ -33,7 +33,7 @@ MOST = 8
 class Server:
     def __init__(self, port: int, app: Any, client: httpx.Client) -> None:
         self.port = port
-        self.sessions: Sessions = app.state.core.episodes.sessions
+        self.sessions: MemorySessions = app.state.handler.episodes.sessions
         self._client = client
 
     def act(self, session_id: str, *, rows: int | None = None, policy: str = "leaky", **more: Any) -> tuple[int, Any]:

@@ -27,10 +27,10 @@ from rlservo.serve_app.protocols.status_page import FOLDER
 from rlservo.serve_app.server.api_keys import ACCESS, Access, access_of, grant, new_key
 from rlservo.serve_app.server.request_log import FIELDS, configure
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 Serve = Callable[[Any], AbstractContextManager[int]]
-Controlled = Callable[..., AbstractContextManager[ReplicaVersions]]
+Controlled = Callable[..., AbstractContextManager[PlanFollower]]
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -185,7 +185,7 @@ class Wire:
 @dataclass(frozen=True)
 class Served:
     app: PolicyApp
-    control: ReplicaVersions
+    control: PlanFollower
     port: int
     kind: str
 
@@ -505,7 +505,7 @@ def listening_log(settings: ServerSettings) -> Iterator[None]:
 
 def test_no_route_reads_a_body_beyond_the_limit(server: Served) -> None:
     """Announced or in chunks: refused before FastAPI, or whoever parses, holds it; with an admin key, too."""
-    limit = server.app.state.core.settings.max_body_bytes
+    limit = server.app.state.handler.settings.max_body_bytes
     chunk = b"%x\r\n" % 65536 + b" " * 65536 + b"\r\n"
     for method, path, access in paths(server.app):
         if path == "/" or path.endswith("/stream"):

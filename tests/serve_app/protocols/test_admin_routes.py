@@ -20,7 +20,7 @@ import pytest
 from typer.testing import CliRunner
 
 from rlservo.deploy.cli import app as command_line
-from rlservo.deploy.policy_commands import served_config
+from rlservo.deploy.commands.serve import served_config
 from rlservo.export.contract.errors import (
     ConflictError,
     ForbiddenError,
@@ -32,12 +32,12 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.client.admin_client import AdminClient, find_key
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
-from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.version_loader import VersionLoader
 from rlservo.serve_app.wire.admin_key_file import key_file, read_key
 from stores import plan_files
@@ -69,7 +69,7 @@ def key_path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def port(folder: Path, key_path: Path, served: Serve, tmp_path: Path) -> Iterator[int]:
     """A server whose operator has a key and which asks nobody else for one; ur5 in 1 and 2, production 1."""
     digest = "sha256:" + hashlib.sha256(read_key(key_path).encode()).hexdigest()
-    control = ReplicaVersions(VersionLoader(Repository([folder])), plan_files(tmp_path), replica="only")
+    control = PlanFollower(VersionLoader(Repository([folder])), plan_files(tmp_path), replica="only")
     config = {"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}},
                            "gridworld": {"versions": ["1"]}}, "unlisted": "ignore"}  # fmt: skip
     asyncio.run(control.configure(config))
@@ -165,7 +165,7 @@ def started(policies: Path, key_path: Path, served: Serve, tmp_path: Path) -> It
     for version in ("1", "2"):
         shutil.copytree(policies / "ur5" / version, root / "ur5" / version)
     digest = "sha256:" + hashlib.sha256(read_key(key_path).encode()).hexdigest()
-    control = ReplicaVersions(VersionLoader(Repository([root])), plan_files(root), replica="only")
+    control = PlanFollower(VersionLoader(Repository([root])), plan_files(root), replica="only")
     asyncio.run(control.configure({}))
     app = create_app(lambda: control.store, ServerSettings(operator_key=digest), replica="only", control=control)
     with served(app) as port, AdminClient(f"http://127.0.0.1:{port}", api_key=read_key(key_path)) as client:
@@ -225,7 +225,7 @@ def test_administration_needs_the_key_and_acting_does_not(port: int) -> None:
 
 
 def test_a_server_without_an_operator_lets_nobody_administer(folder: Path, served: Serve, tmp_path: Path) -> None:
-    control = ReplicaVersions(VersionLoader(Repository([folder / "ur5" / "1"])), plan_files(tmp_path))
+    control = PlanFollower(VersionLoader(Repository([folder / "ur5" / "1"])), plan_files(tmp_path))
     asyncio.run(control.configure({}))
     with served(create_app(lambda: control.store, ServerSettings(), control=control)) as open_port:
         with (

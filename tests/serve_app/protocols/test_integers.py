@@ -27,8 +27,8 @@ from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_grpc import FIELDS, OipGrpcCodec
 from rlservo.serve_app.protocols.oip_messages import messages
-from rlservo.serve_app.runtime.elements import parse_array
-from rlservo.serve_app.runtime.observations import ObservationParser
+from rlservo.serve_app.runtime.input_numbers import parse_array
+from rlservo.serve_app.runtime.observation_check import ObservationParser
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
@@ -201,7 +201,7 @@ def test_so_are_bytes(http: httpx.Client, app: FastAPI, policy: str, array: Any)
 
 
 def over_grpc(app: FastAPI, policy: str, datatype: str, array: Any, *, raw: bool) -> Any:
-    core = app.state.core
+    handler = app.state.handler
     asked = messages.ModelInferRequest(model_name=policy)
     given = asked.inputs.add(name="obs", datatype=datatype, shape=[1, 2])
     if raw:
@@ -209,7 +209,7 @@ def over_grpc(app: FastAPI, policy: str, datatype: str, array: Any, *, raw: bool
     else:
         getattr(given.contents, FIELDS[datatype]).extend(array.tolist())
     request = Request("grpc", "", None, time.perf_counter())
-    return asyncio.run(core.answer(OipGrpcCodec(core), request, (asked.SerializeToString(), None)))
+    return asyncio.run(handler.answer(OipGrpcCodec(handler), request, (asked.SerializeToString(), None)))
 
 
 def test_typed_contents_of_64_bits_are_kept_exactly(app: FastAPI) -> None:
@@ -232,7 +232,7 @@ def test_a_bool_is_a_byte_of_0_or_1(http: httpx.Client, app: FastAPI) -> None:
 
 @pytest.mark.parametrize("given", [[1.7, 1], [2**63, 1], [np.float32(2**24), 1], np.array([300, 1]), ["1", "1"]])
 def test_in_process_too(app: FastAPI, given: Any) -> None:
-    policy: Policy = app.state.core.store().get("uint8")
+    policy: Policy = app.state.handler.store().get("uint8")
     with pytest.raises(ObservationError, match=r"integer|number"):
         policy.act(given)
 

@@ -17,7 +17,7 @@ import websockets.sync.client
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -32,7 +32,7 @@ ROW = {"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": OBS}
 
 @pytest.fixture(scope="module")
 def port(
-    policies: Path, controlled: Callable[..., AbstractContextManager[ReplicaVersions]], served: Serve
+    policies: Path, controlled: Callable[..., AbstractContextManager[PlanFollower]], served: Serve
 ) -> Iterator[int]:
     with controlled(policies) as control:
         settings = ServerSettings(operator_key=LINE.split()[-1], default_policy="ur5")

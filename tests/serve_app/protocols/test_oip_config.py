@@ -22,8 +22,8 @@ from rlservo.serve_app.protocols.oip_grpc import _numbered
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.plan import PolicyPlan
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.serving_plan import PolicyPlan
 from stores import load_store
 
 OPTIONS = {
@@ -112,9 +112,9 @@ def test_every_input_and_output_of_the_metadata_is_in_the_configuration(ask: Ask
 def test_an_alias_means_its_version(store: PolicyStore) -> None:
     plan = PolicyPlan(versions={"1": "", "2": "", "10": ""}, aliases={"production": "2"})
     aliased = PolicyStore([store.get("ur5", version) for version in ("1", "2", "10")], {"ur5": plan})
-    core = create_app(lambda: aliased, ServerSettings()).state.core
-    assert [each["version"] for each in statistics(core, "ur5", "production")] == ["2"]
-    assert [each["version"] for each in statistics(core, "ur5")] == ["1", "2", "10"]
+    handler = create_app(lambda: aliased, ServerSettings()).state.handler
+    assert [each["version"] for each in statistics(handler, "ur5", "production")] == ["2"]
+    assert [each["version"] for each in statistics(handler, "ur5")] == ["1", "2", "10"]
 
 
 def tensor(rows: int) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def test_statistics_count_what_was_answered_over_every_protocol(ask: Ask) -> Non
 
 
 def test_a_run_that_several_requests_share_is_one_execution(store: PolicyStore) -> None:
-    core = create_app(lambda: store, ServerSettings()).state.core
+    handler = create_app(lambda: store, ServerSettings()).state.handler
     batcher = store.batcher_of(store.get("gathered"))
     assert batcher is not None
 
@@ -167,13 +167,13 @@ def test_a_run_that_several_requests_share_is_one_execution(store: PolicyStore) 
         batcher._several = True  # as if several had come in the turn before
         obs = np.zeros(27, np.float32)
         requests = [Request("oip", "gathered", None, time.perf_counter(), obs=obs) for _ in range(6)]
-        return await asyncio.gather(*map(core.decide, requests))
+        return await asyncio.gather(*map(handler.decide, requests))
 
     ran = batcher.runs
     for decision in asyncio.run(crowd()):
-        core.metrics.record_answer("oip", decision, 0.001)
+        handler.metrics.record_answer("oip", decision, 0.001)
     assert batcher.runs - ran == 1
-    (found,) = statistics(core, "gathered")
+    (found,) = statistics(handler, "gathered")
     assert (found["inference_count"], found["execution_count"]) == (6, 1)
 
 
@@ -191,8 +191,8 @@ def test_extensions_name_both(ask: Ask) -> None:
 
 def test_messages_take_every_field_of_the_documents(store: PolicyStore) -> None:
     """A field that a message lacks is a ValueError: the two forms cannot drift apart."""
-    core = create_app(lambda: store, ServerSettings()).state.core
+    handler = create_app(lambda: store, ServerSettings()).state.handler
     for name in store.names:
-        config = messages.ModelConfigResponse(config=_numbered(model_config(core, name, None))).config
+        config = messages.ModelConfigResponse(config=_numbered(model_config(handler, name, None))).config
         assert config.input[0].data_type in (9, 11) and config.name == name  # Triton's TYPE_INT64 and TYPE_FP32
-    assert len(messages.ModelStatisticsResponse(model_stats=statistics(core)).model_stats) == 7
+    assert len(messages.ModelStatisticsResponse(model_stats=statistics(handler)).model_stats) == 7

@@ -26,12 +26,12 @@ from rlservo.serve_app.protocols.status_page import FOLDER, prefers_html
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_changes import set_alias
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 from servers import over_uvicorn
 from stores import load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
-Controlled = Callable[..., AbstractContextManager[ReplicaVersions]]
+Controlled = Callable[..., AbstractContextManager[PlanFollower]]
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")

@@ -21,10 +21,10 @@ from browser import REBOUND, Browser
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 Serve = Callable[[Any], AbstractContextManager[int]]
-Controlled = Callable[..., AbstractContextManager[ReplicaVersions]]
+Controlled = Callable[..., AbstractContextManager[PlanFollower]]
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -138,7 +138,7 @@ def page_for(target: str) -> str:
 class Target:
     port: int
     pages: Pages
-    control: ReplicaVersions
+    control: PlanFollower
 
     def step(self, **more: Any) -> int:
         """Ask once, as the robot; return which step of its episode that was."""

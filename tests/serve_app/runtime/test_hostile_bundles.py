@@ -40,15 +40,15 @@ from rlservo.export.contract.regular_files import open_regular
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions import blocking_calls, plan_changes
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.plan import Plan, PolicyPlan, ServedConfig
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
-from rlservo.serve_app.versions.repository import Repository
+from rlservo.serve_app.versions.plan_follower import PlanFollower
+from rlservo.serve_app.versions.serving_plan import Plan, PolicyPlan, ServedConfig
 from rlservo.serve_app.versions.version_loader import VersionLoader
 from stores import plan_files
 
@@ -80,7 +80,7 @@ def patience(request: pytest.FixtureRequest) -> dict[str, float]:
 def url(root: Path, served: Serve, patience: dict[str, float]) -> Iterator[str]:
     """A server of ur5 in 1 and 2, and of gridworld."""
     loader = VersionLoader(Repository([root]), **patience)
-    control = ReplicaVersions(loader, plan_files(root), replica="r")
+    control = PlanFollower(loader, plan_files(root), replica="r")
     asyncio.run(control.configure({}))
     app = create_app(lambda: control.store, ServerSettings(operator_key=DIGEST), replica="r", control=control)
     with served(app) as port:
@@ -396,14 +396,14 @@ def test_a_process_whose_files_hang_follows_what_others_change_meanwhile(
     root: Path, tmp_path: Path, stall: Callable[[Path], Stalled], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rlservo.serve_app.versions.plan_files.FOLDER_POLL_S", 0.05)
-    monkeypatch.setattr("rlservo.serve_app.versions.replica_versions.RETRY_PERIOD_S", 0.3)
+    monkeypatch.setattr("rlservo.serve_app.versions.plan_follower.RETRY_PERIOD_S", 0.3)
     elsewhere = Path(shutil.copytree(root, tmp_path / "elsewhere"))
 
     async def run() -> None:
-        controls: list[ReplicaVersions] = []
+        controls: list[PlanFollower] = []
         for folder in (root, elsewhere):
             loader = VersionLoader(Repository([folder]), load_timeout_s=1)
-            controls.append(ReplicaVersions(loader, plan_files(root), replica=folder.name))
+            controls.append(PlanFollower(loader, plan_files(root), replica=folder.name))
         config = {"policies": {"ur5": {"versions": ["1"]}, "gridworld": {}}, "unlisted": "ignore"}
         for control in controls:
             await control.configure(config)

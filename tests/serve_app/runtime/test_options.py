@@ -17,7 +17,7 @@ from rlservo.export.contract.bundle import read_contract
 from rlservo.export.contract.errors import ActionError, ObservationError, UsageError
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.runtime.leaf_observations import LeafParser
+from rlservo.serve_app.runtime.observation_leaf_check import LeafParser
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings

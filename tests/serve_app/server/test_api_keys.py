@@ -22,8 +22,8 @@ from rlservo.serve_app.server.access_checks import AccessChecks, Hosts, find_key
 from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Access, Keys, Role, check_exposure, new_key
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.replica_versions import ReplicaVersions
 from rlservo.serve_app.wire.loopback import is_loopback
 from stores import load_store
 
@@ -165,7 +165,7 @@ def test_probes_and_documentation_need_no_key(port: int) -> None:
 
 
 def test_administration_wants_an_admin_key_even_where_no_key_is_asked_for(
-    ur5: Path, controlled: Callable[..., AbstractContextManager[ReplicaVersions]], served: Serve
+    ur5: Path, controlled: Callable[..., AbstractContextManager[PlanFollower]], served: Serve
 ) -> None:
     with controlled(ur5) as control:
         lines = f"{CELL_LINE},{ADMIN_LINE}"

@@ -109,9 +109,9 @@ def test_a_grpc_message_of_more_than_a_batch_needs_is_refused(app: FastAPI) -> N
     long = messages.ModelInferRequest(model_name="ur5", id="x" * 1_000_000)
     for message in (many, named, long):
         request = Request("grpc", "", None, time.perf_counter())
-        core = app.state.core
+        handler = app.state.handler
         with pytest.raises(TooLargeError):
-            asyncio.run(core.answer(OipGrpcCodec(core), request, (message.SerializeToString(), None)))
+            asyncio.run(handler.answer(OipGrpcCodec(handler), request, (message.SerializeToString(), None)))
 
 
 IMAGE = BoxSpec(shape=(84, 84, 4), dtype="uint8", low=0, high=255)

@@ -17,8 +17,8 @@ import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
 
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.core import Core
 from rlservo.serve_app.server.metrics import Metrics
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions import plan_changes
@@ -102,10 +102,10 @@ def test_a_version_that_is_unloaded_disappears_and_the_plan_is_numbered(
     for version in ("1", "2"):
         box_policy(tmp_path, version=version)
     with controlled(tmp_path, config={"policies": {"ur5": {"aliases": {"production": "1"}}}}) as control:
-        core = Core(lambda: control.store, ServerSettings(), replica="r", control=control)
+        handler = RequestHandler(lambda: control.store, ServerSettings(), replica="r", control=control)
 
         def loaded() -> dict[str, float]:
-            text = asyncio.run(exposition(core)).decode()
+            text = asyncio.run(exposition(handler)).decode()
             families = {family.name: family for family in text_string_to_metric_families(text)}
             assert families["rlservo_plan_generation"].samples[0].value == control.plan.generation
             return {each.labels["version"]: each.value for each in families["rlservo_policy_loaded"].samples}

@@ -139,7 +139,7 @@ def test_a_websockets_frames_count_and_one_too_many_ends_it_or_not(port: int, ap
         connect()
     assert caught.value.response.status_code == 429
     assert 900 < int(caught.value.response.headers["retry-after"]) <= 1000
-    app.state.core.keys.limits._buckets.clear()
+    app.state.handler.keys.limits._buckets.clear()
     with connect() as stream:
         stream.recv()
         for _ in range(BURST - 1):
@@ -195,7 +195,7 @@ def infer() -> bytes:
 
 def test_grpc_says_resource_exhausted(app: PolicyApp) -> None:
     async def calls() -> list[Context]:
-        service, contexts = Grpc(app.state.core), []
+        service, contexts = Grpc(app.state.handler), []
         for _ in range(BURST + 1):
             contexts.append(Context(LIMITED))
             await service.answer("ModelInfer", (infer(), None), contexts[-1])
@@ -213,7 +213,7 @@ def test_a_grpc_streams_messages_count_and_it_goes_on(app: PolicyApp) -> None:
             yield infer()
 
     async def replies() -> list[str]:
-        stream = Grpc(app.state.core).stream(requests(), context)
+        stream = Grpc(app.state.handler).stream(requests(), context)
         return [reply.error_message async for reply in stream]
 
     context = Context(LIMITED)

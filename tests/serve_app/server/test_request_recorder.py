@@ -29,7 +29,7 @@ from rlservo.serve_app.replay.replay import replay
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server import request_recorder
 from rlservo.serve_app.server.api_keys import new_key
-from rlservo.serve_app.server.core import Core
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.request_recorder import RequestRecorder
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import load_store
@@ -42,7 +42,7 @@ class Server:
     port: int
     folder: Path
     recorder: RequestRecorder
-    core: Core
+    handler: RequestHandler
 
     @property
     def url(self) -> str:
@@ -77,7 +77,7 @@ def start(recurrent: Path, ur5: Path, served: Serve, tmp_path: Path) -> Iterator
             store = load_store(recurrent, ur5, options=options)
             app = create_app(lambda: store, ServerSettings(record=str(tmp_path / "recorded"), **settings))
             server = Server(
-                stack.enter_context(served(app)), tmp_path / "recorded", app.state.core.recorder, app.state.core
+                stack.enter_context(served(app)), tmp_path / "recorded", app.state.handler.recorder, app.state.handler
             )
             stack.callback(server.recorder.close)
             return server
@@ -293,7 +293,7 @@ def test_a_session_keeps_no_request_alive(start: Callable[..., Server]) -> None:
     body = {"obs": [0.5, 0.25, 0.125], "session_id": "a", "reset": True}
     for seq in ({}, {"seq": 1}):
         assert server.act("lstm_box", body | seq)[0] == 200
-        session = server.core.episodes.sessions.find("lstm_box", "a")
+        session = server.handler.episodes.sessions.find("lstm_box", "a")
         assert session is not None and (session.answer is None or session.answer.inputs == {})
     assert session.answer is not None
 

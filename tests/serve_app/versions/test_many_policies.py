@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from rlservo.export.contract.bundle import read_contract
-from rlservo.serve_app.versions import repository
-from rlservo.serve_app.versions.plan import ServedConfig
+from rlservo.serve_app.repository import repository
 from stores import load_store
 
 
@@ -37,7 +36,7 @@ def test_bundle_that_has_moved_since_the_look_is_found(discrete_policy: Callable
     discrete_policy(here, name="grid")
     discrete_policy(there, name="other")
     places = repository.Repository([here, there])
-    digest = places.available(ServedConfig())["grid"]["1"]
+    digest = places.available(needs_all=True)["grid"]["1"]
     (here / "grid").rename(there / "grid")
     with places.fetch("grid", "1", digest) as folder:
         assert folder == there / "grid" / "1"

@@ -223,8 +223,8 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
             return [unpack(await one.recv())["actions"] for one in opened]
 
     async def calls() -> list[Any]:
-        core = create_app(lambda: store, ServerSettings()).state.core
-        codec, answer = OipGrpcCodec(core), core.answer
+        handler = create_app(lambda: store, ServerSettings()).state.handler
+        codec, answer = OipGrpcCodec(handler), handler.answer
         asked = messages.ModelInferRequest(model_name="ur5")
         asked.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
         requests = []
@@ -287,7 +287,7 @@ def test_a_warning_is_in_the_reply_to_what_it_is_about(bounded: Path) -> None:
 
 
 def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(store: PolicyStore) -> None:
-    core = create_app(lambda: store, ServerSettings()).state.core
+    handler = create_app(lambda: store, ServerSettings()).state.handler
 
     async def slow() -> None:
         time.sleep(0.05)  # another request of the same turn
@@ -296,7 +296,7 @@ def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(s
         now = time.perf_counter()
         hurried = Request("json", "ur5", None, now, obs=OBS[0], deadline_ms=30.0)
         patient = Request("json", "ur5", None, now, obs=OBS[1], deadline_ms=30_000.0)
-        decide = core.decide
+        decide = handler.decide
         return await asyncio.gather(decide(hurried), decide(patient), slow(), return_exceptions=True)
 
     with watched(store, store.get("ur5")) as sizes:

@@ -8,8 +8,8 @@ import pytest
 
 from rlservo.export.contract.errors import ConflictError, UnknownPolicyError, UnknownVersionError, UsageError
 from rlservo.serve_app.versions import plan_changes
-from rlservo.serve_app.versions.plan import Canary, Plan, PolicyPlan, ServedConfig
 from rlservo.serve_app.versions.plan_changes import plan_of
+from rlservo.serve_app.versions.serving_plan import Canary, Plan, PolicyPlan, ServedConfig
 
 AVAILABLE = {"ur5": {"1": "a", "2": "b", "10": "c"}, "mir": {"1": "d"}}
 

@@ -1,0 +1,1 @@
+"""Commands of `rlservo`, a file for each: options and printing; the work is in the other folders."""

@@ -1,0 +1,98 @@
+"""The command `rlservo cockpit`: options here, work in rlservo.deploy.cockpit."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.commands.environment_options import parse_env_arguments
+from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
+
+if TYPE_CHECKING:
+    from rlservo.deploy.cockpit.policies import PolicySource
+
+PORT = 8090
+
+
+def cockpit(
+    url: Annotated[str | None, typer.Option(help="Server to ask for actions.")] = None,
+    policy: Annotated[str | None, typer.Option(help="Policy name; the first one by default.")] = None,
+    version: Annotated[str | None, typer.Option(help="Version or alias; by default the one that clients get.")] = None,
+    bundle: Annotated[
+        Path | None, typer.Option(help="Act in process with this bundle, or with those of this folder.")
+    ] = None,
+    env: Annotated[
+        str | None, typer.Option(help="Environment id (rlservo/...); by default the one the policy was trained in.")
+    ] = None,
+    env_arg: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
+    ] = None,
+    recording: Annotated[
+        Path | None, typer.Option(help="Show a recording (.mcap); with --bundle also what that would have done.")
+    ] = None,
+    robot_server: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Show a robot server's simulation while a client drives it.")
+    ] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Of the page, on 127.0.0.1.")] = PORT,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the first episode.")] = None,
+    api_key: Annotated[
+        str | None, typer.Option(envvar="RLSERVO_API_KEY", help="Rather in the variable: others see arguments.")
+    ] = None,
+) -> None:
+    """Show in the browser how a policy drives a robot.
+
+    Drag its target, and read what the policy sees. Ctrl-C ends it.
+
+    Example: `rlservo cockpit --url http://127.0.0.1:8000 --policy ur5`
+    """
+    shown = [url, recording, robot_server, None if recording is not None else bundle]
+    if sum(each is not None for each in shown) != 1:
+        raise UsageError(
+            "give one of --url (a server), --bundle (in process), --recording (with or without --bundle) and "
+            "--robot-server"
+        )
+    arguments = parse_env_arguments(env_arg or [])
+    with needs_extra("cockpit"):
+        from rlservo.deploy.cockpit.run import run_drive, run_playback, run_watch
+
+    with terminal.ends_like_ctrl_c(), contextlib.suppress(KeyboardInterrupt):
+        if recording is not None:
+            run_playback(recording, bundle=bundle, policy=policy, env_id=env, port=port, on_ready=_tell)
+            return
+        if robot_server is not None:
+            run_watch(robot_server, env_arguments=arguments, port=port, on_ready=_tell)
+            return
+        run_drive(
+            _source(url, bundle, api_key),
+            policy=policy,
+            version=version,
+            env_id=env,
+            env_arguments=arguments,
+            port=port,
+            seed=seed,
+            on_ready=_tell,
+        )
+
+
+def drive_on_page(url: str, port: int) -> None:
+    """Show what a server's policies drive, on a page, until an interrupt."""
+    with needs_extra("cockpit"):
+        from rlservo.deploy.cockpit.run import run_drive
+
+    source = _source(url, None, None)
+    run_drive(source, policy=None, version=None, env_id=None, env_arguments={}, port=port, seed=None, on_ready=_tell)
+
+
+def _source(url: str | None, bundle: Path | None, api_key: str | None) -> PolicySource:
+    from rlservo.deploy.cockpit.policies import BundledPolicies, ServedPolicies
+
+    return ServedPolicies(str(url), api_key=api_key) if bundle is None else BundledPolicies(bundle)
+
+
+def _tell(address: str) -> None:
+    terminal.output().print(f"cockpit at {address}; Ctrl-C stops", highlight=False, soft_wrap=True)

@@ -1,0 +1,35 @@
+"""Options of an environment that commands make: its constructor's arguments, and how it draws without a display."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Any
+
+from rlservo.export.contract.errors import UsageError
+
+
+def parse_env_arguments(pairs: list[str]) -> dict[str, Any]:
+    """Parse NAME=VALUE pairs; a value that is not JSON is a string."""
+    arguments: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or not name.isidentifier():
+            raise UsageError(f"--env-arg {pair!r}: expected NAME=VALUE, for example ur_model=ur10e")
+        try:
+            arguments[name] = json.loads(value)
+        except json.JSONDecodeError:
+            arguments[name] = value
+    return arguments
+
+
+def choose_gl_backend() -> None:
+    """Let MuJoCo render off screen where there is no display. It must be said before mujoco is imported."""
+    if "MUJOCO_GL" in os.environ or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        return
+    from ctypes.util import find_library  # it imports subprocess
+
+    for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
+        if find_library(library):
+            os.environ["MUJOCO_GL"] = backend
+            return

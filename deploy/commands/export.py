@@ -1,0 +1,135 @@
+"""The commands `rlservo export` and `rlservo prune`."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.terminal import Json, note, print_json
+from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
+
+
+def export(
+    checkpoint: Annotated[
+        str, typer.Argument(help="RLlib checkpoint folder (of a Tune trial the newest), or a URI such as s3://...")
+    ],
+    out: Annotated[Path, typer.Option(help="Repository folder; the bundle goes to OUT/<name>/<version>/.")],
+    name: Annotated[str | None, typer.Option(help="Policy name; the environment's by default.")] = None,
+    version: Annotated[str | None, typer.Option(help="Integer or x.y.z; the next integer by default.")] = None,
+    description: Annotated[str, typer.Option(help="A sentence for people, kept in the contract.")] = "",
+    module_id: Annotated[
+        str | None, typer.Option(help="Which RLModule (old API stack: policy); needed when there are several.")
+    ] = None,
+    all_modules: Annotated[
+        bool, typer.Option("--all-modules", help="Export every module, each to OUT/<name>-<module>; all or none.")
+    ] = False,
+    agent_id: Annotated[
+        str | None, typer.Option(help="For which agent, where a module serves several that are filtered differently.")
+    ] = None,
+    app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+    value: Annotated[
+        bool, typer.Option("--value/--no-value", help="Whether the bundle has the value head, too.")
+    ] = True,
+    untrained_filter: Annotated[
+        bool,
+        typer.Option(
+            "--untrained-filter", help="Export even if the observation filter's statistics are empty or evaluation's."
+        ),
+    ] = False,
+    metric: Annotated[
+        str | None, typer.Option(help="Of a Tune trial or experiment, the checkpoint with the best of this metric.")
+    ] = None,
+    mode: Annotated[
+        Literal["max", "min"], typer.Option(help="Whether the best is the largest or the smallest.")
+    ] = "max",
+    as_json: Json = False,
+) -> None:
+    """Turn an RLlib checkpoint into a policy bundle. It is proven equal to RLlib's own actions, or nothing is written.
+
+    Examples: `rlservo export examples/checkpoints/ur_positioning --out policies`,
+    `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
+    """
+    start = time.perf_counter()
+    if all_modules and (module_id is not None or agent_id is not None):
+        raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
+    with terminal.status("importing") as show, ExitStack() as fetching:
+        with needs_extra("train", "ray", "torch", "onnx", "onnxscript", "gymnasium"):
+            from rlservo.export.rllib import quick_import
+
+            quick_import.prepare()
+            from rlservo.export.checkpoints.experiment import best_checkpoint
+            from rlservo.export.checkpoints.remote import fetch
+            from rlservo.export.export_checkpoint import LOADING_RUNS_CODE, export_all_modules, export_checkpoint
+            from rlservo.export.reports import export_report, peak_memory_mb
+
+        if metric is not None:
+            note(LOADING_RUNS_CODE.format(path=checkpoint))
+            local = fetching.enter_context(fetch(checkpoint, show))
+            best = best_checkpoint(local, metric, mode, app_dir=app_dir, notify=note)
+            note(f"{best.path} has the {mode} {metric}: {best.score:g}")
+            checkpoint = str(best.path)
+        if all_modules:
+            results = export_all_modules(
+                checkpoint,
+                out,
+                name=name,
+                version=version,
+                description=description,
+                app_dir=app_dir,
+                value=value,
+                untrained_filter=untrained_filter,
+                notify=note,
+                progress=show,
+            )
+        else:
+            one = export_checkpoint(
+                checkpoint,
+                out,
+                name=name,
+                version=version,
+                description=description,
+                module_id=module_id,
+                agent_id=agent_id,
+                app_dir=app_dir,
+                value=value,
+                untrained_filter=untrained_filter,
+                notify=note,
+                progress=show,
+            )
+            results = [one]
+    cost = {"seconds": round(time.perf_counter() - start, 2), "peak_memory_mb": round(peak_memory_mb())}
+    if as_json:
+        documents = [
+            {"path": str(result.path), "contract": result.contract.model_dump(mode="json"), **cost}
+            for result in results
+        ]
+        print_json(documents if all_modules else documents[0])
+        return
+    for result in results:
+        terminal.output().print(export_report(result.contract), soft_wrap=True)
+        terminal.output().print(f"written   {result.path}", markup=False, highlight=False, soft_wrap=True)
+    terminal.output().print(
+        f"cost      {cost['seconds']:.1f} s, {cost['peak_memory_mb']} MB at the peak", highlight=False
+    )
+
+
+def prune(
+    checkpoint: Annotated[str, typer.Argument(help="RLlib checkpoint folder or URI.")],
+    out: Annotated[Path, typer.Option(help="Folder to make; it must not exist.")],
+    module_id: Annotated[str | None, typer.Option(help="Which RLModule; needed when there are several.")] = None,
+    app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+) -> None:
+    """Copy only what export needs out of a checkpoint. The copy is small enough to commit or to mail.
+
+    Example: `rlservo prune runs/PPO-.../checkpoint_000015 --out examples/checkpoints/mine`
+    """
+    with needs_extra("train", "ray", "torch", "onnx", "onnxscript", "gymnasium"):
+        from rlservo.export.prune_checkpoint import prune_checkpoint
+
+    prune_checkpoint(checkpoint, out, module_id=module_id, app_dir=app_dir, notify=note)

@@ -1,0 +1,151 @@
+"""The commands `rlservo log ...`: recordings shown, converted, repaired and drawn."""
+
+from __future__ import annotations
+
+import shlex
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.terminal import Json, print_json
+from rlservo.export.contract.extras import needs_extra
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.recording.summary import Summary
+
+log = typer.Typer(no_args_is_help=True, help="Show, convert and draw recordings.")
+
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), or folders of them.")]
+Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder: its newest version.")]
+PolicyName = Annotated[
+    str | None, typer.Option("--policy", help="Which recorded policy, by name; needed where it is not clear.")
+]
+
+
+class Format(str, Enum):
+    """What a recording is converted to."""
+
+    parquet = "parquet"
+    lerobot = "lerobot"
+    minari = "minari"
+
+
+@log.command()
+def info(files: Files, as_json: Json = False) -> None:
+    """Show what is in recordings, and what is missing.
+
+    Example: `rlservo log info recordings`
+    """
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.reader import Recording
+        from rlservo.serve_app.recording.summary import summarise_recording
+
+    summary = summarise_recording(Recording(files))
+    if as_json:
+        print_json(summary.as_dict())
+    else:
+        _print_summary(summary)
+
+
+@log.command()
+def export(
+    files: Files,
+    to: Annotated[Format, typer.Option("--to", help="The format.")],
+    out: Annotated[Path, typer.Option(help="New file (parquet), or new folder.")],
+    policy: PolicyName = None,
+    task: Annotated[str | None, typer.Option(help="For LeRobot: a sentence that says what the robot does.")] = None,
+) -> None:
+    """Convert recordings to Parquet, LeRobotDataset v3.0 or Minari.
+
+    Example: `rlservo log export run.mcap --to parquet --out run.parquet`
+    """
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.lerobot_export import export_lerobot
+        from rlservo.serve_app.recording.minari_export import PATH_VARIABLE, export_minari
+        from rlservo.serve_app.recording.parquet_export import export_parquet
+        from rlservo.serve_app.recording.reader import Recording
+
+    recording = Recording(files)
+    if to is Format.parquet:
+        line = f"written {out}: {export_parquet(recording, out, name=policy)} decisions"
+    elif to is Format.lerobot:
+        episodes, frames = export_lerobot(recording, out, name=policy, task=task)
+        line = f"written {out}: {episodes} episodes, {frames} frames"
+    else:
+        identity, episodes, env = export_minari(recording, out, name=policy)
+        made_in = f"of {env}" if env else "of no environment that is installed here"
+        place = f"{PATH_VARIABLE}={shlex.quote(str(out.resolve()))}"
+        line = f"written {out}: {episodes} episodes {made_in}; {place}, then minari.load_dataset({identity!r})"
+    _line(line)
+
+
+@log.command()
+def repair(
+    file: Annotated[Path, typer.Argument(metavar="FILE", exists=True, dir_okay=False, help="A recording (.mcap).")],
+    out: Annotated[Path, typer.Option(help="New file.")],
+) -> None:
+    """Copy a recording that was cut off into a whole file.
+
+    To its last whole chunk, with an end and an index, which other programs need. FILE stays as it is.
+
+    Example: `rlservo log repair run.mcap --out whole.mcap`
+    """
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.repair import repair_recording
+
+    facts = repair_recording(file, out)
+    _line(f"written {out}: {facts.messages} messages{f'; {file} is {facts.damage}' if facts.damage else ''}")
+
+
+@log.command()
+def plot(
+    files: Files,
+    episode: Annotated[int, typer.Option(min=0, help="Which episode, from 0, in the order they ended.")] = 0,
+    out: Annotated[Path, typer.Option(help="The picture: .png, .svg, .pdf.")] = Path("episode.png"),
+) -> None:
+    """Draw one recorded episode.
+
+    Observations and actions by name, rewards, latency and warnings.
+
+    Example: `rlservo log plot run.mcap --episode 3 --out episode.png`
+    """
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.plot import plot_episode
+        from rlservo.serve_app.recording.reader import Recording
+
+    drawn = plot_episode(Recording(files), episode, out)
+    terminal.output().print(f"written {out}: {len(drawn)} decisions", markup=False, highlight=False, soft_wrap=True)
+
+
+def _print_summary(summary: Summary) -> None:
+    for file in summary.files:
+        state = "whole" if file["whole"] else "being written" if file["being_written"] else "without an end"
+        notes = [f"{file['messages']} messages", state]
+        if file["dropped"]:
+            notes.append(f"{file['dropped']} records were dropped")
+        if file["clock_jumps"]:
+            notes.append(f"the wall clock jumped {file['clock_jumps']} times")
+        if file["damage"]:
+            notes.append(file["damage"])
+        _line(f"{file['path']}: {', '.join(notes)}")
+    for policy in summary.policies:
+        _line(f"{policy.name} version {policy.version}  graph {policy.graph_sha256[:12] or 'not known'}")
+        span = policy.last_s - policy.first_s
+        _line(f"  {policy.episodes} episodes ({policy.ended} ended), {policy.decisions} decisions over {span:.1f} s")
+        if policy.endings:
+            _line(f"  endings: {', '.join(f'{word}: {count}' for word, count in policy.endings.items())}")
+        if policy.return_mean is not None:
+            _line(f"  mean return {policy.return_mean:.4g}")
+        if policy.latency_p50_ms is not None:
+            _line(f"  latency p50 {policy.latency_p50_ms:.3g} ms, p99 {policy.latency_p99_ms:.3g} ms")
+        _line(
+            f"  explored {policy.explored}, warnings {policy.warnings}, without an action {policy.without_action}, "
+            f"fallbacks {policy.fallbacks}, episodes with a gap {policy.gaps}"
+        )
+
+
+def _line(text: str) -> None:
+    terminal.output().print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,254 @@
+"""The commands `rlservo policy ...`: what is served, by a server or by the repository itself."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.commands.serve import split_pair, split_share
+from rlservo.deploy.terminal import Json, print_json
+from rlservo.export.contract.extras import needs_extra
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from rlservo.serve_app.client.admin_client import AdminClient
+    from rlservo.serve_app.server.offline_commands import OfflineCommands
+
+policy = typer.Typer(
+    help="Say what is served. Versions, aliases, rollback, canary, shadow; by a server, or by the repository itself.",
+    no_args_is_help=True,
+)
+
+Url = Annotated[str, typer.Option(help="The server.", envvar="RLSERVO_URL")]
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(help="File with the admin key; else RLSERVO_ADMIN_KEY, else the one 'rlservo serve' wrote here."),
+]
+Repository = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="DIR|URI",
+        help="Without a server: where 'rlservo serve' reads; all its places, in its order. Every server follows.",
+    ),
+]
+Name = Annotated[str, typer.Argument(help="Policy name.")]
+LOCAL = "http://127.0.0.1:8000"
+
+
+@policy.command("list")
+def list_policies(
+    url: Url = LOCAL, key_file: KeyFile = None, repository: Repository = None, as_json: Json = False
+) -> None:
+    """Show what is served, and since when. Of a repository also what it holds beside that.
+
+    Example: `rlservo policy list`
+    """
+    if repository:
+        listing = _repository(repository).listing()
+        if as_json:
+            print_json(listing)
+            return
+        _print_repository(listing)
+        return
+    with _client(url, key_file) as client:
+        replicas = client.replicas()
+        shown = {replica["replica"] for replica in replicas}
+        others = {process: number for process, number in client.plans().items() if process not in shown}
+    if as_json:
+        print_json([*replicas, *({"replica": process, "generation": number} for process, number in others.items())])
+        return
+    for replica in replicas:
+        terminal.output().print(_table(replica))
+        for sentence in replica["behind"]:
+            terminal.output().print(f"behind: {sentence}", style="red", markup=False, highlight=False, soft_wrap=True)
+    for process, number in others.items():
+        terminal.output().print(f"process {process}: plan {number}", markup=False, highlight=False)
+
+
+@policy.command()
+def load(
+    name: Name,
+    version: Annotated[str | None, typer.Argument(help="The repository's newest by default.")] = None,
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    repository: Repository = None,
+    as_json: Json = False,
+) -> None:
+    """Load a version and prove it, ready for an alias.
+
+    What clients get stays as it is until then; of a policy that is not served at all, the version loaded first is in
+    use at once.
+
+    Example: `rlservo policy load ur5 4`
+    """
+    _give(url, key_file, repository, as_json, name, "load", version=version)
+
+
+@policy.command()
+def unload(
+    name: Name,
+    version: Annotated[str | None, typer.Argument(help="The whole policy by default.")] = None,
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    repository: Repository = None,
+    as_json: Json = False,
+) -> None:
+    """Drop a version that nothing leads to, or a whole policy.
+
+    Example: `rlservo policy unload ur5 3`
+    """
+    _give(url, key_file, repository, as_json, name, "unload", version=version)
+
+
+@policy.command()
+def alias(
+    name: Name,
+    pair: Annotated[str, typer.Argument(metavar="ALIAS=VERSION", help="ALIAS= removes it; production= cannot be.")],
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    repository: Repository = None,
+    as_json: Json = False,
+) -> None:
+    """Let an alias lead to a loaded version. `production` is what clients get that ask for none.
+
+    Example: `rlservo policy alias ur5 production=4`
+    """
+    key, version = split_pair(pair, "production=4")
+    _give(url, key_file, repository, as_json, name, "alias", alias=key, version=version or None)
+
+
+@policy.command()
+def rollback(
+    name: Name,
+    alias: Annotated[str, typer.Option(help="Which alias.")] = "production",
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    repository: Repository = None,
+    as_json: Json = False,
+) -> None:
+    """Let an alias lead where it led before. Once more goes one further back.
+
+    Example: `rlservo policy rollback ur5`
+    """
+    _give(url, key_file, repository, as_json, name, "rollback", alias=alias)
+
+
+@policy.command()
+def canary(
+    name: Name,
+    pair: Annotated[str, typer.Argument(metavar="VERSION=SHARE|off", help="A version or alias, and 0 < share <= 1.")],
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    repository: Repository = None,
+    as_json: Json = False,
+) -> None:
+    """Send a share of the sessions to another version, or end that.
+
+    Example: `rlservo policy canary ur5 candidate=0.1`
+    """
+    version, share = (None, None) if pair == "off" else split_share(pair)
+    _give(url, key_file, repository, as_json, name, "canary", version=version, share=share)
+
+
+@policy.command()
+def shadow(
+    name: Name,
+    version: Annotated[str, typer.Argument(metavar="VERSION|off", help="A version or alias.")],
+    url: Url = LOCAL,
+    key_file: KeyFile = None,
+    repository: Repository = None,
+    as_json: Json = False,
+) -> None:
+    """Let another version compute along, or end that. How its actions differ is recorded.
+
+    Example: `rlservo policy shadow ur5 candidate`
+    """
+    _give(url, key_file, repository, as_json, name, "shadow", version=None if version == "off" else version)
+
+
+@contextlib.contextmanager
+def _client(url: str, key_file: Path | None) -> Iterator[AdminClient]:
+    with needs_extra("client"):
+        from rlservo.serve_app.client.admin_client import AdminClient, find_key
+    with AdminClient(url, api_key=find_key(url, key_file)) as client:
+        yield client
+
+
+def _repository(places: list[str]) -> OfflineCommands:
+    with needs_extra("serve"):
+        from rlservo.serve_app.server.offline_commands import OfflineCommands
+    return OfflineCommands(places)
+
+
+def _give(
+    url: str, key_file: Path | None, places: list[str] | None, as_json: bool, name: str, command: str, **document: Any
+) -> None:
+    """Give a command to a server, or to a repository, and show what is served then."""
+    if places:
+        reply = _repository(places).command(name, command, document)
+    else:
+        with _client(url, key_file) as client:
+            reply = client.command(name, command, document)
+    if as_json:
+        print_json(reply)
+        return
+    aliases = ", ".join(f"{alias}={version}" for alias, version in reply["aliases"].items()) or "none"
+    lines = [f"{reply['policy']}: default {reply['default']}, loaded {', '.join(reply['versions']) or 'none'}"]
+    lines.append(f"aliases {aliases}")
+    if reply["canary"] is not None:
+        lines.append(f"canary {reply['canary']['version']} gets {reply['canary']['share']:g} of the sessions")
+    if reply["shadow"] is not None:
+        lines.append(f"shadow {reply['shadow']}")
+    lines.append(f"plan {reply['generation']}" + (f" in {reply['place']}" if "place" in reply else ""))
+    terminal.output().print("; ".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def _table(replica: dict[str, Any]) -> Table:
+    table = _columns(
+        f"process {replica['replica']}, plan {replica['generation']} ({replica['changed_by']})",
+        *("policy", "version", "state", "aliases", "since (UTC)", "requests", "reason"),
+    )
+    for each in replica["policies"]:
+        for version in each["version_states"]:
+            marks = [*version["aliases"]]
+            state = (version["version"], version["state"], ", ".join(marks), _when(version["loaded_at"]))
+            table.add_row(each["name"], *state, str(version["requests"]), version["reason"])
+    return table
+
+
+def _print_repository(listing: dict[str, Any]) -> None:
+    table = _columns(None, "policy", "version", "state", "used as")
+    for each in listing["policies"]:
+        others = {"canary": each["canary"] and each["canary"]["version"], "shadow": each["shadow"]}
+        uses = each["aliases"] | {use: each["aliases"].get(target, target) for use, target in others.items() if target}
+        for version in each["versions"]:
+            used_as = ", ".join(use for use, target in uses.items() if target == version)
+            table.add_row(each["name"], version, "loaded", used_as)
+        for version in each["not_loaded"]:
+            table.add_row(each["name"], version, "not loaded", "")
+    terminal.output().print(table)
+    plan = "no plan yet: the first server or command writes one, with every version"
+    if listing["generation"]:
+        plan = f"plan {listing['generation']} ({listing['changed_by']}, {_when(listing['changed_at'])} UTC)"
+    terminal.output().print(f"{plan}; in {listing['place']}", markup=False, highlight=False, soft_wrap=True)
+    for sentence in listing["errors"]:
+        terminal.errors().print(sentence, style="red", markup=False, highlight=False, soft_wrap=True)
+
+
+def _columns(title: str | None, *names: str) -> Table:
+    from rich.table import Table
+
+    table = Table(title=title)
+    for name in names:
+        table.add_column(name, overflow="fold")
+    return table
+
+
+def _when(time: str | None) -> str:
+    return "" if time is None else time[:19].replace("T", " ")

@@ -1,0 +1,59 @@
+"""The command `rlservo publish`; the work is in serve_app/repository and export/renumber_bundle.py."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.terminal import Json, print_json
+from rlservo.export.contract.extras import needs_extra
+
+
+def publish(
+    bundle: Annotated[
+        Path, typer.Argument(help="Bundle, policy folder (its newest version) or one-policy repository.")
+    ],
+    uri: Annotated[str, typer.Argument(metavar="URI", help="s3://bucket/policies, or a folder.")],
+    version: Annotated[
+        str | None,
+        typer.Option(metavar="N|next", help="Another number than the bundle's own, or the next one that is free."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Publish a bundle for `rlservo serve URI`. A published version never changes.
+
+    The bundle is proven first. Its files are written before its line in the index, without which nobody sees the
+    version; one that is there is never overwritten. Credentials come from the environment (AWS_...).
+
+    Example: `rlservo publish policies/ur5 s3://bucket/policies`
+    """
+    from rlservo.export.contract.bundle import load_bundle
+    from rlservo.serve_app.repository.publication import next_version
+    from rlservo.serve_app.repository.publication import publish as publish_bundle
+    from rlservo.serve_app.runtime.policy import Policy
+
+    chosen = load_bundle(bundle)
+    with tempfile.TemporaryDirectory(prefix="rlservo-publish-") as folder:
+        if version == "next":
+            version = next_version(uri, chosen.contract.name)
+        if version not in (None, chosen.contract.version):
+            with needs_extra("train", "torch", "onnx"):
+                from rlservo.export.renumber_bundle import renumber
+
+                chosen = renumber(chosen, str(version), Path(folder))
+        Policy.load(chosen.path).close()  # what no server would load is not published
+        place = publish_bundle(chosen, uri, progress=terminal.note)
+    contract = chosen.contract
+    if as_json:
+        print_json({"name": contract.name, "version": contract.version, "sha256": chosen.digest, "place": place})
+        return
+    terminal.output().print(
+        f"{contract.name} version {contract.version} is published: {place}",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )

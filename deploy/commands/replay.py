@@ -1,0 +1,144 @@
+"""The commands `rlservo replay` and `rlservo estimate`: recordings put through another bundle."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.commands.log import Files, PolicyName
+from rlservo.deploy.terminal import Json, print_json
+from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.replay.estimate import EstimateReport
+    from rlservo.serve_app.replay.replay import ReplayReport
+
+Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder: its newest version.")]
+
+
+def replay(
+    files: Files,
+    bundle: Bundle,
+    tolerance: Annotated[
+        float, typer.Option(min=0.0, help="By how much an element may differ without counting as changed.")
+    ] = 0.0,
+    policy: PolicyName = None,
+    as_json: Json = False,
+) -> None:
+    """Compare a bundle's actions with the recorded ones.
+
+    Exit code 0: no action would change; 1: some would; 2: the recording does not fit the bundle.
+
+    Example: `rlservo replay run.mcap --bundle policies/ur5/2`
+    """
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.reader import Recording
+        from rlservo.serve_app.replay.replay import replay as run_replay
+
+    began = time.perf_counter()
+    with terminal.status("replaying the recordings"):
+        report = run_replay(Recording(files), bundle, tolerance=tolerance, name=policy)
+    seconds = time.perf_counter() - began
+    if as_json:
+        print_json({**report.as_dict(), "seconds": round(seconds, 3)})
+    else:
+        _print_replay(report, seconds)
+    if report.changed:
+        raise typer.Exit(1)
+
+
+def estimate(
+    files: Files,
+    bundle: Bundle,
+    explore: Annotated[bool, typer.Option("--explore", help="Of the exploring policy, not of the mode.")] = False,
+    gamma: Annotated[float, typer.Option(help="Discount per step.")] = 1.0,
+    policy: PolicyName = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Estimate a bundle's return from recordings of another.
+
+    Recordings that did not explore have fitted Q evaluation alone. It is experimental: how often its interval holds
+    was counted in a one-dimensional simulation only. Drive nothing because of it.
+
+    Exit code 0: an estimate holds by its method's own checks; 1: the recordings cannot support one.
+
+    Example: `rlservo estimate recordings --bundle policies/ur5/2`
+    """
+    if not 0 < gamma <= 1:
+        raise UsageError(f"--gamma must be above 0 and at most 1, got {gamma:g}")
+    with needs_extra("record"):
+        from rlservo.serve_app.recording.reader import Recording
+        from rlservo.serve_app.replay.estimate import estimate as run_estimate
+
+    with terminal.status("reading the recordings") as show:
+        report = run_estimate(
+            Recording(files), bundle, explore=explore, gamma=gamma, name=policy, seed=seed, progress=show
+        )
+    if as_json:
+        print_json(report.as_dict())
+    else:
+        _print_estimate(report)
+    if not any(one.supported for one in report.estimates):
+        raise typer.Exit(1)
+
+
+def _print_replay(report: ReplayReport, seconds: float) -> None:
+    _line(
+        f"{', '.join(report.policies)} replayed through {report.bundle}: {report.compared} decisions in {seconds:.1f} s"
+    )
+    if report.same_graph is not None:
+        _line(f"the graph is {'the recorded one' if report.same_graph else 'another than the recorded one'}")
+    _line(f"identical bit for bit: {report.identical} of {report.compared}")
+    _line(f"changed by more than {report.tolerance:g}: {report.changed} ({report.changed_share:.2%})")
+    if report.explored:
+        _line(
+            f"explored: {report.explored}, compared by their distributions' parameters, largest difference "
+            f"{report.largest_distribution_difference:.3g}"
+        )
+    if report.unsafe:
+        _line(f"the bundle's action is none of its space: {report.unsafe}")
+    if report.not_compared:
+        _line(f"not compared (no action, a gap, nothing to compare): {report.not_compared}")
+    if report.dropped:
+        _line(f"the recorder had dropped {report.dropped} records")
+    for title, count in report.other_policies.items():
+        _line(f"not looked at: {count} decisions of {title}")
+    for element in report.elements:
+        if element.largest:
+            _line(
+                f"  {element.name}: largest {element.largest:.4g} {element.unit}, mean {element.mean:.3g}, "
+                f"changed {element.changed}"
+            )
+    for moment in report.worst:
+        when = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(moment.time_s))
+        _line(
+            f"  {when} UTC, episode {moment.episode or '-'} step {moment.step}: {moment.element} "
+            f"{moment.recorded:.6g} -> {moment.replayed:.6g}"
+        )
+
+
+def _print_estimate(report: EstimateReport) -> None:
+    _line(f"{report.bundle} ({report.target}) from {report.episodes} episodes of {', '.join(report.policies)}")
+    assert report.recorded_return is not None and report.recorded_interval is not None
+    _line(f"recorded return {report.recorded_return:.5g}  {_interval(report.recorded_interval)}")
+    for reason, count in report.not_used.items():
+        _line(f"not used: {count} episodes {reason}")
+    for one in report.estimates:
+        _line(
+            f"{one.method}: {one.value:.5g}  {_interval(one.interval)}  effective episodes {one.effective_samples:.1f}"
+        )
+        _line(f"  {'holds' if one.supported else 'NOT SUPPORTED'}: {one.reason}")
+
+
+def _interval(interval: tuple[float, float]) -> str:
+    return f"(95% {interval[0]:.5g} to {interval[1]:.5g})"
+
+
+def _line(text: str) -> None:
+    terminal.output().print(text, markup=False, highlight=False, soft_wrap=True)

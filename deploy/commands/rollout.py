@@ -1,0 +1,142 @@
+"""The command `rlservo rollout`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.commands.environment_options import choose_gl_backend, parse_env_arguments
+from rlservo.deploy.terminal import Json, print_json
+from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra, require
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.interface import ActingPolicy
+
+TransportKind = Literal["http", "ws"]
+
+
+def rollout(
+    env: Annotated[str, typer.Argument(help="Gymnasium environment id.")],
+    url: Annotated[str | None, typer.Option(help="Server to ask for actions.")] = None,
+    policy: Annotated[str | None, typer.Option(help="Policy name on that server; its only one by default.")] = None,
+    bundle: Annotated[Path | None, typer.Option(help="Act in process with this bundle instead of a server.")] = None,
+    episodes: Annotated[int, typer.Option(min=1)] = 10,
+    seed: Annotated[int | None, typer.Option(help="Episode i is reset with seed + i.")] = None,
+    rate: Annotated[
+        Literal["real", "max"], typer.Option(help="real: at the control rate, as on a robot; max: as fast as it goes.")
+    ] = ("max"),
+    explore: Annotated[bool, typer.Option("--explore", help="Sample actions instead of taking the mode.")] = False,
+    env_arg: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
+    ] = None,
+    video: Annotated[Path | None, typer.Option(help="Write the first episode to this .mp4 file.")] = None,
+    transport: Annotated[
+        TransportKind, typer.Option(help="http: JSON, a request per action; ws: one WebSocket.")
+    ] = "http",
+    deadline_ms: Annotated[float | None, typer.Option(help="An action that takes longer is not used.")] = None,
+    fallback: Annotated[
+        str | None,
+        typer.Option(
+            metavar="hold|zero|stop|ACTION", help="What the robot does without an answer in time; by default it fails."
+        ),
+    ] = None,
+    server_state: Annotated[
+        bool, typer.Option("--server-state", help="Leave a recurrent policy's state with the server.")
+    ] = False,
+    api_key: Annotated[
+        str | None, typer.Option(envvar="RLSERVO_API_KEY", help="Rather in the variable: others see arguments.")
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Record every decision, with rewards and ends: a new .mcap file, or a folder.")
+    ] = None,
+    disturb: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND=SIZE,...",
+            help="Drive under disturbances, such as latency=3,noise=real,payload=3; `rlservo verify -h` has the kinds.",
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Drive an environment with a policy. Success, return, latency and deadline misses are reported.
+
+    Example: `rlservo rollout rlservo/EndEffectorPositioningURSim-v0 --url http://127.0.0.1:8000 --policy ur5`
+    """
+    if (url is None) == (bundle is None):
+        raise UsageError("give either --url (a server) or --bundle (in process)")
+    if bundle is not None and (fallback, deadline_ms, transport) != (None, None, "http"):
+        raise UsageError("--transport, --deadline-ms and --fallback are for a server (--url)")
+    if video is not None:
+        choose_gl_backend()
+    if record is not None:
+        require("record", "mcap", "orjson")
+    with needs_extra("sim", "gymnasium", *(("imageio", "imageio_ffmpeg") if video else ())):
+        from rlservo.serve_app.rollout.control_loop import rollout as run_rollout
+        from rlservo.serve_app.rollout.report import render_report
+
+    with (
+        terminal.status(f"0 of {episodes} episodes") as show,
+        _acting_policy(url, policy, bundle, transport, deadline_ms, server_state, api_key) as acting,
+    ):
+        report = run_rollout(
+            _with_fallback(acting, fallback),
+            env,
+            episodes=episodes,
+            seed=seed,
+            rate=rate,
+            explore=explore,
+            env_kwargs=parse_env_arguments(env_arg or []),
+            video=video,
+            record=record,
+            on_episode=lambda row: show(f"{row.index + 1} of {episodes} episodes"),
+            disturb=disturb,
+        )
+    if as_json:
+        print_json(report.as_dict())
+    else:
+        terminal.output().print(render_report(report))
+    if report.interrupted:
+        raise typer.Exit(130)
+    if report.stopped is not None:
+        raise typer.Exit(1)
+
+
+def _acting_policy(
+    url: str | None,
+    name: str | None,
+    bundle: Path | None,
+    transport: TransportKind,
+    deadline_ms: float | None,
+    server_state: bool,
+    api_key: str | None,
+) -> ActingPolicy:
+    """Return the policy to drive with; in process it needs no HTTP client."""
+    if bundle is not None:
+        from rlservo.serve_app.runtime.policy import Policy
+
+        return Policy.load(bundle)
+    with needs_extra("client"):
+        from rlservo.serve_app.client.policy_client import PolicyClient
+        from rlservo.serve_app.client.stream_client import StreamClient
+
+    kind = StreamClient if transport == "ws" else PolicyClient
+    return kind(str(url), name, deadline_ms=deadline_ms, server_state=server_state, api_key=api_key)
+
+
+def _with_fallback(policy: ActingPolicy, fallback: str | None) -> ActingPolicy:
+    if fallback is None:
+        return policy
+    from rlservo.serve_app.rollout.fallback import WithFallback
+
+    if fallback in ("hold", "zero", "stop"):
+        return WithFallback(policy, fallback)
+    try:
+        action = json.loads(fallback)
+    except json.JSONDecodeError:
+        raise UsageError(f"--fallback {fallback!r}: expected hold, zero, stop or an action such as [0, 0]") from None
+    return WithFallback(policy, action)

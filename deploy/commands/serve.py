@@ -1,0 +1,204 @@
+"""The command `rlservo serve`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.terminal import note
+from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
+
+if TYPE_CHECKING:
+    pass
+
+
+TransportKind = Literal["http", "ws"]
+
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", help="YAML or JSON file of versions, aliases, canary and shadow, as in serve.yaml."),
+]
+VersionsOption = Annotated[
+    list[str] | None,
+    typer.Option("--versions", metavar="NAME=VERSION,...", help="Versions to load; all of the repository by default."),
+]
+AliasOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--alias",
+        metavar="NAME:ALIAS=VERSION",
+        help="ur5:production=3, say; repeat it. Without one the newest version is production, and stays it.",
+    ),
+]
+CanaryOption = Annotated[
+    list[str] | None,
+    typer.Option("--canary", metavar="NAME:VERSION=SHARE", help="Share of the sessions for another version."),
+]
+ShadowOption = Annotated[
+    list[str] | None,
+    typer.Option("--shadow", metavar="NAME=VERSION", help="Version that computes along, only to be compared."),
+]
+
+
+def serve(
+    directories: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="DIR|URI...", help="Bundles, policy folders, repositories; s3://... as `rlservo publish` writes it."
+        ),
+    ],
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 is any free one.")] = 8000,
+    grpc_port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC, here.")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
+    default_policy: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Policy of a WebSocket at '/', where openpi's clients connect; the only one by default.",
+        ),
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Record every decision into this folder (`rlservo log`).")
+    ] = None,
+    poll: Annotated[
+        float | None,
+        typer.Option(min=1, metavar="SECONDS", help="Look for new versions this often; they are loaded, not in use."),
+    ] = None,
+    session_store: Annotated[
+        str | None,
+        typer.Option(
+            metavar="memory|URL",
+            help="Where sessions by id are kept; several workers need redis://HOST:PORT/DATABASE.",
+        ),
+    ] = None,
+    config: ConfigOption = None,
+    versions: VersionsOption = None,
+    alias: AliasOption = None,
+    canary: CanaryOption = None,
+    shadow: ShadowOption = None,
+) -> None:
+    """Serve policies on this machine until Ctrl-C. On a cluster, Ray's `serve deploy` does it (docs/cluster.md).
+
+    Example: `rlservo serve policies`, then
+    `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`
+    """
+    with needs_extra("serve"):
+        from rlservo.serve_app.engines.local import RunningServer, serve_policies
+        from rlservo.serve_app.wire.admin_key_file import key_file
+    if record is not None:
+        with needs_extra("record"):
+            import rlservo.serve_app.recording.log_file  # noqa: F401
+
+    def ready(served: RunningServer) -> None:
+        for name, default in served.policies:
+            terminal.output().print(
+                f"{served.url}/v1/policies/{name}  (version {default})", highlight=False, soft_wrap=True
+            )
+        if served.grpc is not None:
+            terminal.output().print(f"{served.grpc}  gRPC, Open Inference Protocol", highlight=False, soft_wrap=True)
+        if served.admin_key_file is not None:
+            note(f"administration: rlservo policy --help; its key is in {served.admin_key_file}")
+        terminal.output().print(
+            f"ready; status page: {served.url} (API: {served.url}/docs); Ctrl-C stops", highlight=False, soft_wrap=True
+        )
+
+    serve_policies(
+        directories,
+        host=host,
+        port=port,
+        grpc_port=grpc_port,
+        workers=workers,
+        settings={
+            name: value
+            for name, value in (
+                ("default_policy", default_policy),
+                ("record", record and str(record)),
+                ("poll_s", poll),
+                ("session_store", session_store),
+            )
+            if value is not None
+        },
+        served=served_config(config, versions, alias, canary, shadow),
+        admin_key_file=key_file(port),
+        on_ready=ready,
+        on_stop=lambda: note("stopping: requests in progress are answered first"),
+    )
+
+
+def served_config(
+    file: Path | None,
+    versions: list[str] | None,
+    aliases: list[str] | None,
+    canaries: list[str] | None,
+    shadows: list[str] | None,
+) -> dict[str, Any]:
+    """Return the configuration that the file and the options of `rlservo serve` mean; options win.
+
+    Raises UsageError.
+    """
+    document = _load_config(file) if file is not None else {}
+    policies = document.setdefault("policies", {})
+
+    for text in versions or ():
+        name, numbers = split_pair(text, "ur5=3,4")
+        policies.setdefault(name, {})["versions"] = numbers.split(",")
+    for text in aliases or ():
+        name, pair = split_pair(text, "ur5:production=3", ":")
+        key, version = split_pair(pair, "ur5:production=3")
+        policies.setdefault(name, {}).setdefault("aliases", {})[key] = version
+    for text in canaries or ():
+        name, pair = split_pair(text, "ur5:candidate=0.1", ":")
+        version, share = split_share(pair)
+        policies.setdefault(name, {})["canary"] = {"version": version, "share": share}
+    for text in shadows or ():
+        name, version = split_pair(text, "ur5=candidate")
+        policies.setdefault(name, {})["shadow"] = version
+    return document
+
+
+def _load_config(file: Path) -> dict[str, Any]:
+    text = file.read_text(encoding="utf-8", errors="replace")
+    try:
+        document = json.loads(text) if file.suffix == ".json" else _parse_yaml(text)
+    except ValueError as error:
+        raise UsageError(f"{file} cannot be read: {' '.join(str(error).split())[:300]}") from None
+    if not isinstance(document, dict) or not isinstance(document.get("policies", {}), dict):
+        raise UsageError(f"{file}: expected a map with 'policies', as user_config in deploy/serve.yaml")
+    return document
+
+
+def _parse_yaml(text: str) -> Any:
+    try:
+        import yaml
+    except ModuleNotFoundError:
+        raise UsageError("reading YAML needs the Python package 'pyyaml'; a .json file needs nothing") from None
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from None
+
+
+def split_pair(text: str, example: str, separator: str = "=") -> tuple[str, str]:
+    """Return the words before and after the separator. Raises UsageError, with the example."""
+    key, found, value = text.partition(separator)
+    if not key or not found:
+        raise UsageError(f"{text!r}: expected for example {example}")
+    return key, value
+
+
+def split_share(pair: str) -> tuple[str, float]:
+    """Return the version and the share of `VERSION=SHARE`. Raises UsageError."""
+    version, share = split_pair(pair, "candidate=0.1")
+    try:
+        return version, float(share)
+    except ValueError:
+        raise UsageError(f"{pair!r}: expected a share such as 0.1 after '='") from None

@@ -1,0 +1,195 @@
+"""The command `rlservo verify`: against the checkpoint, and with `--disturb` in the simulator.
+
+The table of disturbances goes to the terminal, as JSON, as a plot and into the contract.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.commands.environment_options import parse_env_arguments
+from rlservo.deploy.terminal import Json, note, print_json
+from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.rollout.disturbance_table import DisturbanceTable
+
+EPISODES = 100  # of each row, where the caller does not say
+WIDTH = 140  # [characters], of the table at least: narrower its figures fall apart
+
+
+def verify(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
+    disturbances: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[KIND=SIZE]...",
+            help="With --disturb, the rows of the table, such as latency=3 or noise=real,payload=2; the standard ones "
+            "by default. Kinds: latency, observation_latency, late [cycles], drop [share], noise, bias (real, 2*real), "
+            "stuck (any or an element), payload [kg], model [share], base [m], target=outside, start=corner.",
+        ),
+    ] = None,
+    checkpoint: Annotated[
+        str | None, typer.Option(help="The RLlib checkpoint to compare with; a folder or a URI.")
+    ] = None,
+    env: Annotated[str | None, typer.Option(help="Environment id for a closed-loop comparison.")] = None,
+    disturb: Annotated[
+        bool, typer.Option("--disturb", help="Drive --env under disturbances: noise, latency, payload and others.")
+    ] = False,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Episodes of the closed loop (20), of each row under --disturb (100).")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the first episode.")] = 0,
+    env_arg: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="With --disturb, environment constructor argument (JSON value)."),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="With --disturb, draw the table into this file.")] = None,
+    write: Annotated[
+        bool, typer.Option("--write", help="With --disturb, write the rows into the contract as evaluations.")
+    ] = False,
+    app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+    as_json: Json = False,
+) -> None:
+    """Prove a bundle against its checkpoint again. With --env also in closed loop, written into the contract.
+
+    With --disturb it is driven as a real robot would have it, with no checkpoint needed: success, return and endings
+    under each disturbance, over the same seeds.
+
+    Examples: `rlservo verify policies/ur5 --checkpoint runs/best --env rlservo/EndEffectorPositioningURSim-v0`,
+    `rlservo verify policies/ur5 --env rlservo/EndEffectorPositioningURSim-v0 --disturb`
+    """
+    if not disturb and (disturbances or plot or write or env_arg):
+        raise UsageError("disturbances, --plot, --write and --env-arg go with --disturb")
+    if checkpoint is None and not disturb:
+        raise UsageError("give --checkpoint to compare the bundle with, or --disturb with --env, or both")
+    document: dict[str, Any] = {}
+    if checkpoint is not None:
+        document |= _verify_against(checkpoint, bundle, env, episodes or 20, seed, app_dir, as_json)
+    if disturb:
+        table = _measure(
+            bundle,
+            env,
+            disturbances or [],
+            episodes=episodes,
+            seed=seed,
+            env_arguments=parse_env_arguments(env_arg or []),
+            plot=plot,
+            write=write,
+        )
+        document["disturbances"] = table.as_dict()
+        if not as_json:
+            _show(table)
+    if as_json:
+        print_json(document)
+
+
+def _verify_against(
+    checkpoint: str, bundle: Path, env: str | None, episodes: int, seed: int, app_dir: Path, as_json: bool
+) -> dict[str, Any]:
+    """Compare a bundle with its checkpoint; return the document for programs, and print it for people otherwise."""
+    with needs_extra("train", "ray", "torch", "onnx", "onnxscript", "gymnasium"):
+        from rlservo.export.reports import verification_report
+        from rlservo.export.verify_bundle import verify_bundle
+
+    env_config = None
+    if env is not None:  # the policy may have been trained with disturbances around this environment
+        from rlservo.envs.randomization import wrapped_env
+        from rlservo.export.contract.bundle import load_bundle
+
+        trained = load_bundle(bundle).contract.provenance
+        if env != trained.env_id:
+            env_config = wrapped_env(trained.env_id or "", trained.env_config)[1]
+    with terminal.status("reading the bundle") as show:
+        result = verify_bundle(
+            bundle,
+            checkpoint,
+            env_id=env,
+            env_config=env_config,
+            episodes=episodes,
+            first_seed=seed,
+            app_dir=app_dir,
+            notify=note,
+            progress=show,
+        )
+    if not as_json:
+        terminal.output().print(verification_report(result.parity, result.evaluation))
+    return {
+        "parity": result.parity.model_dump(mode="json"),
+        "evaluation": result.evaluation.model_dump(mode="json") if result.evaluation else None,
+        "same_checkpoint": result.same_checkpoint,
+    }
+
+
+def _measure(
+    bundle: Path,
+    env_id: str | None,
+    disturbances: Sequence[str],
+    *,
+    episodes: int | None,
+    seed: int,
+    env_arguments: Mapping[str, Any],
+    plot: Path | None,
+    write: bool,
+) -> DisturbanceTable:
+    """Measure a bundle under disturbances; draw and keep the table where asked for.
+
+    The environment is made with the `env_config` the policy was trained with, without the disturbances it was trained
+    under, and with `env_arguments`. Raises UsageError for a disturbance that does not exist or cannot be had.
+    """
+    if env_id is None:
+        raise UsageError("--disturb needs --env: the environment to disturb")
+    if seed < 0:
+        raise UsageError(f"--seed is {seed}: expected 0 or more")
+    with needs_extra("sim"):
+        from rlservo.envs.randomization import wrapped_env
+        from rlservo.export.contract.bundle import load_bundle, write_contract
+        from rlservo.serve_app.rollout.disturbance_table import (
+            check_plot,
+            evaluations_of,
+            measure_disturbances,
+            plot_table,
+        )
+        from rlservo.serve_app.runtime.policy import Policy
+
+    if plot is not None:
+        check_plot(plot)
+    loaded = load_bundle(bundle)
+    trained = loaded.contract.provenance
+    arguments = {**wrapped_env(trained.env_id or "", trained.env_config)[1], **env_arguments}
+    with Policy.load(bundle) as policy:
+        table = measure_disturbances(
+            policy,
+            env_id,
+            disturbances,
+            episodes=EPISODES if episodes is None else episodes,
+            seed=seed,
+            env_kwargs=arguments,
+            progress=note,
+        )
+    for text, why in table.skipped.items():
+        note(f"left out {text}: {why}")
+    if plot is not None:
+        plot_table(table, plot)
+        note(f"written {plot}")
+    if write:
+        now = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+        evaluations = (*loaded.contract.evaluations, *evaluations_of(table, now))
+        write_contract(loaded.path, loaded.contract.model_copy(update={"evaluations": evaluations}))
+        note(f"written into {loaded.path / 'contract.json'}")
+    return table
+
+
+def _show(table: DisturbanceTable) -> None:
+    """Print the table."""
+    from rlservo.serve_app.rollout.disturbance_table import render_table
+
+    console = terminal.output()
+    console.print(render_table(table), width=max(console.width, WIDTH), soft_wrap=True)

@@ -1,1 +1,0 @@
-"""Commands of the exporter: export, verify, prune, inspect."""

@@ -1,0 +1,26 @@
+"""Copy of a bundle under another version number, with everything else as it was proven."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from rlservo.export.bundle_names import check_names
+from rlservo.export.contract.bundle import CONTRACT_KEY, ONNX_FILE, Bundle, load_bundle, write_contract
+from rlservo.export.contract.contract import contract_json
+
+
+def renumber(bundle: Bundle, version: str, out: Path) -> Bundle:
+    """Copy a bundle to `out/<name>/<version>/`; the number stands in its contract, and in the graph's copy of it.
+
+    Needs onnx. Raises UsageError for what is no version, and BundleError.
+    """
+    from rlservo.export.graph.onnx_file import add_metadata
+
+    check_names(None, version)
+    folder = out / bundle.contract.name / version
+    shutil.copytree(bundle.path, folder)
+    contract = bundle.contract.model_copy(update={"version": version})
+    add_metadata(folder / ONNX_FILE, {CONTRACT_KEY: contract_json(contract)})
+    write_contract(folder, contract)
+    return load_bundle(folder)

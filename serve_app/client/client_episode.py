@@ -1,0 +1,120 @@
+"""Recurrent state, last action and step count of the episode that a client is in."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Mapping
+from typing import Any
+
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import SessionLostError
+from rlservo.serve_app.client.replies import check_step, is_action, next_state
+
+
+class ClientEpisode:
+    """One episode after another, and what of it a request carries.
+
+    The recurrent state is here and travels with every request, or with `server_state` it stays with the server: in a
+    session of this client, or on a stream with the connection. The server needs the last action where it limits the
+    step from it; it is sent along when the server's may not be the one that the robot was commanded.
+    """
+
+    def __init__(self, *, server_state: bool, is_stream: bool) -> None:
+        self._server_state = server_state
+        self._is_stream = is_stream
+        self._session_id = uuid.uuid4().hex if server_state and not is_stream else None
+        self._has_unanswered_start = False  # which may reach the server after the next one
+        self._is_limited = False  # whether the server limits the step of a policy without recurrent state
+        self.reset()
+
+    def reset(self) -> None:
+        """Start an episode."""
+        self._state: dict[str, Any] = {}  # empty at an episode's start
+        self._steps = 0
+        self._last_action: Any = None  # as the server sent it
+        self._is_last_action_known = True  # whether the server has the same one
+        self._is_lost = False
+
+    def is_on_server(self, contract: Contract) -> bool:
+        """Return whether the server keeps the episode's recurrent state."""
+        return self._server_state and (bool(contract.state) or not self._is_stream)
+
+    def is_carried(self, contract: Contract) -> bool:
+        """Return whether requests carry a `state`."""
+        return not self.is_on_server(contract) and (bool(contract.state) or self._is_limited)
+
+    def is_bound(self, contract: Contract) -> bool:
+        """Return whether what the episode remembers is of this policy's version."""
+        return bool(contract.state) and self._steps > 0
+
+    def carry(self) -> None:
+        """Send a `state` from now on: the server has refused a request without one."""
+        self._is_limited = True
+
+    def set_last_action(self, action: Any) -> None:
+        """Take note of what the robot was commanded instead of the server's action."""
+        self._last_action, self._is_last_action_known = action, False
+
+    def reconnect(self) -> None:
+        """Take note of a new connection, which knows nothing of the episode."""
+        self._is_last_action_known = False
+        self._is_lost = self._steps > 0
+
+    def request_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any]:
+        """Return what the next request says of the episode.
+
+        Until its reply came, the server may have acted with an action that no robot has seen.
+
+        Raises SessionLostError when the recurrent state went with a connection.
+        """
+        fields: dict[str, Any] = {}
+        if self.is_on_server(contract):
+            if self._is_lost:
+                raise SessionLostError("the connection broke, and the episode's memory went with it: call reset()")
+            fields["reset"] = self._steps == 0
+            if self._session_id is not None:
+                if self._has_unanswered_start:
+                    self._session_id = uuid.uuid4().hex
+                self._has_unanswered_start = self._steps == 0
+                fields["session_id"] = self._session_id
+        elif self.is_carried(contract):
+            fields["state"] = self._state
+        elif self._is_stream and self._steps == 0:
+            fields["reset"] = True  # of the last action, which the connection holds
+        has_last_action = bool(fields) or self._is_stream
+        if has_last_action and not self._is_last_action_known and is_action(self._last_action, batch, contract):
+            fields["last_action"] = self._last_action
+        self._is_last_action_known = False
+        return fields
+
+    def end_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any] | None:
+        """Return what the request that tells the episode's end says of it; None where there is nothing to end.
+
+        Raises SessionLostError.
+        """
+        if self._steps == 0:
+            return None
+        fields = self.request_fields(contract, batch)
+        if self._session_id is not None:
+            fields["end"] = True
+        return fields
+
+    def end(self) -> None:
+        """Take note that the server knows of the episode's end: the next one has a session of its own."""
+        self.reset()
+        if self._session_id is not None:
+            self._session_id = uuid.uuid4().hex
+
+    def advance(self, reply: Mapping[str, Any], action: Any, contract: Contract) -> None:
+        """Go on to the next step after a reply; `action` is the reply's, in the form in which it would be sent.
+
+        Raises SessionLostError when the reply is of another episode, UnavailableError when it lacks the state.
+        """
+        self._has_unanswered_start = False
+        if self.is_on_server(contract) and (contract.state or "session_step" in reply):
+            self._steps = check_step(reply, self._steps)
+        else:
+            if self.is_carried(contract):
+                self._state = next_state(reply, contract)
+            self._steps += 1
+        self._last_action, self._is_last_action_known = action, True

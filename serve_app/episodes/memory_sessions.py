@@ -1,0 +1,124 @@
+"""Sessions in this process, bounded in number, evicted when idle.
+
+A session is begun explicitly. A request for one that does not exist gets an error, because a state begun again in the
+middle of an episode would give wrong actions without notice. `redis_sessions.py` keeps them where several processes
+find them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from typing import TypeAlias
+
+from rlservo.export.contract.errors import RlservoError, SessionError, UnavailableError
+from rlservo.serve_app.episodes.request import Request, SessionId, check_client
+from rlservo.serve_app.episodes.session import Session
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
+
+StepSession: TypeAlias = Callable[[PolicyStore, Request, Session | None], tuple[Decision, Session]]
+"""Computes a step: the decision, and the session after it."""
+
+Key: TypeAlias = tuple[str, SessionId]  # (policy name, session id)
+
+
+class MemorySessions:
+    """The sessions of one process, by policy name and session id."""
+
+    def __init__(self, *, most: int, idle_s: float) -> None:
+        """`most` bounds the episodes in memory, in sessions and on streams together (a batch is so many)."""
+        self._most = most
+        self._idle_s = idle_s
+        self._sessions: OrderedDict[Key, Session] = OrderedDict()  # the longest unused come first
+        self.rows = 0  # episodes remembered, in sessions and on streams
+        self.evicted: Counter[str] = Counter()  # by policy name
+
+    def __len__(self) -> int:
+        return len(self._sessions)
+
+    def count(self) -> Counter[str]:
+        """Return how many sessions there are, by policy name."""
+        self._evict()
+        return Counter(name for name, _ in self._sessions)
+
+    def find(self, name: str, session_id: SessionId) -> Session | None:
+        """Return a session that is not idle, None where there is none."""
+        self._evict()
+        return self._sessions.get((name, session_id))
+
+    async def act(
+        self, store: PolicyStore, request: Request, session_id: SessionId, step_session: StepSession
+    ) -> Decision:
+        """Decide for a request of a session. Raises UnavailableError, ClientGoneError, and what `step_session` raises.
+
+        It waits for nothing where requests come in order anyway: on the connection of the last one.
+        """
+        key = (request.policy, session_id)
+        before = self.find(*key)
+        if before is None or request.connection is None or request.connection != before.connection:
+            await check_client(request)
+            before = self.find(*key)
+        if before is not None and request.arrived < before.begun:
+            raise overtaken(request, session_id)
+        decision, after = step_session(store, request, before)
+        if after.is_ended:
+            self.end(*key)
+            return decision
+        more = after.rows - (0 if before is None else before.rows)
+        self._check_room(more)
+        self.rows += more
+        after.connection, after.used = request.connection, time.monotonic()
+        self._sessions[key] = after
+        self._sessions.move_to_end(key)
+        return decision
+
+    def end(self, name: str, session_id: SessionId) -> None:
+        """Forget a session."""
+        session = self._sessions.pop((name, session_id), None)
+        if session is not None:
+            self.rows -= session.rows
+
+    def reserve(self, stream: Session, rows: int) -> None:
+        """Reserve the places of a stream's episodes. Raises UnavailableError, and nothing has changed."""
+        self._evict()
+        self._check_room(rows - stream.rows)
+        self.rows += rows - stream.rows
+        stream.rows = rows
+
+    def release(self, stream: Session) -> None:
+        """Give the places of a stream's episodes back."""
+        self.rows -= stream.rows
+        stream.rows = 0
+
+    def _check_room(self, more: int) -> None:
+        if more > 0 and self.rows + more > self._most:
+            what = "another episode" if more == 1 else f"{more} more episodes (a batch is so many)"
+            raise UnavailableError(
+                f"the server remembers {self.rows} episodes already, at most {self._most}, and has no room for {what}: "
+                f"end a session, wait until an idle one is evicted ({self._idle_s:g} s), or send the state along with "
+                "each request",
+                {"episodes": self.rows, "most": self._most},
+            )
+
+    def _evict(self) -> None:
+        oldest = time.monotonic() - self._idle_s
+        while self._sessions:
+            name, session_id = next(iter(self._sessions))
+            if self._sessions[name, session_id].used > oldest:
+                break
+            self.end(name, session_id)
+            self.evicted[name] += 1
+
+
+def overtaken(request: Request, session_id: SessionId) -> RlservoError:
+    """Return the error of a request during which another one began its session."""
+    shown = f"session '{shorten(session_id)}' of policy '{request.policy[:64]}'"
+    if request.episode is not None and request.episode.reset:
+        return UnavailableError(f"another request began {shown} at the same time: try again")
+    return SessionError(f"the request was under way when another one began {shown} again: it is of the episode before")
+
+
+def shorten(session_id: SessionId) -> str:
+    """Return an id as an error's sentence may show it."""
+    return str(session_id)[:64]

@@ -1,0 +1,1 @@
+"""Bundles by name and version, in folders and object storage: found, fetched by hash, cached, published."""

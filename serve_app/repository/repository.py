@@ -1,0 +1,227 @@
+"""Bundles by name and version, in folders and behind URIs; their hashes tell them apart.
+
+A name or version that a request brings is only ever compared with what the places hold; no path is made of it.
+Everything here blocks (hashing, onnxruntime, golden vectors, networks), and may do so for ever where a file system
+hangs: `versions/version_loader.py` calls it through `BlockingCalls`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, digest_of, find_bundles, read_contract
+from rlservo.export.contract.contract import version_key
+from rlservo.export.contract.errors import (
+    BundleError,
+    BundleTamperedError,
+    RlservoError,
+    UnavailableError,
+    UnknownPolicyError,
+    UnknownVersionError,
+    UsageError,
+)
+from rlservo.serve_app.repository.bundle_cache import BundleCache, default_folder
+from rlservo.serve_app.repository.object_storage import ObjectStorage, is_uri, place_of
+from rlservo.serve_app.repository.remote_repository import Key, RemoteRepository
+
+CACHE_BYTES = 10 << 30
+STORAGE_TIMEOUT_S = 15.0
+
+
+@dataclass
+class _Listing:
+    """What one look through all places saw."""
+
+    found: dict[Key, tuple[str, str]] = field(default_factory=dict)  # (hash, where it is)
+    errors: dict[Key, RlservoError] = field(default_factory=dict)  # of what cannot be served
+    unread: list[UnavailableError] = field(default_factory=list)  # of storages that do not answer
+
+    def add(self, key: Key, digest: str, place: str) -> None:
+        """Add a bundle. A copy of one that is there is the same; another one makes neither of them usable."""
+        there, where = self.found.setdefault(key, (digest, place))
+        if there != digest:
+            self.errors[key] = UsageError(
+                f"policy '{key[0]}' version {key[1]} is in both {where} and {place}: "
+                "serve one of them, or export one under another name or version"
+            )
+
+    def digests(self) -> dict[Key, str]:
+        """Return the hash of what can be served."""
+        return {key: digest for key, (digest, _) in self.found.items() if key not in self.errors}
+
+
+class Repository:
+    """The folders and URIs of bundles that a server was given."""
+
+    def __init__(
+        self,
+        places: Iterable[str | Path],
+        limits: BundleLimits = DEFAULT_LIMITS,
+        *,
+        cache: str | Path | None = None,
+        cache_bytes: int = CACHE_BYTES,
+        storage_timeout_s: float = STORAGE_TIMEOUT_S,
+    ) -> None:
+        """`cache` is the folder that bundles behind URIs are fetched into. Raises UsageError."""
+        given = [place_of(place) for place in places]
+        if not given:
+            raise UsageError("no policy to serve: give at least one bundle folder")
+        self._paths = [Path(place) for place in given if not is_uri(place)]
+        self._limits = limits
+        self._seen: dict[tuple[str, str, str], Path] = {}
+        """The folders of the last look, by name, version and hash."""
+        storages = [ObjectStorage(place, timeout_s=storage_timeout_s) for place in given if is_uri(place)]
+        self._remote: list[RemoteRepository] = []
+        if storages:
+            bundles = BundleCache(Path(cache) if cache is not None else default_folder() / "bundles", cache_bytes)
+            self._remote = [RemoteRepository(storage, bundles, limits) for storage in storages]
+        self.patience_s = 3 * storage_timeout_s * len(storages)
+        """[s] by which a look through storages, each call with its time-out, may take longer than one on disk."""
+
+    def available(self, *, needs_all: bool) -> dict[str, dict[str, str]]:
+        """Return every bundle's hash by name and version, for a first plan.
+
+        With `needs_all` all that is there has to be good: raises BundleError or UsageError, and UnavailableError where
+        a storage does not answer.
+        """
+        listing = self._look()
+        if listing.unread:
+            raise listing.unread[0]
+        if needs_all:
+            raise_all(list(listing.errors.values()))
+        hashes: dict[str, dict[str, str]] = {}
+        for (name, version), digest in sorted(listing.digests().items(), key=lambda each: version_key(each[0][1])):
+            hashes.setdefault(name, {})[version] = digest
+        return hashes
+
+    def look(self) -> tuple[dict[Key, str], list[RlservoError]]:
+        """Return the hash of every bundle that can be served now, and a sentence for each thing that is wrong."""
+        listing = self._look()
+        return listing.digests(), [*listing.errors.values(), *listing.unread]
+
+    def find_digest(self, name: str, version: str | None) -> tuple[str, str]:
+        """Return (version, hash) of a bundle; None is the newest one.
+
+        Raises UnknownPolicyError or UnknownVersionError, what is wrong with the bundle of that name and version, and
+        UnavailableError where a storage that does not answer may have it.
+        """
+        listing = self._look()
+        digests = {v: digest for (n, v), digest in listing.digests().items() if n == name}
+        versions = sorted(digests, key=version_key)
+        if listing.unread and (version is None or version not in versions):
+            raise listing.unread[0]
+        wanted = version if version is not None else (versions[-1] if versions else None)
+        if wanted is not None and wanted in digests:
+            return wanted, digests[wanted]
+        # A bundle of that name and version that cannot be served says more than that there is none.
+        for key, error in listing.errors.items():
+            if key[0] == name and version in (key[1], None):
+                raise error
+        if not listing.found:
+            raise_all(list(listing.errors.values()))
+        if not versions:
+            known = ", ".join(sorted({n for n, _ in listing.found})) or "none"
+            raise UnknownPolicyError(f"the repository has no policy '{name[:64]}': it has {known}")
+        raise UnknownVersionError(
+            f"the repository has no version '{str(version)[:32]}' of policy '{name}': it has {', '.join(versions)}"
+        )
+
+    @contextlib.contextmanager
+    def fetch(self, name: str, version: str, digest: str) -> Iterator[Path]:
+        """Give the folder of an accepted bundle, which stays until the block ends.
+
+        Raises BundleTamperedError where the bundle of that name and version has another hash by now, and what is wrong
+        with it where it cannot be served.
+        """
+        errors: list[RlservoError] = []
+        folder = self._seen.get((name, version, digest))
+        if folder is None or not self._holds(folder, name, version, digest):
+            # Otherwise without a look at all others, which for a thousand of them would be a million.
+            folder = self._find_in_folders(name, version, digest, errors) if self._paths else None
+        if folder is not None:
+            yield folder
+            return
+        for remote in self._remote:
+            with contextlib.ExitStack() as stack:
+                try:
+                    fetched = stack.enter_context(remote.fetch(name, version, digest))
+                except RlservoError as error:
+                    errors.append(error)
+                    continue
+                yield fetched
+                return
+        if not errors:
+            raise UnknownVersionError(f"the repository has no version '{version[:32]}' of policy '{name}' any more")
+        raise next((error for error in errors if isinstance(error, UnavailableError)), errors[0])
+
+    def touch(self, digests: Collection[str]) -> None:
+        """Keep what is served in the cache."""
+        for remote in self._remote[:1]:  # they share it
+            remote.cache.touch(digests)
+
+    def _find_in_folders(self, name: str, version: str, digest: str, errors: list[RlservoError]) -> Path | None:
+        listing = _Listing()
+        self._look_in_folders(listing)
+        if (name, version) in listing.found and (name, version, digest) not in self._seen:
+            errors.append(
+                BundleTamperedError(
+                    f"{listing.found[name, version][1]} is not the bundle that was accepted as version {version} of "
+                    f"'{name}' (its hashes are others): export changes under a new version, or load this one again"
+                )
+            )
+        errors += [error for key, error in listing.errors.items() if key == (name, version)]
+        return self._seen.get((name, version, digest))
+
+    def _holds(self, folder: Path, name: str, version: str, digest: str) -> bool:
+        try:
+            contract = read_contract(folder, self._limits)
+            return (contract.name, contract.version, digest_of(folder)) == (name, version, digest)
+        except BundleError:
+            return False
+
+    def _look(self) -> _Listing:
+        """Look through all places."""
+        listing = _Listing()
+        self._look_in_folders(listing)
+        for remote in self._remote:
+            try:
+                for key, digest in remote.versions().items():
+                    listing.add(key, digest, f"{remote.uri}/{key[0]}/{key[1]}")
+            except UnavailableError as error:
+                listing.unread.append(error)
+            except BundleError as error:
+                listing.errors["", remote.uri] = error
+        return listing
+
+    def _look_in_folders(self, listing: _Listing) -> None:
+        """Add what the folders hold."""
+        seen: dict[tuple[str, str, str], Path] = {}
+        folders: dict[Path, Path] = {}  # resolved -> as given: the same folder given twice counts once
+        for path in self._paths:
+            try:
+                folders.update({folder.resolve(): folder for folder in find_bundles(path)})
+            except BundleError as error:
+                listing.errors["", str(path)] = error
+        for folder in folders.values():
+            try:
+                contract = read_contract(folder, self._limits)
+                key, digest = (contract.name, contract.version), digest_of(folder)
+            except BundleError as error:
+                listing.errors[folder.parent.name, folder.name] = error
+                continue
+            seen.setdefault((*key, digest), folder)
+            listing.add(key, digest, str(folder))
+        self._seen = seen
+
+
+def raise_all(errors: Sequence[RlservoError]) -> None:
+    """Raise the error, or one that lists all of them."""
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        sentences = "; ".join(error.message for error in errors)
+        kind = UnavailableError if all(isinstance(error, UnavailableError) for error in errors) else BundleError
+        raise kind(f"{len(errors)} bundles cannot be served: {sentences}")

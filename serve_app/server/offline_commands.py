@@ -1,0 +1,63 @@
+"""Commands of `rlservo policy` on a repository itself, without a server: proven here, followed by all that serve it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from typing import Any
+
+from rlservo.export.contract.contract import version_key
+from rlservo.serve_app.repository.repository import raise_all
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.server.start_check import plan_files, version_loader
+from rlservo.serve_app.versions.plan_commands import Changed, parse
+from rlservo.serve_app.versions.plan_writer import PlanWriter
+from rlservo.serve_app.versions.serving_plan import Plan
+
+
+class OfflineCommands:
+    """What `AdminClient` does by a server. Every method raises what is wrong with the repository or the command."""
+
+    def __init__(self, places: Sequence[str]) -> None:
+        """The places are what `rlservo serve` is given, in the same order. Raises UsageError."""
+        settings = ServerSettings.from_environment()
+        self._files = plan_files(places, settings)
+        self._loader = version_loader(places, settings)
+
+    def command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
+        """Carry out a command on a policy; return what is served of it then, as the server would."""
+        given = parse(command, document)
+        what = f"{command} {name} {given.words()}".strip()
+        plan = asyncio.run(given.give(PlanWriter(self._loader, self._files), name, what))
+        return {**Changed.of(plan, name).model_dump(), "place": self._files.place}
+
+    def listing(self) -> dict[str, Any]:
+        """Return the newest plan, and for each policy the versions of the repository that it does not load.
+
+        Raises BundleError or UnavailableError where there is neither a plan nor a policy.
+        """
+        return asyncio.run(self._listing())
+
+    async def _listing(self) -> dict[str, Any]:
+        plan = await PlanWriter(self._loader, self._files).newest()
+        digests, errors = await self._loader.look()
+        if plan is None and not digests:
+            raise_all(errors)
+        policies = {} if plan is None else plan.policies
+        others: dict[str, list[str]] = {name: [] for name, policy in policies.items() if policy.versions}
+        for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1]))):
+            if name not in policies or version not in policies[name].versions:
+                others.setdefault(name, []).append(version)
+        return {
+            "place": self._files.place,
+            "generation": 0 if plan is None else plan.generation,
+            "changed_by": plan and plan.changed_by,
+            "changed_at": plan and plan.changed_at,
+            "policies": [{**_described(plan, name), "not_loaded": others[name]} for name in sorted(others)],
+            "errors": [error.message for error in errors],
+        }
+
+
+def _described(plan: Plan | None, name: str) -> dict[str, Any]:
+    changed = Changed.of(plan or Plan(generation=0, policies={}, changed_at="", changed_by=""), name)
+    return {"name": name, **changed.model_dump(exclude={"generation", "policy"})}

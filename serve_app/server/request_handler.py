@@ -1,0 +1,404 @@
+"""Handling of a request, whatever its protocol: received, admitted, parsed, decided, encoded; counted, logged, timed.
+
+A protocol is a `Codec` and a transport. The transport (`http_endpoint.py`, `websocket_stream.py`, `oip_grpc.py`) makes
+a `Request` and calls `RequestHandler.answer`, which calls the codec; what it raises the transport encodes as an error.
+
+A decision runs in the event loop from its first line to its last (or pauses for the rest of its turn:
+`micro_batching.py`). So requests do not wait for each other in a queue of ours: they wait as tasks that the loop has
+made and not yet run. All that arrived while the loop was busy run in one turn of it, a *burst*. Its length is the
+queue, its beginning when each of them had arrived at the latest. That is known for the price of one callback per burst.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from rlservo.export.contract.errors import (
+    InternalError,
+    LateError,
+    ObservationError,
+    OverloadedError,
+    RequestError,
+    RlservoError,
+    TooLargeError,
+    UnavailableError,
+    UnknownPolicyError,
+)
+from rlservo.serve_app.episodes.episodes import Episodes
+from rlservo.serve_app.episodes.request import ClientGoneError, Episode, Request, check_deadline
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.api_key_file import CurrentKeys
+from rlservo.serve_app.server.api_keys import A_KEY
+from rlservo.serve_app.server.loop_clock import LoopClock
+from rlservo.serve_app.server.metrics import Metrics
+from rlservo.serve_app.server.request_log import FIELDS, RequestLog
+from rlservo.serve_app.server.row_count import count_rows, most_rows
+from rlservo.serve_app.server.settings import MEMORY, ServerSettings
+from rlservo.serve_app.versions.plan_follower import PlanFollower
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blamed_version
+from rlservo.serve_app.versions.shadow import Shadows
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.episodes.redis_sessions import RedisSessions
+    from rlservo.serve_app.server.request_recorder import RequestRecorder
+
+logger = logging.getLogger(__name__)
+
+STRICTER = "stricter-than-production"
+"""Counted for `bad-observation` where the version that production leads to takes the observation."""
+BUG = "the server failed on this request; its log says how"
+
+StoreProvider = Callable[[], PolicyStore | None]
+Source = TypeVar("Source", contravariant=True)
+Reply = TypeVar("Reply", covariant=True)
+
+
+class Codec(Protocol[Source, Reply]):
+    """Bytes of one protocol: from what a transport reads from, and to what it writes."""
+
+    async def receive(self, request: Request, source: Source) -> Any:
+        """Return the content, read within its limits. Raises RlservoError, and ClientGoneError."""
+        ...
+
+    def parse(self, request: Request, content: Any) -> None:
+        """Fill the request from its content. Raises RlservoError."""
+        ...
+
+    def encode(self, request: Request, decision: Decision) -> Reply:
+        """Return the reply."""
+        ...
+
+
+class Admission:
+    """Refuses what came too late, or what is too much for one event loop."""
+
+    def __init__(self, settings: ServerSettings) -> None:
+        """Take the limits: of a burst, of the wait before and in it, of bodies half sent, of streams."""
+        self._max_queued = settings.max_ongoing_requests
+        self.max_wait_s = settings.max_queue_ms / 1e3
+        self._max_incoming = settings.max_incoming
+        self._max_streams = settings.max_streams
+        self.loop_clock = LoopClock(self.max_wait_s)
+        self._burst = 0
+        self._burst_began = 0.0
+        self.incoming = 0
+        self.streams = 0
+        self.longest = 0  # the longest burst so far
+
+    def check_age(self) -> None:
+        """Raise LateError for a request that may have waited too long to be read."""
+        now = time.perf_counter()
+        if now < self.loop_clock.unknown_until or now - self.loop_clock.next_tick > self.max_wait_s:
+            raise LateError(
+                f"the server was blocked for more than {self.max_wait_s * 1e3:g} ms, and the observation may be as "
+                "old: send a newer one"
+            )
+
+    def enter(self) -> float:
+        """Return when this request had arrived at the latest (`time.perf_counter`).
+
+        Raises OverloadedError or LateError.
+        """
+        self.check_age()
+        now = time.perf_counter()
+        if self._burst == 0:
+            self._burst_began = now
+            asyncio.get_running_loop().call_soon(self._end_burst)
+        self._burst += 1
+        if self._burst > self._max_queued:
+            raise OverloadedError(f"more than {self._max_queued} requests are waiting in this replica: try again")
+        if now - self._burst_began > self.max_wait_s:
+            raise OverloadedError(
+                f"requests wait longer than {self.max_wait_s * 1e3:g} ms in this replica: try again shortly"
+            )
+        return self._burst_began
+
+    def _end_burst(self) -> None:
+        self.longest = max(self.longest, self._burst)
+        self._burst = 0
+
+    @contextlib.contextmanager
+    def reading_body(self) -> Iterator[None]:
+        """Count a request whose body has come in part. Raises OverloadedError."""
+        if self.incoming >= self._max_incoming:
+            raise OverloadedError(f"{self.incoming} requests are still being sent to this server: try again shortly")
+        self.incoming += 1
+        try:
+            yield
+        finally:
+            self.incoming -= 1
+
+    def open_stream(self) -> None:
+        """Count an open stream. Raises OverloadedError."""
+        if self.streams >= self._max_streams:
+            raise OverloadedError(f"{self.streams} streams are open in this replica: close one, or try again shortly")
+        self.streams += 1
+
+    def close_stream(self) -> None:
+        """Count it no longer."""
+        self.streams -= 1
+
+
+class RequestHandler:
+    """Answers requests, and is the one place that admits, counts, logs and times them; every protocol has the same."""
+
+    def __init__(
+        self,
+        store_provider: StoreProvider,
+        settings: ServerSettings,
+        replica: str = "",
+        *,
+        control: PlanFollower | None = None,
+        is_alone: bool = True,
+    ) -> None:
+        """`store_provider` gives None for as long as the policies are being loaded.
+
+        Reads the keys that `settings` name; `replica` names this process in the metrics; with a `control` what is
+        served can change while the server runs; `is_alone` says whether every request reaches this process.
+        Raises UsageError.
+        """
+        self.control = control
+        self.replica = replica
+        self.keys = CurrentKeys(settings)
+        self._store_provider = store_provider
+        self._max_batch = settings.max_batch
+        self.settings = settings
+        self.admission = Admission(settings)
+        self.episodes = Episodes(
+            max_sessions=settings.max_sessions,
+            idle_s=settings.session_idle_s,
+            store=_session_store(settings),
+            is_alone=is_alone,
+        )
+        self.metrics = Metrics(replica)
+        self.log = RequestLog(settings)
+        self.shadows = Shadows(self.metrics.record_differences)
+        self.recorder: RequestRecorder | None = None
+        if settings.record is not None:
+            from rlservo.serve_app.server.request_recorder import RequestRecorder  # which needs an extra
+
+            self.recorder = RequestRecorder(settings)
+            self.episodes.marks_states = True
+
+    async def close(self) -> None:
+        """Close connections to other services."""
+        if self.episodes.store is not None:
+            await self.episodes.store.close()
+
+    @property
+    def ready(self) -> bool:
+        """Whether the policies are loaded."""
+        return self._store_provider() is not None
+
+    def has(self, name: str, version: str | None = None) -> bool:
+        """Whether a policy, in this version or under this alias, is loaded."""
+        store = self._store_provider()
+        try:
+            return store is not None and bool(store.get(name, version))
+        except UnknownPolicyError:
+            return False
+
+    def policies(self) -> Iterator[tuple[str, str, Policy]]:
+        """Yield (name, version, policy) of all that are loaded."""
+        store = self._store_provider()
+        if store is not None:
+            for name in store.names:
+                for version in store.versions(name):
+                    yield name, version, store.get(name, version)
+
+    def store(self) -> PolicyStore:
+        """Return the policies. Raises UnavailableError while they are being loaded."""
+        store = self._store_provider()
+        if store is None:
+            raise UnavailableError("the policies are still being loaded: try again shortly")
+        return store
+
+    async def answer(self, codec: Codec[Source, Reply], request: Request, source: Source) -> Reply:
+        """Return the reply. What the codec reads it reads from `source`.
+
+        Raises RlservoError, which has been counted and logged, and ClientGoneError.
+        """
+        try:
+            content = await codec.receive(request, source)
+            self._admit(request)
+            self.store()  # not ready comes before any fault of the request
+            codec.parse(request, content)
+            if request.label is not None or request.episode is not None:
+                _check_names(request)
+            if request.non_finite:
+                decision = await self._decide_non_finite(request)
+            else:
+                decision = await self.decide(request)
+            reply = codec.encode(request, decision)
+        except ClientGoneError:
+            raise
+        except RlservoError as error:
+            asked, counted_as = blamed_version(error), self._counted_as(request, error)
+            self.record_failure(request, error.code, error.message, asked=asked, counted_as=counted_as)
+            if self.recorder is not None:
+                self.recorder.note_failure(request, self._store_provider(), error)
+            raise
+        except Exception as error:
+            self.record_bug(request, asked=blamed_version(error))
+            raise InternalError(BUG) from error
+        taken = time.perf_counter() - request.received
+        self.metrics.record_answer(request.protocol, decision, taken)
+        if request.episode is not None and request.episode.final_status is not None:
+            self._count_end(request, decision, request.episode.final_status)
+        if self.recorder is not None:
+            self.recorder.note_answer(request, decision, taken)
+        if self.log.every:
+            self.log.write_answer(request, decision, taken)
+        return reply
+
+    async def decide(self, request: Request) -> Decision:
+        """Decide, unless its deadline has passed.
+
+        Raises DeadlineError, LateError, SessionError, TooLargeError, UnavailableError and what `PolicyStore.act` and
+        `Episodes.act` raise.
+        """
+        store, name, obs = self.store(), request.policy, request.obs
+        if request.deadline_ms is not None and (time.perf_counter() - request.received) * 1e3 >= request.deadline_ms:
+            check_deadline(request)  # raises: it is later by now
+        single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
+        if (len(obs) if single else most_rows(obs)) > self._max_batch:
+            self._check_batch(store, request)
+        if request.episode is not None or request.stream is not None:
+            decision = await self.episodes.act(store, request)
+        elif store.batches and not request.explore:
+            check = partial(_check_again, request, time.perf_counter(), self.admission.max_wait_s)
+            decision = await store.act_together(name, request.version, obs, label=request.label, check=check)
+        else:
+            decision = store.act(
+                name, request.version, obs, explore=request.explore, seed=request.seed, label=request.label
+            )
+        shadow = store.shadow(name)
+        if shadow is not None and decision.version == shadow.of and not request.explore:
+            self.shadows.offer(shadow, obs, decision)
+        return decision
+
+    def record_failure(
+        self,
+        request: Request,
+        code: str,
+        sentence: str,
+        *,
+        peer: str | None = None,
+        asked: str | None = None,
+        counted_as: str | None = None,
+    ) -> None:
+        """Count and log a request that got no action; names that are not loaded are not told apart.
+
+        `peer` is the address it came from, for the log of what was refused before it was routed; `asked` is the version
+        that was asked and failed, where it came so far; `counted_as` is the code in the metrics, where it is another.
+        """
+        name, version = request.policy, request.version
+        store = self._store_provider()
+        if store is None or name not in store.names:
+            name = version = ""
+        elif asked is not None:
+            version = asked
+        else:  # an alias is counted as the version it leads to, no version as the default
+            version = store.default(name) if version is None else store.version_of(name, version)
+        self.metrics.count_failure(request.protocol, name, version, counted_as or code)
+        self.log.write_failure(request, code, sentence, peer=peer)
+
+    def record_bug(self, request: Request, *, asked: str | None = None) -> None:
+        """Count a request that failed by the exception that is being handled, and log that with its traceback."""
+        logger.exception("a request failed", extra={FIELDS: {"request_id": request.request_id}})
+        # Unless a version was asked: what failed may be the policies.
+        name, version = ("", "") if asked is None else (request.policy, asked)
+        self.metrics.count_failure(request.protocol, name, version, InternalError.code)
+
+    def open_stream(self, request: Request) -> None:
+        """Count a stream that opens, from whose opening `request` is. Raises OverloadedError."""
+        try:
+            self.admission.open_stream()
+        except OverloadedError as error:
+            self.record_failure(request, error.code, error.message)
+            raise
+        self.metrics.count_stream(request.policy, 1)
+
+    def close_stream(self, request: Request) -> None:
+        """Count it no longer."""
+        self.admission.close_stream()
+        self.metrics.count_stream(request.policy, -1)
+
+    def _count_end(self, request: Request, decision: Decision, status: str) -> None:
+        """Count an episode that ended, unless chance gave its requests to one version or another."""
+        carries_state = decision.episode is not None and decision.episode.state is not None
+        drawn = request.version is None and not carries_state and self.store().is_drawn(decision.name, request.label)
+        if not drawn and not decision.is_repeat:
+            self.metrics.count_end(decision, status)
+
+    def _admit(self, request: Request) -> None:
+        """Raise OverloadedError or LateError; a wait before `received` begins to count."""
+        if request.stream_id is not None:  # request and reply alternate there, so that the streams' number is the bound
+            if not request.is_fresh:
+                self.admission.check_age()
+            return
+        # Only now, when the body is here: one that is slow to come waits for itself.
+        request.received = min(request.received, self.admission.enter())
+
+    def _counted_as(self, request: Request, error: RlservoError) -> str:
+        """Return what a failure is counted as: its code, or STRICTER where the version that was asked is at fault.
+
+        Most observations that a version refuses every version would, and they say nothing of it. One that production
+        takes does, even where the refusal is what the version's contract says.
+        """
+        version, store = blamed_version(error), self._store_provider()
+        if version is None or store is None or not isinstance(error, ObservationError):
+            return error.code
+        with contextlib.suppress(RlservoError):
+            production = store.get(request.policy)
+            if production.contract.version != version:
+                production.parse(request.obs)
+                return STRICTER
+        return error.code
+
+    async def _decide_non_finite(self, request: Request) -> Decision:
+        """Refuse what JSON does not have, by the sentence of the element where it is one of the observation's."""
+        if request.episode is None:  # else a session would move on
+            try:
+                await self.decide(request)
+            except ObservationError as error:
+                raise ObservationError(f"{error.message}; JSON has no NaN or Infinity", error.details) from error
+        raise RequestError("the request body holds NaN or Infinity, which JSON does not have: send finite numbers")
+
+    def _check_batch(self, store: PolicyStore, request: Request) -> None:
+        rows = count_rows(store.get(request.policy, request.version).contract.observation_space, request.obs)
+        if rows > self._max_batch:
+            raise TooLargeError(f"a batch of {rows} observations is too large: at most {self._max_batch}")
+
+
+def _check_names(request: Request) -> None:
+    """Refuse a key where an episode's name or end belongs: recordings, metrics and logs would have it."""
+    episode = request.episode or Episode()
+    said = {"x-session-id": request.label, "session_id": episode.session_id, "final_status": episode.final_status}
+    for name, text in said.items():
+        if type(text) is str and A_KEY.search(text):
+            request.label = request.episode = None
+            raise RequestError(f"'{name}' holds an API key, which would be recorded: send a name of your own")
+
+
+def _session_store(settings: ServerSettings) -> RedisSessions | None:
+    """Return the store of sessions that several processes share, where one is set. Raises UsageError."""
+    if settings.session_store == MEMORY:
+        return None
+    from rlservo.serve_app.episodes.redis_sessions import RedisSessions  # only servers with several workers need it
+
+    return RedisSessions(settings.session_store, idle_s=settings.session_idle_s, patience_s=settings.max_queue_ms / 1e3)
+
+
+def _check_again(request: Request, since: float, limit_s: float) -> None:
+    """Check an observation that was gathered for a batch, and waited for those before it."""
+    if time.perf_counter() - since > limit_s:
+        raise LateError(f"the observation waited longer than {limit_s * 1e3:g} ms for its batch: send a newer one")
+    if request.deadline_ms is not None:
+        check_deadline(request)

@@ -1,0 +1,266 @@
+"""Versions that one process serves: it follows the plan, and takes commands that change it.
+
+A process swaps one store for the next and keeps the old one where it cannot follow. What touches bundles or plans
+happens in threads, with a time-out, and nothing is locked meanwhile: requests and other changes go on, also where a
+file system hangs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Awaitable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from rlservo.export.contract.contract import version_key
+from rlservo.export.contract.errors import BundleError, RefusedError, RlservoError, UnavailableError
+from rlservo.serve_app.repository.remote_repository import Key
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions.plan_files import PlanFiles
+from rlservo.serve_app.versions.plan_writer import Change, PlanWriter
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.serving_plan import Plan, PolicyPlan, ServedConfig, timestamp
+from rlservo.serve_app.versions.version_loader import Loadable, VersionLoader
+
+logger = logging.getLogger(__name__)
+
+RETRY_PERIOD_S = 30.0  # [s] between attempts at a version that could not be loaded
+REFUSED_PERIOD_S = 300.0  # [s] between attempts at a new version that was refused, when nobody asked for it
+
+
+@dataclass(frozen=True)
+class VersionState:
+    """How one version stands in this process."""
+
+    state: str  # loading, ready or failed
+    reason: str = ""
+    loaded_at: str | None = None
+
+
+class PlanFollower:
+    """Versions that this process serves, and their changes."""
+
+    def __init__(self, loader: VersionLoader, files: PlanFiles, *, replica: str = "") -> None:
+        self.store: PolicyStore | None = None
+        self.plan: Plan | None = None
+        self.replica = replica
+        self._loader = loader
+        self._files = files
+        self._writer = PlanWriter(loader, files)
+        self._served: dict[str, set[str]] = {}  # every identity that was ever served here, by name
+        self._failed: dict[Loadable, RlservoError] = {}  # why this process serves something older than the plan
+        self._refused: dict[Key, str] = {}  # by the last command that this process took
+        self._tried_at = 0.0
+        self._config = ServedConfig()  # which versions may be loaded without being asked for
+
+    @property
+    def place(self) -> str:
+        """Where the plan is."""
+        return self._files.place
+
+    @property
+    def behind(self) -> tuple[str, ...]:
+        """Why this process serves something older than the plan, a sentence per version."""
+        return tuple(error.message for error in self._failed.values())
+
+    async def configure(self, document: Any) -> None:
+        """Serve the plan; where the repository has none yet, first write the one that a configuration means.
+
+        Raises UsageError, BundleError and UnavailableError.
+        """
+        self._config = ServedConfig.parse(document)
+        held: list[Policy] = []
+        plan = await self._writer.at_start(self._config, held)
+        if document and not plan_changes.agrees(plan, self._config):
+            logger.warning(
+                "plan %d in %s (%s) says otherwise than the configuration, and holds: `rlservo policy` changes it",
+                plan.generation,
+                self.place,
+                plan.changed_by,
+            )
+        await self._apply(plan)
+
+    async def load(self, name: str, version: str | None, *, what: str) -> Plan:
+        """Add a version of the repository (None: the newest) as `PlanWriter.load` does, and follow."""
+        held: list[Policy] = []
+        return await self._carry_out(self._writer.load(name, version, what=what, known=self._generation(), held=held))
+
+    async def change(self, change: Change, *, what: str) -> Plan:
+        """Make a change as `PlanWriter.change` does; return the plan when this process serves it."""
+        held: list[Policy] = []
+        return await self._carry_out(self._writer.change(change, what=what, known=self._generation(), held=held))
+
+    async def _carry_out(self, writing: Awaitable[Plan]) -> Plan:
+        self._refused = {}
+        try:
+            plan = await writing
+        except RefusedError as error:
+            self._refused = {
+                (each["name"], each["version"]): each["reason"] for each in error.details.get("versions", ())
+            }
+            raise
+        self._try_again()
+        await self._apply(plan)
+        return plan
+
+    def _generation(self) -> int:
+        if self.plan is None:
+            raise UnavailableError("the policies are still being loaded: try again shortly")
+        return self.plan.generation
+
+    async def follow(self) -> None:
+        """Serve the newest plan if another one is served, and try again what could not be loaded a while ago."""
+        plan = await self._writer.after(self._generation())
+        if self._failed and time.monotonic() - self._tried_at > RETRY_PERIOD_S and self._try_again():
+            plan = plan or self.plan
+        if plan is not None:
+            await self._apply(plan)
+
+    def _try_again(self) -> bool:
+        """Forget what could not be loaded, but not what is still being waited for: a file system may hang."""
+        before, self._failed = self._failed, {k: e for k, e in self._failed.items() if k[:2] in self._loader.loading}
+        return self._failed != before
+
+    async def poll_plan(self) -> None:
+        """Follow the plans that others write, until cancelled."""
+        telling = asyncio.create_task(self._tell_newer())  # where files hang, the plan is followed all the same
+        try:
+            await self._follow_always()
+        finally:
+            telling.cancel()
+
+    async def _tell_newer(self) -> None:
+        with contextlib.suppress(UnavailableError):
+            digests, _ = await self._loader.look()
+            newer = ", ".join(" ".join(key) for key in self._newer(digests)[:10])
+            if newer:
+                number = self._generation()
+                logger.warning("newer than what plan %d has, and not loaded: %s (`rlservo policy load`)", number, newer)
+
+    async def _follow_always(self) -> None:
+        told = ""
+        while True:
+            await asyncio.sleep(self._files.poll_s)
+            try:
+                await self.follow()
+                told = ""
+            except Exception as error:  # it may be out of reach for a while; what is served goes on
+                if str(error) != told:
+                    logger.warning("the plan cannot be followed, what is served goes on: %s", error)
+                told = str(error)
+
+    async def poll_repository(self, period_s: float) -> None:
+        """Load what is newer than all versions that the plan knows of a policy, as `load` does, until cancelled.
+
+        What the configuration leaves out is left out here, too; what an operator unloads stays unloaded.
+        """
+        refused_until: dict[Loadable, float] = {}
+        told: set[str] = set()
+        while True:
+            await asyncio.sleep(period_s)
+            try:
+                digests, errors = await self._loader.look()
+                wrong = {error.message for error in errors}
+                for name, version in self._newer(digests):
+                    key = (name, version, digests[name, version])
+                    if time.monotonic() < refused_until.get(key, 0.0):
+                        continue
+                    try:
+                        add = partial(plan_changes.load, name=name, version=version, digest=key[2])
+                        await self.change(add, what=f"poll {name} {version}")
+                    except UnavailableError as error:
+                        wrong.add(error.message)
+                    except RlservoError as error:
+                        wrong.add(error.message)
+                        refused_until[key] = time.monotonic() + REFUSED_PERIOD_S
+            except Exception as error:
+                wrong = {str(error)}
+            for sentence in sorted(wrong - told):
+                logger.warning("looking for new versions, what is served goes on: %s", sentence)
+            told = wrong
+
+    def _newer(self, digests: Mapping[Key, str]) -> list[Key]:
+        """Return the versions that a policy's known ones are all older than; of an unknown policy only the newest."""
+        policies = {} if self.plan is None else self.plan.policies
+        newer: list[Key] = []
+        for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1]))):
+            listed, known = self._config.policies.get(name), policies.get(name)
+            if self._config.unlisted == "ignore" if listed is None else listed.versions is not None:
+                continue
+            if known is None and newer and newer[-1][0] == name:
+                newer.pop()
+            before = () if known is None else (*known.versions, *known.unloaded)
+            if all(version_key(version) > version_key(each) for each in before):
+                newer.append((name, version))
+        return newer
+
+    def states(self) -> dict[str, dict[str, VersionState]]:
+        """Return how every version stands that is served, should be, or was refused."""
+        states = {key: VersionState("failed", reason) for key, reason in self._refused.items()}
+        states.update({key[:2]: VersionState("failed", error.message) for key, error in self._failed.items()})
+        for name, policy in ({} if self.store is None else self.store.plans).items():
+            for version, digest in policy.versions.items():
+                loaded = self._loader.get(name, version, digest)
+                if loaded is not None:
+                    reason = states[name, version].reason if (name, version) in states else ""
+                    states[name, version] = VersionState("ready", reason, timestamp(loaded.loaded_at))
+        states.update({key: VersionState("loading") for key in self._loader.loading if key not in states})
+        by_name: dict[str, dict[str, VersionState]] = {}
+        for (name, version), state in sorted(states.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
+            by_name.setdefault(name, {})[version] = state
+        return by_name
+
+    async def _apply(self, plan: Plan) -> None:
+        """Serve a plan: policy by policy as a whole, so that one which cannot be loaded stays as it was.
+
+        Raises BundleError when this process serves nothing yet and a default version cannot be loaded.
+        """
+        self._tried_at = time.monotonic()
+        found: dict[Loadable, Policy | RlservoError] = {}
+        for name, wanted in plan.policies.items():
+            for version, digest in wanted.versions.items():
+                key = (name, version, digest)
+                try:
+                    found[key] = self._failed.get(key) or await self._loader.load(*key)
+                except RlservoError as error:
+                    found[key] = error
+        self._arrange(plan, found)
+        await self._loader.touch([digest for _, _, digest in found])
+
+    def _arrange(self, plan: Plan, found: Mapping[Loadable, Policy | RlservoError]) -> None:
+        """Serve a plan with what of it could be loaded. Nothing waits here: a request sees the old or the new."""
+        if self.plan is not None and plan.generation < self.plan.generation:
+            return  # while this one was being loaded, a later one has been served
+        serving: dict[str, PolicyPlan] = {}
+        kept: list[Policy] = []
+        for name, wanted in plan.policies.items():
+            keys = [(name, version, digest) for version, digest in wanted.versions.items()]
+            errors = {key[1]: error for key in keys if isinstance(error := found[key], RlservoError)}
+            was = None if self.store is None else self.store.plans.get(name)
+            if errors and was is not None:
+                wanted = was
+                keys = [(name, version, digest) for version, digest in was.versions.items()]
+            elif errors and wanted.default in errors:
+                if self.store is not None:
+                    continue  # not served here rather than as another version; `behind` says so
+                raise BundleError(
+                    f"policy '{name}' cannot be served as version {wanted.default}, its default in plan "
+                    f"{plan.generation} of {self.place}: {errors[wanted.default].message}"
+                )
+            serving[name] = wanted
+            kept += [policy for key in keys if (policy := self._loader.get(*key)) is not None]
+        for policy in kept:
+            self._served.setdefault(policy.contract.name, set()).add(policy.identity)
+        changed = [name for name, identities in self._served.items() if len(identities) > 1]
+        self.store = PolicyStore(kept, serving, changed=changed, replaces=self.store)
+        self.plan = plan
+        self._failed = {key: each for key, each in found.items() if isinstance(each, RlservoError)}
+        if self._failed:
+            logger.error("plan %d cannot be served as it should: %s", plan.generation, "; ".join(self.behind))
+        else:
+            logger.info("serving plan %d (%s)", plan.generation, plan.changed_by)

@@ -1,0 +1,474 @@
+"""Several processes over one plan in a repository, with real bundles: who serves what, and who is told."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rlservo.export.contract.errors import (
+    BundleError,
+    ConflictError,
+    RefusedError,
+    RlservoError,
+    UnavailableError,
+    UsageError,
+)
+from rlservo.serve_app.repository.repository import Repository
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions.plan_files import FOLDER, PlanFiles
+from rlservo.serve_app.versions.plan_follower import PlanFollower
+from rlservo.serve_app.versions.plan_writer import Change, PlanWriter
+from rlservo.serve_app.versions.serving_plan import Canary, Plan
+from rlservo.serve_app.versions.version_loader import VersionLoader
+
+OBS = np.zeros(27, np.float32) + 0.1
+
+
+class Fleet:
+    """Processes that share a plan. Each has folders of its own, as on several nodes."""
+
+    def __init__(self, plans: Path, *folders: Path) -> None:
+        self.plans = plans
+        self.controls = [self.start(folder, f"r{n}") for n, folder in enumerate(folders)]
+
+    def start(self, folder: Path, name: str) -> PlanFollower:
+        return PlanFollower(VersionLoader(Repository([folder])), self.files, replica=name)
+
+    @property
+    def files(self) -> PlanFiles:
+        return PlanFiles([], root=str(self.plans))
+
+    async def deploy(self, document: Any) -> None:
+        for control in self.controls:
+            await control.configure(document)
+
+    async def follow(self) -> None:
+        for control in self.controls:
+            await control.follow()
+
+    def defaults(self) -> list[str]:
+        return [control.store.default("ur5") if control.store else "" for control in self.controls]
+
+    def numbers(self) -> set[int]:
+        return {control.plan.generation for control in self.controls if control.plan}
+
+
+def config(*versions: str, production: str, **more: Any) -> dict[str, Any]:
+    return {
+        "policies": {"ur5": {"versions": list(versions), "aliases": {"production": production}, **more}},
+        "unlisted": "ignore",
+    }
+
+
+def aliasing(version: str, alias: str = "production") -> Change:
+    return lambda before: plan_changes.set_alias(before, "ur5", alias, version)
+
+
+@pytest.fixture
+def folder(policies: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(policies, tmp_path / "node", ignore=shutil.ignore_patterns(FOLDER)))
+
+
+def break_weights(folder: Path, version: str) -> None:
+    (folder / "ur5" / version / "policy.onnx").write_bytes(b"nothing")
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    for _ in range(1000):
+        if condition():
+            return
+        await asyncio.sleep(0.02)
+    pytest.fail("it did not come about within 20 s")
+
+
+def test_a_change_is_served_by_who_took_it_when_it_answers_and_by_the_others_within_a_second(folder: Path) -> None:
+    async def run() -> None:
+        fleet = Fleet(folder, folder, folder, folder)
+        await fleet.deploy(config("1", production="1"))
+        first, second, third = fleet.controls
+        polls = [asyncio.create_task(control.poll_plan()) for control in (second, third)]
+        held = second.store
+        await first.load("ur5", "2", what="load ur5 2")
+        plan = await first.change(aliasing("2"), what="alias ur5 production=2")
+        assert fleet.defaults()[0] == "2" and first.plan == plan and plan.generation == 3
+        began = asyncio.get_running_loop().time()
+        await until(lambda: fleet.defaults() == ["2", "2", "2"])
+        assert asyncio.get_running_loop().time() - began < 1.5  # on a busy machine
+        assert held is not None and held.default("ur5") == "1"  # a request that began with the old store ends with it
+        held.act("ur5", None, OBS)
+        assert fleet.numbers() == {3}
+        for poll in polls:
+            poll.cancel()
+
+    asyncio.run(run())
+    files = sorted((folder / FOLDER).iterdir())
+    assert [file.name for file in files] == ["000000001.json", "000000002.json", "000000003.json"]
+    assert [json.loads(file.read_text())["changed_by"] for file in files] == [
+        "configuration",
+        "load ur5 2",
+        "alias ur5 production=2",
+    ]
+
+
+def test_of_two_operators_at_once_one_wins_and_the_other_is_told(folder: Path, tmp_path: Path) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder, folder, folder)
+        await fleet.deploy(config("1", "2", "10", production="1"))
+        versions = ("2", "10", "10")  # two of the three want the same
+        outcomes = await asyncio.gather(
+            *(
+                control.change(aliasing(version), what=f"alias ur5 production={version}")
+                for control, version in zip(fleet.controls, versions, strict=True)
+            ),
+            return_exceptions=True,
+        )
+        await fleet.follow()
+        (won,) = set(fleet.defaults())
+        for version, outcome in zip(versions, outcomes, strict=True):
+            if version == won:
+                assert isinstance(outcome, Plan)
+            else:
+                assert isinstance(outcome, ConflictError)
+                assert f"another command came first (plan 2: alias ur5 production={won})" in outcome.message
+        assert fleet.numbers() == {2}
+
+    asyncio.run(run())
+
+
+def test_two_operators_that_roll_back_at_once_go_back_once(folder: Path, tmp_path: Path) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder, folder)
+        await fleet.deploy(config("1", "2", "10", production="1"))
+        for version in ("2", "10"):
+            await fleet.controls[0].change(aliasing(version), what="alias")
+        await fleet.follow()
+        await asyncio.gather(
+            *(
+                c.change(lambda p: plan_changes.roll_back(p, "ur5", "production"), what="rollback")
+                for c in fleet.controls
+            )
+        )
+        await fleet.follow()
+        assert fleet.defaults() == ["2", "2"] and fleet.numbers() == {4}
+
+    asyncio.run(run())
+
+
+def test_changes_of_different_things_at_once_are_all_made(folder: Path, tmp_path: Path) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder, folder)
+        await fleet.deploy({})
+        first, second = fleet.controls
+        await asyncio.gather(
+            first.change(aliasing("1", "candidate"), what="alias"),
+            second.change(aliasing("2", "old"), what="alias"),
+            first.change(lambda p: plan_changes.set_shadow(p, "ur5", "2"), what="shadow"),
+            second.change(lambda p: plan_changes.set_alias(p, "gridworld", "candidate", "1"), what="alias"),
+        )
+        await fleet.follow()
+        assert fleet.numbers() == {5}
+        for control in fleet.controls:
+            assert control.plan is not None
+            ur5, gridworld = control.plan.policies["ur5"], control.plan.policies["gridworld"]
+            assert (ur5.aliases["candidate"], ur5.aliases["old"], ur5.shadow) == ("1", "2", "2")
+            assert gridworld.aliases["candidate"] == "1"
+
+    asyncio.run(run())
+
+
+def test_a_version_that_fails_is_refused_before_anything_is_written(folder: Path) -> None:
+    async def run() -> None:
+        fleet = Fleet(folder, folder)
+        await fleet.deploy(config("1", production="1"))
+        (control,) = fleet.controls
+        break_weights(folder, "2")
+        with pytest.raises(RefusedError, match=r"nothing has changed: .*policy.onnx is not the file") as caught:
+            await control.load("ur5", "2", what="load ur5 2")
+        assert caught.value.details["versions"][0]["version"] == "2"
+        assert fleet.numbers() == {1} and len(list((folder / FOLDER).iterdir())) == 1
+        assert control.states()["ur5"]["1"].state == "ready" and control.states()["ur5"]["1"].loaded_at is not None
+        with pytest.raises(ConflictError):
+            await control.change(lambda p: plan_changes.unload(p, "ur5", "1"), what="unload")
+        await control.change(aliasing("1"), what="alias ur5 production=1")  # as it is: nothing to write
+        assert fleet.numbers() == {1} and len(list((folder / FOLDER).iterdir())) == 1
+
+    asyncio.run(run())
+
+
+def test_golden_vectors_that_are_not_reproduced_refuse_a_version(
+    folder: Path, box_policy: Callable[..., Path], tmp_path: Path
+) -> None:
+    other = box_policy(tmp_path / "other", version="11", seed=5)
+    target = Path(shutil.copytree(folder / "ur5" / "10", folder / "ur5" / "11"))
+    shutil.copy(other / "contract.json", target)
+    for name in ("policy.onnx", "SHA256SUMS"):
+        shutil.copy(other / name, target)
+    sums = (target / "SHA256SUMS").read_text().splitlines()
+    golden = next(line for line in (folder / "ur5" / "10" / "SHA256SUMS").read_text().splitlines() if "golden" in line)
+    (target / "SHA256SUMS").write_text("\n".join([golden if "golden" in line else line for line in sums]) + "\n")
+
+    async def run() -> None:
+        fleet = Fleet(folder, folder)
+        await fleet.deploy(config("10", production="10"))
+        with pytest.raises(RefusedError, match="golden"):
+            await fleet.controls[0].load("ur5", "11", what="load")
+
+    asyncio.run(run())
+
+
+def test_a_configuration_begins_a_plan_and_commands_rule_after(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder, folder)
+        break_weights(folder, "2")
+        for wrong, kind in (
+            (config("1", "2", production="1"), RlservoError),
+            ({"policies": 7}, UsageError),
+            (config("1", "99", production="1"), RlservoError),
+        ):
+            with pytest.raises(kind):
+                await fleet.deploy(wrong)
+            assert not (tmp_path / FOLDER).exists()
+        await fleet.deploy(config("1", "10", production="1"))
+        assert "says otherwise" not in caplog.text
+        await fleet.controls[0].change(aliasing("10"), what="alias ur5 production=10")
+        whole_new_cluster = [fleet.start(folder, f"new{n}") for n in range(2)]
+        for control in whole_new_cluster:
+            await control.configure(config("1", "10", production="1"))
+            assert control.store is not None and control.store.default("ur5") == "10"
+        assert caplog.text.count("plan 2 in") == 2 and "says otherwise than the configuration, and holds" in caplog.text
+
+    asyncio.run(run())
+
+
+def test_a_version_exported_since_is_not_in_use_by_itself_and_a_start_says_so(
+    folder: Path, box_policy: Callable[..., Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        await Fleet(folder, folder).deploy({})
+        box_policy(folder, version="11", seed=11)
+        fleet = Fleet(folder, folder)
+        await fleet.deploy({})
+        poll = asyncio.create_task(fleet.controls[0].poll_plan())
+        await until(lambda: "newer than what plan 1 has, and not loaded: ur5 11" in caplog.text)
+        assert fleet.defaults() == ["10"]
+        poll.cancel()
+
+    asyncio.run(run())
+
+
+def test_a_process_that_cannot_follow_keeps_what_it_had_and_tells_why(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere = Path(shutil.copytree(folder, tmp_path / "elsewhere"))
+    shutil.rmtree(elsewhere / "ur5" / "2")
+
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder, elsewhere)
+        await fleet.deploy(config("1", production="1"))
+        await fleet.controls[0].load("ur5", "2", what="load")
+        await fleet.controls[0].change(aliasing("2"), what="alias")
+        await fleet.follow()
+        assert fleet.defaults() == ["2", "1"] and fleet.numbers() == {3}
+        behind = fleet.controls[1]
+        assert "has no version '2' of policy 'ur5' any more" in behind.behind[0]
+        assert behind.states()["ur5"]["2"].state == "failed"
+        await behind.follow()  # it is not tried again at every look
+        shutil.copytree(folder / "ur5" / "2", elsewhere / "ur5" / "2")
+        await behind.follow()
+        assert fleet.defaults() == ["2", "1"]
+        monkeypatch.setattr("rlservo.serve_app.versions.plan_follower.RETRY_PERIOD_S", 0.0)
+        await behind.follow()
+        assert fleet.defaults() == ["2", "2"] and behind.behind == ()
+
+    asyncio.run(run())
+
+
+def test_the_same_version_is_the_same_bundle_in_every_process(
+    folder: Path, box_policy: Callable[..., Path], tmp_path: Path
+) -> None:
+    async def run() -> None:
+        fleet = Fleet(folder, folder)
+        document = config("1", "2", production="1")
+        await fleet.deploy(document)
+        store = fleet.controls[0].store
+        assert store is not None
+        action = store.act("ur5", "2", OBS).action
+        shutil.rmtree(folder / "ur5" / "2")
+        shutil.move(box_policy(tmp_path / "again", version="2", seed=9), folder / "ur5" / "2")
+        restarted = fleet.start(folder, "restarted")  # its default is there; the exchanged version is not served
+        await restarted.configure(document)
+        assert restarted.store is not None and restarted.store.versions("ur5") == ("1",)
+        assert "is not the bundle that was accepted" in restarted.states()["ur5"]["2"].reason
+        await fleet.controls[0].load("ur5", "2", what="load")  # now it is
+        reloaded = fleet.controls[0].store
+        assert reloaded is not None and not np.allclose(reloaded.act("ur5", "2", OBS).action, action)
+
+    asyncio.run(run())
+
+
+def test_a_process_whose_default_is_gone_does_not_start(folder: Path) -> None:
+    async def run() -> None:
+        fleet = Fleet(folder, folder)
+        await fleet.deploy(config("1", "2", production="2"))
+        break_weights(folder, "2")
+        with pytest.raises(
+            BundleError, match=r"cannot be served as version 2, its default in plan 1 of .*/node/\.plan"
+        ):
+            await fleet.start(folder, "restarted").configure({})
+
+    asyncio.run(run())
+
+
+def test_canary_and_shadow_have_to_read_and_give_the_same(
+    folder: Path, discrete_policy: Callable[..., Path], rewrite_contract: Callable[..., None]
+) -> None:
+    discrete_policy(folder, name="ur5", version="12")
+
+    async def run() -> None:
+        fleet = Fleet(folder, folder)
+        await fleet.deploy(config("1", "12", production="1"))
+        control = fleet.controls[0]
+        with pytest.raises(RefusedError, match=r"version 12 cannot be the canary of version 1"):
+            await control.change(
+                lambda p: plan_changes.set_canary(p, "ur5", Canary(version="12", share=0.5)), what="canary"
+            )
+        with pytest.raises(RefusedError, match=r"version 12 cannot be the shadow of version 1"):
+            await control.change(lambda p: plan_changes.set_shadow(p, "ur5", "12"), what="shadow")
+        assert fleet.numbers() == {1}
+
+    asyncio.run(run())
+
+
+def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folder: Path, tmp_path: Path) -> None:
+    began, go_on = threading.Event(), threading.Event()
+
+    def slowly(bundle: Path) -> Policy:
+        if bundle.name == "2":
+            began.set()
+            assert go_on.wait(20)
+        return Policy.load(bundle)
+
+    async def run() -> None:
+        control = PlanFollower(VersionLoader(Repository([folder]), slowly), PlanFiles([folder]), replica="slow")
+        await control.configure(config("1", production="1"))
+        change = asyncio.create_task(control.load("ur5", "2", what="load"))
+        while not began.is_set():
+            await asyncio.sleep(0.01)
+        assert control.states()["ur5"]["2"].state == "loading"
+        assert control.store is not None and control.store.act("ur5", None, OBS).version == "1"
+        go_on.set()
+        await change
+        assert control.states()["ur5"]["2"].state == "ready" and control.store.versions("ur5") == ("1", "2")
+
+    asyncio.run(run())
+
+
+def test_a_version_that_takes_too_long_is_there_when_it_is_asked_for_again(folder: Path) -> None:
+    go_on = threading.Event()
+    loads: list[Path] = []
+
+    def slowly(bundle: Path) -> Policy:
+        loads.append(bundle)
+        assert bundle.name != "2" or go_on.wait(20)
+        return Policy.load(bundle)
+
+    async def run() -> None:
+        loader = VersionLoader(Repository([folder]), slowly, load_timeout_s=0.5)
+        control = PlanFollower(loader, PlanFiles([folder]))
+        await control.configure(config("1", production="1"))
+        with pytest.raises(UnavailableError, match=r"loading policy 'ur5' version 2 took longer than 0.5 s"):
+            await control.load("ur5", "2", what="load")
+        go_on.set()
+        await until(lambda: not loader.loading)
+        await control.load("ur5", "2", what="load")
+        assert [path.name for path in loads] == ["1", "2"]
+
+    asyncio.run(run())
+
+
+def test_names_and_versions_do_not_leave_the_repository(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "ur5" / "1", tmp_path / "secret" / "1")
+    repository = Repository([folder])
+    for name, version in (("../secret", "1"), ("ur5", "../../secret/1"), ("..", None), ("", None), ("ur5/1", None)):
+        with pytest.raises(Exception, match="the repository has no"):
+            repository.find_digest(name, version)
+
+
+def test_nothing_changes_before_the_policies_are_loaded(folder: Path) -> None:
+    async def run() -> None:
+        with pytest.raises(UnavailableError, match="still being loaded"):
+            await Fleet(folder, folder).controls[0].change(aliasing("1"), what="alias")
+
+    asyncio.run(run())
+
+
+def test_a_command_without_a_server_begins_the_plan_that_servers_then_serve(folder: Path) -> None:
+    async def run() -> None:
+        def writer() -> PlanWriter:
+            return PlanWriter(VersionLoader(Repository([folder])), PlanFiles([folder]))
+
+        plan = await writer().change(aliasing("1"), what="alias ur5 production=1")
+        assert plan.generation == 1 and plan.policies["ur5"].history == {"production": ("10",)}
+        fleet = Fleet(folder, folder)
+        await fleet.deploy({})
+        assert fleet.defaults() == ["1"]
+        break_weights(folder, "2")
+        with pytest.raises(RefusedError, match=r"policy\.onnx is not the file"):
+            await writer().change(aliasing("2"), what="alias ur5 production=2")
+        await fleet.follow()
+        assert fleet.numbers() == {1}
+
+    asyncio.run(run())
+
+
+def test_a_plan_that_is_no_plan_stops_nobody_and_a_lost_one_is_not_begun_again(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder)
+        await fleet.deploy(config("1", production="1"))
+        (control,) = fleet.controls
+        poll = asyncio.create_task(control.poll_plan())
+        following = tmp_path / FOLDER / "000000002.json"
+        following.write_text('{"generation": 2, "policies": {}, "by": "a later rlservo"}')
+        await until(lambda: "000000002.json is no plan that this rlservo reads" in caplog.text)
+        await asyncio.sleep(1.2)
+        assert caplog.text.count("is no plan") == 1 and fleet.defaults() == ["1"]
+        following.unlink()
+        shutil.move(tmp_path / FOLDER, tmp_path / "away")
+        with pytest.raises(UnavailableError, match="has lost plan 1, which is served here"):
+            await control.change(aliasing("1", "candidate"), what="alias")
+        shutil.move(tmp_path / "away", tmp_path / FOLDER)
+        await control.change(aliasing("1", "candidate"), what="alias")
+        poll.cancel()
+
+    asyncio.run(run())
+
+
+def test_the_plan_stands_in_the_first_place_that_can_be_written_or_in_the_users_state(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    bundle = folder / "ur5" / "1"
+    other = Path(shutil.copytree(folder, tmp_path / "other"))
+    assert PlanFiles([bundle, "https://host/policies", other, folder]).place == f"{other}/{FOLDER}"
+    assert PlanFiles([bundle, "s3://bucket/policies", other]).place == "s3://bucket/policies/.plan"
+    assert PlanFiles([folder], root=str(other)).place == f"{other}/{FOLDER}"
+    kept = PlanFiles([bundle, "https://host/policies"]).place
+    assert kept.startswith(f"{tmp_path}/state/rlservo/plans/") and kept != PlanFiles([bundle]).place
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    assert PlanFiles([folder]).place.startswith(f"{tmp_path}/state/")
+    (folder / FOLDER).mkdir()  # the operator's, who may write there
+    assert PlanFiles([folder]).place == f"{folder}/{FOLDER}"
