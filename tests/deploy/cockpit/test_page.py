@@ -18,7 +18,7 @@ from PIL import Image
 
 pytest.importorskip("viser", reason="the cockpit draws with viser")
 
-from cockpits import PATIENCE_S, Browser, Cockpit, Windows, cockpit_of, served_on, wait_for
+from cockpits import PATIENCE_S, TWO_FRAMES, Browser, Cockpit, Windows, cockpit_of, served_on, wait_for
 from rlservo.deploy.cockpit.drive import Drive
 from rlservo.deploy.cockpit.panel import DrivePanel
 from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
@@ -63,8 +63,10 @@ RIGHT_EDGES = """() => {
   const table = [...document.querySelectorAll("table")].at(-1);
   return [Math.max(...[...table.querySelectorAll("th, td")].map(right)), right(table.parentElement)];
 }"""
-# Where the README's picture goes: RLSERVO_PICTURES=examples pytest tests/deploy/cockpit/test_page.py -k picture
+# Where the documents' pictures go: RLSERVO_PICTURES=docs/images pytest tests/deploy/cockpit/test_page.py -k picture
 PICTURES = os.environ.get("RLSERVO_PICTURES")
+CYCLES = 44 if PICTURES else 3  # of the README's moving picture, at 10 Hz
+LARGEST_GIF_BYTES = 2 << 20
 
 
 @pytest.fixture(scope="module")
@@ -296,6 +298,18 @@ def test_a_picture_for_the_readme(cockpit: Cockpit, drive: Drive, window: Browse
     file = Path(PICTURES or tmp_path) / "cockpit.png"
     picture = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
     picture.quantize(256).save(file, optimize=True)
+    drive.do(lambda: drive.begin("own"))
+    moving = []
+    for _ in range(CYCLES):
+        window.page.evaluate(TWO_FRAMES)
+        moving.append(Image.open(io.BytesIO(window.page.screenshot())).convert("RGB").resize((960, 540)))
+        drive.do(drive.step)
+    palette = moving[-1].quantize(96)
+    frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in moving]
+    file = file.with_suffix(".gif")
+    frames[0].save(file, save_all=True, append_images=frames[1:], duration=100, loop=0, optimize=True)
+    assert file.stat().st_size < LARGEST_GIF_BYTES
+    assert len({frame.tobytes() for frame in frames}) == CYCLES  # the robot moves
     window.page.set_viewport_size({"width": 1000, "height": 560})
     drive.do(lambda: drive.choose_ghost(None))
     drive.do(drive.play)
