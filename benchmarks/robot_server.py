@@ -5,7 +5,7 @@
 A server manager and its robot servers run as processes of their own, as users run them. Steps are one UR5 command with
 its state (SendActionGetState, 1object) and one MiR100 command and its state (SendAction, GetState, lab_6x8), on one
 client of our own, which sends and reads messages and computes nothing. `--robo-gym` names the Python of environments
-with robo-gym (examples/robo_gym.md), whose own environments are measured as well: observations, rewards and protobuf
+with robo-gym (docs/how-to/robo-gym.md), whose own environments are measured as well: observations, rewards and protobuf
 are theirs. Medians of five rounds. Written to bench/robot_server.json too.
 """
 

@@ -6,7 +6,7 @@ Recordings (`rlservo rollout --record`, `WithRecording`, clients) become RLlib's
 them, before unsquash and clip; observations through the checkpoint's own connectors, filters as they stand. BC, MARWIL,
 CQL and IQL learn from whole episodes, starting at the checkpoint's weights where the algorithm has such a network. The
 result is a checkpoint that `rlservo export` takes. Without `--from` the network is new, and so is its observation
-filter: of the recorded observations. docs/learning.md has the whole path.
+filter: of the recorded observations. docs/how-to/learn.md has the whole path.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
     python examples/robo_gym_client.py    # a third, in robo-gym's environment
     python examples/robo_gym_client.py --task ObstacleAvoidanceMir100 --policy mir100_obstacle_avoidance
 
-robo-gym pins an old protobuf, so it cannot share an environment with Ray: examples/robo_gym.md says how to make its
+robo-gym pins an old protobuf, so it cannot share an environment with Ray: docs/how-to/robo-gym.md says how to make its
 own, and what must be done before `--rs-address` drives a real robot.
 
 Standard output has the report only: what robo-gym prints goes to standard error. Exit codes: 0, 1 for what failed, 2
@@ -32,7 +32,7 @@ import numpy as np
 
 from rlservo import PolicyClient, errors
 
-# robo-gym's names, and the policies that examples/robo_gym.md serves for them.
+# robo-gym's names, and the policies that docs/how-to/robo-gym.md serves for them.
 POLICIES = {
     "EndEffectorPositioningUR": "ur5",
     "NoObstacleNavigationMir100": "mir100",
@@ -119,13 +119,13 @@ def import_robo_gym() -> None:
         importlib.import_module("robo_gym")
     except ImportError as error:
         raise errors.RlservoError(
-            f"robo-gym cannot be imported in {sys.executable} ({error}): examples/robo_gym.md says how to make an "
+            f"robo-gym cannot be imported in {sys.executable} ({error}): docs/how-to/robo-gym.md says how to make an "
             "environment for it"
         ) from error
     except TypeError as error:  # protobuf's "Descriptors cannot be created directly"
         raise errors.RlservoError(
             "robo-gym cannot be imported with this protobuf: it needs one below 3.21, in an environment of its own "
-            "(examples/robo_gym.md)"
+            "(docs/how-to/robo-gym.md)"
         ) from error
 
 

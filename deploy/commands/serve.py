@@ -86,7 +86,7 @@ def serve(
     canary: CanaryOption = None,
     shadow: ShadowOption = None,
 ) -> None:
-    """Serve policies on this machine until Ctrl-C. On a cluster, Ray's `serve deploy` does it (docs/cluster.md).
+    """Serve policies on this machine until Ctrl-C. On a cluster use Ray's `serve deploy`.
 
     Example: `rlservo serve policies`, then
     `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`

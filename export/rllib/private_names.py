@@ -1,6 +1,6 @@
 """Private names of RLlib and Tune that restoring needs: where one is gone, the export is refused by name and version.
 
-docs/operations.md, "What must change for the next Ray", lists them.
+docs/reference/support.md lists them.
 """
 
 from __future__ import annotations

@@ -25,9 +25,9 @@ from rlservo.serve_app.replay.follower import FollowedEpisode, Follower
 LARGEST = 5_000_000  # numbers in one matrix of episodes by steps
 RESAMPLES = 1000
 CONFIDENCE = 0.95
-FEWEST_EPISODES = 600  # of 400, an ending of six in a thousand is too often in none (docs/recording.md)
+FEWEST_EPISODES = 600  # of 400, an ending of six in a thousand is too often in none
 FEWEST_FITTED = 30
-SMALLEST_SHARE = 0.5  # of effective episodes; below it the intervals miss the truth too often (docs/recording.md)
+SMALLEST_SHARE = 0.5  # of effective episodes; below it the intervals miss the truth too often
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def importance_sampling(trajectories: list[Trajectory], gamma: float, rng: np.ra
         resampled = np.nan_to_num(numerators / denominators).sum(axis=1)
         weighted = float(np.nan_to_num(discounted.sum(axis=0) / weights.sum(axis=0)).sum())
     plain = discounted.sum(axis=1)
-    # A few heavy weights make a bootstrap too sure of itself: measured, this much wider covers (docs/recording.md).
+    # A few heavy weights make a bootstrap too sure of itself: measured, this much wider covers.
     wider = float(np.sqrt(len(trajectories) / effective)) if effective > 0 else 1.0
     supported, reason = _support(len(trajectories), effective)
     return [

@@ -123,7 +123,7 @@ class ServerSettings(BaseModel):
     """How strict each policy is at its edges, by policy name; '*' is for the others. As a variable: a JSON object."""
 
     record: str | None = None
-    """Record every decision of the policies into this folder (`docs/recording.md`), but of those whose options say
+    """Record every decision of the policies into this folder (docs/how-to/record-and-replay.md), but of those whose options say
     `"record": false`. Observations may be private: off by default. `rlservo serve --record` sets it, too."""
 
     record_file_bytes: int = Field(256 << 20, ge=1 << 20)

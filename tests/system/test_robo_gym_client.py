@@ -1,6 +1,6 @@
 """The loop across both: a served policy drives robo-gym's own environment, from robo-gym's own Python.
 
-And examples/robo_gym.md, whose commands are run as they are written.
+And docs/how-to/robo-gym.md and real-arm.md, whose commands are run as they are written.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ EXAMPLE = ROOT / "examples" / "robo_gym_client.py"
 ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")  # what the fixture robo_gym_python installs
 CLIENT = ("httpcore>=1.0.6", "pydantic>=2.6")
 EPISODE_STEPS = 600  # after which robo-gym ends an episode of the UR
-DOCUMENT = (ROOT / "examples" / "robo_gym.md").read_text()
+DOCUMENT = "".join((ROOT / "docs" / "how-to" / name).read_text() for name in ("robo-gym.md", "real-arm.md"))
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 

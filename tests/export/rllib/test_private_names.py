@@ -40,6 +40,13 @@ def test_no_private_attribute_is_read_past_the_check() -> None:
     assert not past
 
 
+def test_the_documents_table_has_every_name() -> None:
+    table = (ROOT / "docs" / "reference" / "support.md").read_text().partition("## Private names of Ray")[2]
+    names = {argument for _, arguments in calls() for argument in arguments if str(argument).startswith("_")}
+    assert len(names) > 7
+    assert [name for name in sorted(names) if f"`{name}`" not in table] == []
+
+
 ATTRIBUTES = {
     "_update_stats": ("MeanStdFilter", "zoo", "pendulum", None),
     "_filters": ("MeanStdFilter", "zoo", "pendulum", None),

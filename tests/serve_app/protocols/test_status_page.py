@@ -45,7 +45,7 @@ FIRST = {"policies": {"ur5": {"aliases": {"production": "1"}}}}  # which version
 CONTRACT_BUTTON = "document.querySelector('#policy-ur5').parentElement.querySelector('tbody button')"
 MARKUP = "<img src=x onerror='window.broken=1'><script>window.broken=1</script>&amp;"
 ROUND_MS = 250  # between two of the page's looks, instead of two seconds
-# Where pictures for the documents go, if they are wanted: docs/operations.md has the command.
+# Where pictures for the documents go, if they are wanted: CONTRIBUTING.md has the command.
 PICTURES = os.environ.get("RLSERVO_TEST_PICTURES")
 
 

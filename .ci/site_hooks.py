@@ -1,0 +1,52 @@
+"""MkDocs hooks: the order of the navigation, the page of the HTTP API, and every public name on its page."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from mkdocs.exceptions import PluginError
+from swagger_ui_bundle import swagger_ui_path  # type: ignore[import-untyped]
+
+import rlservo
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.server.settings import ServerSettings
+
+SECTIONS = {"tutorial": "Tutorial", "how-to": "How-to", "reference": "Reference", "explanation": "Explanation"}
+PYTHON_PAGE = "reference/python.md"
+NOT_OBJECTS = {"__version__", "errors"}  # errors has a page of its own
+OPENAPI_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>rlservo API</title>
+<link rel="stylesheet" href="swagger/swagger-ui.css"></head>
+<body><div id="swagger-ui"></div><script src="swagger/swagger-ui-bundle.js"></script><script>
+SwaggerUIBundle({spec: %s, dom_id: "#swagger-ui", validatorUrl: null, supportedSubmitMethods: [],
+  presets: [SwaggerUIBundle.presets.apis], layout: "BaseLayout"});
+</script></body></html>
+"""
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Give every page a place: those beside the home page first, then the sections."""
+    pages = sorted(file.src_uri for file in files.documentation_pages())
+    top = [page for page in pages if "/" not in page and page != "index.md"]
+    config.nav = [{"Home": "index.md"}, *top]
+    for folder, title in SECTIONS.items():
+        config.nav.append({title: [page for page in pages if page.startswith(f"{folder}/")]})
+    text = Path(config.docs_dir, PYTHON_PAGE).read_text(encoding="utf-8")
+    missing = [name for name in rlservo.__all__ if name not in NOT_OBJECTS and f".{name}\n" not in text]
+    if missing:
+        raise PluginError(f"{PYTHON_PAGE} does not document {', '.join(missing)}")
+    return files
+
+
+def on_post_build(config: Any) -> None:
+    """Write the page of the HTTP API, with the document inside: a page from disk may fetch nothing."""
+    site = Path(config.site_dir)
+    (site / "swagger").mkdir(exist_ok=True)
+    for name in ("swagger-ui.css", "swagger-ui-bundle.js"):
+        shutil.copy(Path(swagger_ui_path) / name, site / "swagger" / name)
+    document = create_app(lambda: None, ServerSettings()).openapi()  # type: ignore[arg-type, attr-defined]
+    text = json.dumps(document).replace("</", "<\\/")
+    (site / "openapi.html").write_text(OPENAPI_PAGE % text, encoding="utf-8")
