@@ -12,7 +12,7 @@ UNITS := tests/serve_app tests/envs/test_registration.py tests/export/checkpoint
 NOT_UNITS := $(addprefix --ignore=tests/serve_app/, engines client/test_bad_line.py client/test_client_faults.py replay \
 	repository/test_remote_repository.py)
 
-.PHONY: demo test quick check bench wheel setup python clean
+.PHONY: demo test quick check docs bench wheel release setup python clean
 
 demo: setup  ## Export the two shipped checkpoints, serve them, drive both simulators; a table and a picture in demo/
 	$(BIN)/rlservo demo --out demo
@@ -30,6 +30,10 @@ check: setup  ## Lint, format and types, as CI runs them
 	$(BIN)/mypy
 	$(BIN)/pyright
 
+docs: setup  ## The site into site/; a broken link or an undocumented public name fails
+	$(BIN)/python .ci/reference.py --check
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 bench: setup  ## Simulator, training, and export speed, printed and written to bench/
 	$(BIN)/python benchmarks/simulators.py
 	$(BIN)/python benchmarks/robot_server.py
@@ -39,6 +43,12 @@ bench: setup  ## Simulator, training, and export speed, printed and written to b
 
 wheel: setup  ## Build the wheel into dist/
 	$(BIN)/python -m build --wheel --outdir dist .
+
+release: setup  ## Wheel and sdist into dist/, checked, and each installed and run in an empty environment
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/python .ci/try_release.py dist
 
 setup: $(if $(filter file,$(origin PYTHON)),,python) $(STAMP)  ## Only the set-up
 
@@ -51,8 +61,8 @@ $(STAMP): pyproject.toml constraints.txt setup.py envs/rlservo-gymnasium.pth
 	$(PYTHON) -m venv $(VENV)
 	@echo "installing some 200 packages into $(VENV): a few minutes"
 	$(BIN)/python -m pip install $(PIP_QUIET) -c constraints.txt --upgrade pip  # Debian's resolves for ten minutes and more
-	$(BIN)/python -m pip install $(PIP_QUIET) -c constraints.txt -e '.[all,dev]'
+	$(BIN)/python -m pip install $(PIP_QUIET) -c constraints.txt -e '.[all,dev,docs]'
 	touch $(STAMP)
 
 clean:  ## Remove what the other targets made, .venv included
-	rm -rf $(VENV) typings demo bench build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) typings demo bench build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -76,8 +76,8 @@ def option(part: Any) -> str:
 
 def command_line() -> str:
     text = [
-        NOTE,
         "# Command line",
+        NOTE,
         "Every command has `--help`, most have `--json`. Exit code 0 means success, 1 failure, 2 bad input.",
     ]
     for name, command in commands(typer.main.get_command(app), "rlservo"):
@@ -108,7 +108,7 @@ def shown_default(value: Any) -> str:
 
 def settings() -> str:
     sentences, options = field_sentences(ServerSettings), field_sentences(PolicyOptions)
-    text = [NOTE, "# Settings"]
+    text = ["# Settings", NOTE]
     text.append(
         paragraph(
             f"Each setting is a variable `{PREFIX}<NAME>` in capitals, or in serve.yaml a key under `settings`. For "
@@ -136,7 +136,7 @@ def kinds(kind: type[errors.RlservoError]) -> Iterator[type[errors.RlservoError]
 
 
 def error_codes() -> str:
-    text = [NOTE, "# Errors"]
+    text = ["# Errors", NOTE]
     text.append(
         paragraph(
             'A server answers an error with `{"error": "<sentence>", "code": "<code>", "details"?}`; in Python the '
@@ -186,7 +186,7 @@ def pairs(node: ast.Assign) -> Iterator[tuple[str, Any]]:
 
 
 def metric_list() -> str:
-    text = [NOTE, "# Metrics"]
+    text = ["# Metrics", NOTE]
     text.append(
         paragraph(
             "`GET /metrics` answers in Prometheus' format. Every series also has the label `replica`, the process "
@@ -219,7 +219,7 @@ def type_name(kind: Any) -> str:
 
 
 def contract() -> str:
-    text = [NOTE, "# Bundle and contract"]
+    text = ["# Bundle and contract", NOTE]
     text.append(
         paragraph(
             "A bundle is the folder `<name>/<version>/` with `policy.onnx` (weights inside, the contract repeated in "

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
 from mkdocs.exceptions import PluginError
+from mkdocs.plugins import event_priority
 from swagger_ui_bundle import swagger_ui_path  # type: ignore[import-untyped]
 
 import rlservo
@@ -25,6 +27,23 @@ SwaggerUIBundle({spec: %s, dom_id: "#swagger-ui", validatorUrl: null, supportedS
   presets: [SwaggerUIBundle.presets.apis], layout: "BaseLayout"});
 </script></body></html>
 """
+
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("envs", "export", "serve_app", "deploy")
+PACKAGE = tempfile.TemporaryDirectory(prefix="rlservo-site-")  # removed with the process
+
+
+@event_priority(100)  # before mkdocstrings reads it
+def on_config(config: Any) -> Any:
+    """Show mkdocstrings the folders under the names they are imported by."""
+    package = Path(PACKAGE.name, "rlservo")
+    package.mkdir(exist_ok=True)
+    for folder in FOLDERS:
+        (package / folder).symlink_to(ROOT / folder)
+    (package / "__init__.py").symlink_to(ROOT / "deploy" / "package" / "__init__.py")
+    config.plugins["mkdocstrings"].config.handlers["python"]["paths"] = [PACKAGE.name]
+    return config
 
 
 def on_files(files: Any, config: Any) -> Any:

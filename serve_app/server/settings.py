@@ -123,8 +123,8 @@ class ServerSettings(BaseModel):
     """How strict each policy is at its edges, by policy name; '*' is for the others. As a variable: a JSON object."""
 
     record: str | None = None
-    """Record every decision of the policies into this folder (docs/how-to/record-and-replay.md), but of those whose options say
-    `"record": false`. Observations may be private: off by default. `rlservo serve --record` sets it, too."""
+    """Record every decision into this folder, except of policies whose options have `"record": false`. Observations may
+    be private: off by default. Also set by `rlservo serve --record`."""
 
     record_file_bytes: int = Field(256 << 20, ge=1 << 20)
     """A recording goes on in a new file at this size, or after an hour."""
