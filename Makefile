@@ -56,7 +56,7 @@ python:  # where one was named
 	$(PYTHON) .ci/check_python.py $(VENV)
 
 # pip's own lines and bars on a terminal; elsewhere errors alone.
-$(STAMP): pyproject.toml constraints.txt setup.py envs/rlservo-gymnasium.pth
+$(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) .ci/check_python.py $(VENV)
 	$(PYTHON) -m venv $(VENV)
 	@echo "installing some 200 packages into $(VENV): a few minutes"

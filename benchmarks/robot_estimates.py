@@ -25,7 +25,7 @@ from rlservo.serve_app.replay.estimate import Trajectory, fitted_estimate, impor
 from rlservo.serve_app.runtime.exploration import draw_action
 from rlservo.serve_app.runtime.policy import Policy
 
-ENV = "rlservo/EndEffectorPositioningURSim-v0"
+ENV = "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0"
 ABREAST = 64  # episodes that run side by side
 VARIANTS = {  # mean moved by so many standard deviations, log of the standard deviation moved by
     "the recorded policy": (0.0, 0.0),

@@ -20,9 +20,9 @@ from rich.console import Console
 from rich.table import Table
 
 GOALS = {  # environment id -> steps per second that we promise
-    "rlservo/EndEffectorPositioningURSim-v0": 4000,
-    "rlservo/NoObstacleNavigationMir100Sim-v0": None,
-    "rlservo/ObstacleAvoidanceMir100Sim-v0": 1500,
+    "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0": 4000,
+    "rlservo.envs:rlservo/NoObstacleNavigationMir100Sim-v0": None,
+    "rlservo.envs:rlservo/ObstacleAvoidanceMir100Sim-v0": 1500,
 }
 ROUNDS = 5
 

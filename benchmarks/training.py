@@ -31,7 +31,7 @@ import shared.training_run as training_run
 from rlservo.export.contract.errors import RlservoError
 from rlservo.export.rllib.batched_connectors import use_batched_connectors
 
-UR5 = "rlservo/EndEffectorPositioningURSim-v0"
+UR5 = "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0"
 
 
 MINIBATCH = 512
@@ -190,7 +190,7 @@ def configuration(env: str, runners: int, envs: int, batch: int, *, rllib_connec
 
     config = training_run.default_config("PPO")
     assert isinstance(config, PPOConfig)
-    config.environment(env, env_config={"rs_state_to_info": False} if env.startswith("rlservo/") else {})
+    config.environment(env, env_config={"rs_state_to_info": False} if env.startswith("rlservo.envs:rlservo/") else {})
     config.env_runners(num_env_runners=runners, num_envs_per_env_runner=envs)
     if not rllib_connectors:
         use_batched_connectors(config, observation_filter=False)

@@ -35,7 +35,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from mujoco import rollout
 
-UR5 = "rlservo/EndEffectorPositioningURSim-v0"
+UR5 = "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0"
 SYNC, ASYNC = "SyncVectorEnv", "AsyncVectorEnv, a process each"
 THREADS = min(4, os.cpu_count() or 1)
 Way = Callable[[], None]  # one step of all robots

@@ -28,6 +28,7 @@ from rlservo.envs.disturbances import (
     HasRobotModels,
     HasSensorErrors,
 )
+from rlservo.export.contract.environment_id import plain_id
 
 Range = tuple[float, float]
 Array = NDArray[np.float32]
@@ -385,7 +386,7 @@ def wrapped_env(env_id: str, env_config: Mapping[str, Any]) -> tuple[str, dict[s
 
 def _describe(**env_config: Any) -> Any:
     """Name the elements of the environment that is wrapped."""
-    entry_point = gym.spec(env_config["env_id"]).entry_point
+    entry_point = gym.spec(plain_id(env_config["env_id"])).entry_point
     made_by = pkgutil.resolve_name(entry_point) if isinstance(entry_point, str) else entry_point
     describe = getattr(made_by, "describe", None)
     return describe(**wrapped_env(RANDOMIZED, env_config)[1]) if describe else {}

@@ -1,11 +1,11 @@
-"""Names the environments to Gymnasium.
-
-It must stay light: every program that imports gymnasium runs it. MuJoCo is imported when an environment is made.
-"""
+"""Ids of the environments, and their registration with Gymnasium. MuJoCo is imported when an environment is made."""
 
 from __future__ import annotations
 
-NAMESPACE = "rlservo"
+from gymnasium.envs.registration import register, registry
+
+from rlservo.export.contract.environment_id import NAMESPACE
+
 ENTRY_POINTS = {
     "EndEffectorPositioningURSim-v0": "rlservo.envs.ur.end_effector_positioning:EndEffectorPositioningURSim",
     "EmptyEnvironmentURSim-v0": "rlservo.envs.ur.empty_environment:EmptyEnvironmentURSim",
@@ -22,9 +22,6 @@ def register_envs() -> None:
 
     The episode limit is the environment's own, so no `max_episode_steps` is given here.
     """
-    # Not at the top: importing gymnasium calls this function (discovery.py), which must exist by then.
-    from gymnasium.envs.registration import register, registry
-
     for name, entry_point in ENTRY_POINTS.items():
         if f"{NAMESPACE}/{name}" not in registry:
             register(id=f"{NAMESPACE}/{name}", entry_point=entry_point)

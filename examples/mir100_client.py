@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--show", action="store_true", help="open MuJoCo's viewer (needs a display)")
     args = parser.parse_args()
 
-    env = gym.make("rlservo/NoObstacleNavigationMir100Sim-v0", render_mode="human" if args.show else None)
+    env = gym.make("rlservo.envs:rlservo/NoObstacleNavigationMir100Sim-v0", render_mode="human" if args.show else None)
     with rlservo.PolicyClient(args.url, args.policy) as policy:
         for episode in range(args.episodes):
             obs, info = env.reset(seed=episode)

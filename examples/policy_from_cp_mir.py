@@ -12,7 +12,7 @@ from shared.training_run import main_with_sentences
 
 def main() -> None:
     policy_from_cp.main(
-        "rlservo/NoObstacleNavigationMir100Sim-v0",
+        "rlservo.envs:rlservo/NoObstacleNavigationMir100Sim-v0",
         {"rs_state_to_info": False},
         "Run MiR100 navigation with the policy of a checkpoint, or with its export.",
     )

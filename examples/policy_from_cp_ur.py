@@ -12,7 +12,7 @@ from shared.training_run import main_with_sentences
 
 def main() -> None:
     policy_from_cp.main(
-        "rlservo/EndEffectorPositioningURSim-v0",
+        "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0",
         {"ur_model": "ur5", "rs_state_to_info": False},
         "Run UR5 end-effector positioning with the policy of a checkpoint, or with its export.",
     )

@@ -37,6 +37,7 @@ from shared.resources import Room
 from shared.training_run import RETURN, STEPS, Run
 
 from rlservo import errors
+from rlservo.export.contract.environment_id import importing_id
 from rlservo.export.rllib.batched_connectors import supports, use_batched_connectors
 from rlservo.serve_app.rollout.environment import make_env
 
@@ -242,7 +243,7 @@ def algorithm_config(
 ) -> AlgorithmConfig:
     """Return the RLlib configuration for these arguments and the environment's spaces (observation, action)."""
     config = training_run.default_config(args.run, args.log_level)
-    config.environment(args.name_env, env_config=dict(env_config))
+    config.environment(importing_id(args.name_env), env_config=dict(env_config))
     config.framework("torch")
     config.env_runners(
         num_env_runners=args.num_cpus,

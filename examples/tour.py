@@ -26,7 +26,7 @@ from shared.training_run import RETURN, STEPS, Run
 
 from rlservo import Policy, rollout
 
-UR5 = "rlservo/EndEffectorPositioningURSim-v0"
+UR5 = "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0"
 SHIPPED = Path(__file__).resolve().parent / "checkpoints" / "ur_positioning"
 ARROWS = "←↓→↑"  # FrozenLake's actions
 EXPLORATION_STEPS = 5_000  # steps on FrozenLake, after which it hardly explores any more

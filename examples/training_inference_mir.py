@@ -21,7 +21,7 @@ NAVIGATION = shipped_task("mir100_navigation")
 # Its file stops at a success rate, which this script does not; no return is as high as this one.
 OBSTACLES = replace(
     shipped_task("mir100_obstacle_avoidance"),
-    env_id="rlservo/ObstacleAvoidanceMir100Sim-v0",
+    env_id="rlservo.envs:rlservo/ObstacleAvoidanceMir100Sim-v0",
     env_config=NAVIGATION.env_config,
     stop_reward=1000.0,
 )

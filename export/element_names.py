@@ -7,6 +7,7 @@ nothing about the policy, so whatever is missing or wrong here is a notice and n
 
 from __future__ import annotations
 
+import importlib
 import math
 import pkgutil
 from collections.abc import Callable, Mapping
@@ -17,6 +18,7 @@ import gymnasium
 from gymnasium.spaces import Box
 from pydantic import ValidationError
 
+from rlservo.export.contract.environment_id import importing_id
 from rlservo.export.contract.errors import first_line
 from rlservo.export.contract.spaces import Element
 from rlservo.export.recipe.recipe import Recipe
@@ -65,12 +67,12 @@ def read_elements(
 
 
 def _env_class(env_id: str) -> Any:
-    """Return the class behind a Gymnasium id or a `module:Class` path, importing its module but making nothing."""
-    is_path = ":" in env_id and env_id not in gymnasium.registry
-    entry_point = env_id if is_path else gymnasium.spec(env_id).entry_point
-    if not isinstance(entry_point, str):
-        return entry_point
-    return pkgutil.resolve_name(entry_point)
+    """Return the class behind a Gymnasium id, with or without its module, or a `module:Class` path; make nothing."""
+    module, _, name = importing_id(env_id).rpartition(":")
+    if module:
+        importlib.import_module(module)
+    entry_point = gymnasium.spec(name).entry_point if name in gymnasium.registry or not module else env_id
+    return pkgutil.resolve_name(entry_point) if isinstance(entry_point, str) else entry_point
 
 
 def _elements(described: Any) -> tuple[Element, ...]:

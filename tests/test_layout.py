@@ -47,7 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "export/contract", "serve_app/repository", "serve_app/versions", "serve_app/episodes", "serve_app/server",
         "serve_app/protocols", "serve_app/wire",
     },
-    "envs": {"serve_app/wire"},
+    "envs": {"export/contract", "serve_app/wire"},
     "deploy": {"envs", "export", "serve_app"},
     "export/__init__.py": set(),
     "serve_app/__init__.py": set(),

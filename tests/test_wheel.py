@@ -20,7 +20,7 @@ def test_wheel_holds_every_module_and_asset_and_no_foreign_top_level(wheel: Path
         names = set(archive.namelist())
     top_level = {name.split("/")[0] for name in names}
     info = next(name for name in top_level if name.endswith(".dist-info"))
-    assert top_level == {"rlservo", "rlservo-gymnasium.pth", info}
+    assert top_level == {"rlservo", info}
     for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*"):
             if path.match("kuberay/secrets*.yaml") and path.name != "secrets.example.yaml":
@@ -56,9 +56,6 @@ def test_wheel_alone_gives_the_in_process_runtime(wheel: Path, tmp_path: Path) -
     for name, extra in extras.items():
         missing = run(str(python), "-c", f"from rlservo import {name}").stderr
         assert f"pip install '.[{extra}]'" in missing.splitlines()[-1], missing
-    program = "import sys; print(*sorted(name for name in sys.modules if 'rlservo' in name), 'typing' in sys.modules)"
-    started = run(str(python), "-c", program)
-    assert started.stdout.split() == ["rlservo", "rlservo.envs", "rlservo.envs.discovery", "False"]
     rlservo = str(python.with_name("rlservo"))
     assert run(rlservo, "--version").stdout.startswith("rlservo ")
     refused = run(rlservo, "serve", ".")

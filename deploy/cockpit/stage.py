@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from rlservo.envs.checks import InvalidResetError
 from rlservo.envs.randomization import DomainRandomization, wrapped_env
-from rlservo.envs.registration import NAMESPACE
 from rlservo.envs.rendering import RenderedEnv, Start
 from rlservo.envs.shapes import Poses, body_poses, moving_bodies
 from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.environment_id import NAMESPACE
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.rollout.environment import check_fit, control_rate_of, make_env
 

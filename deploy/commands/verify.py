@@ -15,6 +15,7 @@ import typer
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.environment_options import parse_env_arguments
 from rlservo.deploy.terminal import Json, note, print_json
+from rlservo.export.contract.environment_id import plain_id
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import needs_extra
 
@@ -68,6 +69,7 @@ def verify(
     """
     if not disturb and (disturbances or plot or write or env_arg):
         raise UsageError("disturbances, --plot, --write and --env-arg go with --disturb")
+    env = env and plain_id(env)
     if checkpoint is None and not disturb:
         raise UsageError("give --checkpoint to compare the bundle with, or --disturb with --env, or both")
     document: dict[str, Any] = {}

@@ -7,8 +7,7 @@ policy = rlservo.Policy.load("policies/ur5")
 action = policy.act(obs)
 ```
 
-This is the package `rlservo` itself (pyproject.toml maps it here). Python imports it at every start, through the file
-`rlservo-gymnasium.pth` (envs/discovery.py), so it imports nothing until a name is asked for.
+This is the package `rlservo` itself (pyproject.toml maps it here). It imports nothing until a name is asked for.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from typing import Any
 from rlservo.export.checkpoints.location import CTOR_FILE, FACTS_FILE
 from rlservo.export.checkpoints.old_location import ALGORITHM_STATE, POLICY_STATE, RLLIB_FILE, old_stack_root
 from rlservo.export.checkpoints.unpickle import unpickle
+from rlservo.export.contract.environment_id import plain_id
 from rlservo.export.contract.errors import CheckpointError
 
 # Where RLlib keeps its counter in algorithm_state.pkl: up to Ray 2.39, 2.40, and from 2.41 on.
@@ -119,7 +120,7 @@ def _as_mapping(config: Any) -> Mapping[str, Any]:
 def _env_name(env: Any) -> str | None:
     """Return the id the environment was made by; for a class given directly, its import path."""
     if isinstance(env, str):
-        return env
+        return plain_id(env)
     if isinstance(env, type):
         return f"{env.__module__}:{env.__qualname__}"
     return None

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rlservo.export.contract.contract import Provenance
+from rlservo.export.contract.environment_id import importing_id
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import optional_package
 from rlservo.export.contract.nested import build_action
@@ -81,10 +82,10 @@ def _environment(origin: Provenance, spaces: tuple[Any, Any]) -> Any:
     """Return the Gymnasium specification of the training's environment, if it can be made and has these spaces."""
     import gymnasium as gym
 
-    if origin.env_id not in gym.registry:  # and no "module:Env", which a recording shall not import
+    if ":" in (origin.env_id or ":"):  # a module, which a recording shall not import
         return None
     try:
-        env = gym.make(origin.env_id, disable_env_checker=True, **origin.env_config)
+        env = gym.make(importing_id(str(origin.env_id)), disable_env_checker=True, **origin.env_config)
     except Exception:  # a constructor is anyone's code
         return None
     env.close()

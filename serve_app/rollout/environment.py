@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.environment_id import importing_id
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import install, needs_extra
 from rlservo.export.contract.spaces import BoxSpec, DictSpec, MultiBinarySpec, MultiDiscreteSpec, SpaceSpec, TupleSpec
@@ -24,7 +25,7 @@ def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.
     mode = {"render_mode": "rgb_array"} if render else {}
     try:
         # Gymnasium's checker looks at every step and warns on the terminal: that is for who writes an environment.
-        return gym.make(env_id, disable_env_checker=True, **{**arguments, **mode})
+        return gym.make(importing_id(env_id), disable_env_checker=True, **{**arguments, **mode})
     except gym.error.UnregisteredEnv as error:
         close = difflib.get_close_matches(env_id, list(gym.registry), n=3, cutoff=0.5)
         hint = f"did you mean {' or '.join(close)}?" if close else "write 'module:Id' to import the module that has it"

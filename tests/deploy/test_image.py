@@ -58,7 +58,7 @@ def expression(pattern: str) -> re.Pattern[str]:
 
 
 def test_package_data_is_what_is_meant_and_nothing_that_lies_beside_it(checkout: Path) -> None:
-    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, checkout)
     for folder in ("envs", "export", "serve_app"):
         (checkout / folder).symlink_to(ROOT / folder)

@@ -1,4 +1,4 @@
-"""The environments are there in every process, whatever is imported first, and only once."""
+"""The environments are registered by Gymnasium's own ways, once, in any process."""
 
 from __future__ import annotations
 
@@ -8,18 +8,16 @@ import sys
 import pytest
 
 LIST = "import gymnasium; print(sorted(name for name in gymnasium.registry if name.startswith('rlservo/')))"
+ID = "rlservo.envs:rlservo/NoObstacleNavigationMir100Sim-v0"
 
 
 @pytest.mark.parametrize(
     "first",
     [
-        "pass",
-        "import gymnasium",
-        "import gymnasium.envs.registration",
-        "import rlservo.envs.registration",
-        "import rlservo.envs.discovery as d; d.install(); d.install()",
+        "import rlservo.envs",
+        "import gymnasium, rlservo.envs; gymnasium.register_envs(rlservo.envs)",
+        f"import gymnasium; gymnasium.spec('CartPole-v1'); gymnasium.make('{ID}')",
         "import rlservo.envs.registration as r; r.register_envs(); r.register_envs()",
-        pytest.param("import ray.rllib", marks=pytest.mark.slow),
     ],
 )
 def test_seven_environments_are_registered_whatever_comes_first(first: str) -> None:
@@ -28,11 +26,14 @@ def test_seven_environments_are_registered_whatever_comes_first(first: str) -> N
     assert "Warning" not in done.stderr
 
 
-def test_the_hook_imports_nothing_heavy_at_start() -> None:
-    code = "import sys; print([m for m in ('gymnasium', 'numpy', 'mujoco', 'importlib.util') if m in sys.modules])"
-    without = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, timeout=60)
-    with_hook = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert "gymnasium" not in with_hook.stdout
-    assert "numpy" not in with_hook.stdout
-    assert "mujoco" not in with_hook.stdout
-    assert without.returncode == with_hook.returncode == 0
+def test_what_does_not_use_the_environments_does_not_import_them() -> None:
+    """Nothing of ours runs at Python's start, and Gymnasium's own import brings none of it."""
+    code = "import sys, gymnasium; print([name for name in sys.modules if name.startswith(('rlservo', 'mujoco'))])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
+def test_an_environment_named_with_its_module_has_the_plain_id_afterwards() -> None:
+    code = f"import gymnasium; print(gymnasium.make('{ID}').spec.id)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "rlservo/NoObstacleNavigationMir100Sim-v0\n", done.stderr

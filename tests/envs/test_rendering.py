@@ -10,7 +10,8 @@ from ctypes.util import find_library
 
 import pytest
 
-from rlservo.envs.registration import ENTRY_POINTS, NAMESPACE
+from rlservo.envs.registration import ENTRY_POINTS
+from rlservo.export.contract.environment_id import NAMESPACE, importing_id
 
 WINDOW = """
 import sys
@@ -28,7 +29,7 @@ PICTURES = """
 import sys
 import mujoco  # MuJoCo settles how it draws when it is imported, which may be before one of ours is made
 import gymnasium as gym
-env = gym.make("rlservo/EndEffectorPositioningURSim-v0", render_mode=sys.argv[1])
+env = gym.make("rlservo.envs:rlservo/EndEffectorPositioningURSim-v0", render_mode=sys.argv[1])
 for _ in range(2):
     try:
         env.reset(seed=0)
@@ -101,7 +102,7 @@ def test_a_display_without_opengl_counts_as_none(mode: str, start: str) -> None:
 def test_windows_open_and_close_one_after_another() -> None:
     environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}
     # Randomized-v0 is one of the others, disturbed.
-    env_ids = [f"{NAMESPACE}/{name}" for name in ENTRY_POINTS if name != "Randomized-v0"]
+    env_ids = [importing_id(f"{NAMESPACE}/{name}") for name in ENTRY_POINTS if name != "Randomized-v0"]
     done = subprocess.run(
         ["xvfb-run", "-a", "-s", "-screen 0 1024x768x24", sys.executable, "-c", WINDOW, *env_ids],
         capture_output=True,

@@ -28,6 +28,7 @@ from ray.tune.registry import ENV_CREATOR, _global_registry
 from bundles import EXPORTED_WITH, PRODUCT
 from cache import cached, versions
 from rlservo import errors, export_checkpoint
+from rlservo.export.contract.environment_id import plain_id
 from rlservo.serve_app.runtime.policy import Policy
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -180,7 +181,7 @@ def test_each_folder_is_small_and_complete(name: str) -> None:
     assert sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) < LARGEST
     facts = json.loads((folder / "rlservo_facts.json").read_text(encoding="utf-8"))
     settings = yaml.safe_load((folder / "training.yaml").read_text(encoding="utf-8"))
-    assert (facts["algorithm"], facts["env_id"]) == (settings["algorithm"], settings["env"])
+    assert (facts["algorithm"], facts["env_id"]) == (settings["algorithm"], plain_id(settings["env"]))
     curve = (folder / "curve.csv").read_text(encoding="utf-8").splitlines()
     assert curve[0] == "env_steps,episodes,mean_return,mean_length,success,wall_s,cpu_s"
     steps = [int(line.split(",")[0]) for line in curve[1:]]
