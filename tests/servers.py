@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import uvicorn
@@ -343,18 +343,33 @@ def shipped_server(shipped: Path, tmp_path_factory: pytest.TempPathFactory) -> I
     assert list((runtime / "rlservo").iterdir()) == []  # the key went with the server
 
 
+class Reply(NamedTuple):
+    """A reply over HTTP."""
+
+    status: int
+    headers: dict[str, str]  # names in lower case
+    content: bytes
+
+    @property
+    def document(self) -> Any:
+        """The content out of JSON, or the bytes of what is none."""
+        return json.loads(self.content) if self.content[:1] in (b"{", b"[") else self.content
+
+
+def exchange(port: int, method: str, path: str, body: Any = None, **headers: str) -> Reply:
+    """Send one request on a connection of its own; a body that is no bytes is sent as JSON."""
+    content = body if body is None or isinstance(body, bytes) else json.dumps(body)
+    sent = {"content-type": "application/json"} | {name.replace("_", "-"): value for name, value in headers.items()}
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
+        connection.request(method, path, content, sent)
+        reply = connection.getresponse()
+        return Reply(reply.status, {name.lower(): value for name, value in reply.headers.items()}, reply.read())
+
+
 def ask(port: int, method: str, path: str, body: Any = None, key: str = "") -> tuple[int, Any]:
     """Send one request; return the status and the document, or the bytes of what is none."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-    try:
-        content = body if body is None or isinstance(body, bytes) else json.dumps(body)
-        headers = {"content-type": "application/json", **({"authorization": f"Bearer {key}"} if key else {})}
-        connection.request(method, path, content, headers)
-        reply = connection.getresponse()
-        received = reply.read()
-        return reply.status, json.loads(received) if received[:1] in (b"{", b"[") else received
-    finally:
-        connection.close()
+    reply = exchange(port, method, path, body, **({"authorization": f"Bearer {key}"} if key else {}))
+    return reply.status, reply.document
 
 
 def wait_until_served(run: Run, output: Sequence[str] = (), timeout_s: float = 180) -> None:

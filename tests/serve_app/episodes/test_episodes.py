@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import http.client
 import json
@@ -26,6 +25,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import exchange
 from stores import load_store, store_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -50,10 +50,8 @@ def asking(port: int) -> Ask:
     """Return a function that posts JSON and gives (status, reply)."""
 
     def call(path: str, body: Any) -> tuple[int, Any]:
-        with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
-            connection.request("POST", path, json.dumps(body), {"content-type": "application/json"})
-            reply = connection.getresponse()
-            return reply.status, json.loads(reply.read())
+        reply = exchange(port, "POST", path, body)
+        return reply.status, reply.document
 
     return call
 

@@ -40,6 +40,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.version_loader import VersionLoader
 from rlservo.serve_app.wire.admin_key_file import key_file, read_key
+from servers import exchange
 from stores import plan_files
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
@@ -86,14 +87,8 @@ def admin(port: int, key_path: Path) -> Iterator[AdminClient]:
 
 
 def ask(port: int, method: str, path: str, document: Any = None, **headers: str) -> tuple[int, Any]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    body = None if document is None else json.dumps(document)
-    sent = {"content-type": "application/json"} | {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(method, path, body, sent)
-    reply = connection.getresponse()
-    content = reply.read()
-    connection.close()
-    return reply.status, json.loads(content) if content[:1] in (b"{", b"[") else content.decode()
+    reply = exchange(port, method, path, document, **headers)
+    return reply.status, reply.document if reply.content[:1] in (b"{", b"[") else reply.content.decode()
 
 
 def act(port: int, where: str = "act", **fields: Any) -> dict[str, Any]:

@@ -9,21 +9,19 @@ import json
 import random
 import re
 import socket
-import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import uvicorn
 
 from rlservo.export.contract.contract import Contract
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.docs_page import PAGE
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import over_uvicorn
 from stores import load_store
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
@@ -32,6 +30,7 @@ HALF_SENT = (
     b"POST /v1/policies/ur5/act HTTP/1.1\r\nhost: 127.0.0.1\r\n"
     b'content-type: application/json\r\ncontent-length: 1000\r\n\r\n{"obs": ['
 )
+
 SETTINGS = ServerSettings(max_body_bytes=200_000, max_batch=64, body_timeout_s=1.0)
 Ask = Callable[..., tuple[int, dict[str, str], Any]]
 
@@ -59,17 +58,8 @@ def loading(store: PolicyStore) -> Loading:
 
 @pytest.fixture(scope="module")
 def port(loading: Loading) -> Iterator[int]:
-    listener = socket.create_server(("127.0.0.1", 0))
-    config = uvicorn.Config(create_app(loading, SETTINGS), log_level="critical", access_log=False, lifespan="off")
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
-    while not server.started:
-        time.sleep(0.01)
-    yield listener.getsockname()[1]
-    server.should_exit = True
-    thread.join()
-    listener.close()
+    with over_uvicorn(create_app(loading, SETTINGS)) as port:
+        yield port
 
 
 @pytest.fixture(scope="module")

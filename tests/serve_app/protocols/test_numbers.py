@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import http.client
 import json
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -14,6 +12,7 @@ import msgpack
 import pytest
 import websockets.sync.client
 
+import servers
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
@@ -41,11 +40,8 @@ def port(
 
 
 def post(port: int, path: str, body: str) -> tuple[int, dict[str, Any]]:
-    headers = {"content-type": "application/json", "authorization": f"Bearer {KEY}"}
-    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
-        connection.request("POST", path, body, headers)
-        reply = connection.getresponse()
-        return reply.status, json.loads(reply.read())
+    status, document = servers.ask(port, "POST", path, body.encode(), key=KEY)
+    return status, document
 
 
 def with_number(document: dict[str, Any], number: str) -> str:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import http.client
-import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -24,6 +21,7 @@ from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import PolicyPlan
+from servers import exchange
 from stores import load_store
 
 OPTIONS = {
@@ -58,12 +56,8 @@ def ask(app: Any, served: Callable[[Any], AbstractContextManager[int]]) -> Itera
     with served(app) as port:
 
         def call(path: str, body: Any = None) -> tuple[int, Any]:
-            # A connection for each: uvicorn closes one that was silent for five seconds, as a busy machine may be.
-            with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
-                method = "GET" if body is None else "POST"
-                connection.request(method, path, body and json.dumps(body), {"content-type": "application/json"})
-                reply = connection.getresponse()
-                return reply.status, json.loads(reply.read())
+            reply = exchange(port, "GET" if body is None else "POST", path, body)
+            return reply.status, reply.document
 
         yield call
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import http.client
 import json
 import socket
 from collections.abc import Callable, Iterator
@@ -25,6 +24,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.loopback import is_loopback
+from servers import exchange
 from stores import load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
@@ -42,21 +42,14 @@ INFER = (
     "/v2/models/ur5/infer",
     {"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": OBS}]},
 )
+
 LIST = ("GET", "/v1/policies", None)
 LOAD = ("POST", "/v2/repository/models/ur5/load", {})
 
 
 def call(port: int, method: str, path: str, body: Any, **headers: str) -> tuple[int, dict[str, str], Any]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    sent = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(
-        method, path, None if body is None else json.dumps(body), sent | {"content-type": "application/json"}
-    )
-    reply = connection.getresponse()
-    content = reply.read()
-    connection.close()
-    is_json = reply.headers.get("content-type", "").startswith("application/json")
-    return reply.status, dict(reply.headers), json.loads(content) if is_json else content
+    reply = exchange(port, method, path, body, **headers)
+    return reply.status, reply.headers, reply.document
 
 
 def stream(port: int, **headers: str) -> dict[str, Any]:

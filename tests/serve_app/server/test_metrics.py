@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import http.client
-import json
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import partial
@@ -22,6 +20,7 @@ from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions import plan_changes
+from servers import exchange
 from stores import load_store
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
@@ -36,13 +35,10 @@ def test_requests_are_counted_by_policy_version_protocol_and_outcome(
     store = load_store(policies)
     app = create_app(lambda: store, ServerSettings(default_policy="ur5"), replica="r1")
     with served(app) as port:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
 
         def call(path: str, body: Any = None) -> tuple[int, bytes]:
-            method = "GET" if body is None else "POST"
-            connection.request(method, path, body and json.dumps(body), {"content-type": "application/json"})
-            reply = connection.getresponse()
-            return reply.status, reply.read()
+            reply = exchange(port, "GET" if body is None else "POST", path, body)
+            return reply.status, reply.content
 
         def scrape() -> dict[tuple[str, ...], float]:
             status, text = call("/metrics")
@@ -93,7 +89,6 @@ def test_requests_are_counted_by_policy_version_protocol_and_outcome(
         assert {key: again[key] for key in seen if "streams" not in key[0]} == {
             key: value for key, value in seen.items() if "streams" not in key[0]
         }
-        connection.close()
 
 
 def test_a_version_that_is_unloaded_disappears_and_the_plan_is_numbered(

@@ -26,6 +26,7 @@ from rlservo.serve_app.runtime.drift import EVERY, Drift
 from rlservo.serve_app.server.request_log import LOGGER, configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.msgpack_arrays import pack
+from servers import exchange
 from stores import load_store
 
 MEAN, STD = np.linspace(-2, 2, 27), np.linspace(0.5, 3, 27)
@@ -54,13 +55,8 @@ def log_file(tmp_path: Path) -> Iterator[Path]:
 
 
 def post(port: int, path: str, body: Any, **headers: str) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    sent = {"content-type": "application/json"} | {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request("POST", path, json.dumps(body), sent)
-    reply = connection.getresponse()
-    content = reply.read()
-    connection.close()
-    return reply.status, content
+    reply = exchange(port, "POST", path, body, **headers)
+    return reply.status, reply.content
 
 
 def scrape(port: int) -> dict[tuple[str, ...], float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import http.client
 import json
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -30,6 +29,7 @@ from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, Role, new_ke
 from rlservo.serve_app.server.rate_limits import RateLimits
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import exchange
 from stores import load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
@@ -61,13 +61,7 @@ def port(app: PolicyApp, served: Serve) -> Iterator[int]:
 
 
 def ask(port: int, method: str, path: str, body: Any = None, key: str = LIMITED) -> tuple[int, dict[str, str], bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
-    headers = {"content-type": "application/json", "authorization": f"Bearer {key}"}
-    connection.request(method, path, None if body is None else json.dumps(body), headers)
-    reply = connection.getresponse()
-    content = reply.read()
-    connection.close()
-    return reply.status, dict(reply.headers), content
+    return exchange(port, method, path, body, authorization=f"Bearer {key}")
 
 
 ACT = ("POST", "/v1/policies/ur5/act", {"obs": OBS})

@@ -32,6 +32,7 @@ from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.request_recorder import RequestRecorder
 from rlservo.serve_app.server.settings import ServerSettings
+from servers import exchange
 from stores import load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
@@ -49,10 +50,8 @@ class Server:
         return f"http://127.0.0.1:{self.port}"
 
     def post(self, path: str, body: Any, **headers: str) -> tuple[int, Any]:
-        with contextlib.closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)) as connection:
-            connection.request("POST", path, json.dumps(body), {"content-type": "application/json", **headers})
-            reply = connection.getresponse()
-            return reply.status, json.loads(reply.read())
+        reply = exchange(self.port, "POST", path, body, **headers)
+        return reply.status, reply.document
 
     def act(self, policy: str, body: Any, **headers: str) -> tuple[int, Any]:
         return self.post(f"/v1/policies/{policy}/act", body, **headers)
