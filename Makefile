@@ -8,11 +8,16 @@ PIP_QUIET := $(if $(MAKE_TERMOUT),,-qq)
 # Unit tests: what starts no Ray, simulator, robot server, proxy or storage, opens no browser, trains nothing, does not
 # wait for time to pass.
 UNITS := tests/serve_app tests/envs/test_registration.py tests/export/checkpoints/test_experiment.py \
-	tests/test_layout.py tests/test_package.py
+	tests/test_layout.py tests/test_package.py tests/test_private_names.py
 NOT_UNITS := $(addprefix --ignore=tests/serve_app/, engines client/test_bad_line.py client/test_client_faults.py replay \
 	repository/test_remote_repository.py)
 
-.PHONY: demo test quick check docs bench wheel release setup python clean
+# Of the extras, those that need no gigabytes; the cockpit's viser holds websockets and rich back.
+ENDS_EXTRAS := client,serve,sim,record,remote
+TEST_TOOLS := 'pytest>=8' pytest-timeout pytest-xdist pytest-random-order httpx pyyaml jsonschema playwright \
+	'moto[server]' onnx matplotlib
+
+.PHONY: demo test quick newest oldest check docs bench wheel release setup python clean
 
 demo: setup  ## Export the two shipped checkpoints, serve them, drive both simulators; a table and a picture in demo/
 	$(BIN)/rlservo demo --out demo
@@ -22,6 +27,17 @@ test: setup  ## All tests, in four processes: on two cores two of them often wai
 
 quick: setup  ## Unit tests, in a minute on two cores that nothing else uses
 	$(BIN)/python -m pytest -n 4 -m "not slow and not serve and not trained and not browser" $(NOT_UNITS) $(UNITS)
+
+newest oldest:  ## Unit tests with the newest, or the oldest, release of every dependency, in .newest or .oldest
+	$(PYTHON) -m venv --clear .$@
+	.$@/bin/python -m pip install $(PIP_QUIET) uv
+	.$@/bin/uv pip install --python .$@/bin/python --resolution $(if $(filter oldest,$@),lowest-direct,highest) \
+		-e '.[$(ENDS_EXTRAS)]'
+	.$@/bin/uv pip freeze --python .$@/bin/python --exclude-editable > .$@/installed.txt
+	.$@/bin/uv pip install --python .$@/bin/python -c .$@/installed.txt $(TEST_TOOLS)
+	# An old release beside a new one of what it needs itself warns of names that will go.
+	PYTEST_ADDOPTS="-p no:anyio $(if $(filter oldest,$@),-W ignore::DeprecationWarning)" \
+		$(MAKE) --old-file=setup quick VENV=.$@
 
 check: setup  ## Lint, format and types, as CI runs them
 	$(BIN)/python .ci/alias_stubs.py
@@ -65,4 +81,4 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 clean:  ## Remove what the other targets made, .venv included
-	rm -rf $(VENV) typings demo bench build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .newest .oldest typings demo bench build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -132,9 +132,14 @@ def _ends_handled_by(handler: Callable[[int, object], None]) -> Iterator[None]:
             signal.signal(number, handler_before)
 
 
+def show(line: str) -> None:
+    """Print a line of a result as it is, without rich: a server would keep that in memory, 3 MB."""
+    print(line.translate(ESCAPES), flush=True)
+
+
 def note(line: str) -> None:
     """Print a line that a program reading our output should not see."""
-    errors().print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+    print(line.translate(ESCAPES), file=sys.stderr, flush=True)
 
 
 def show_command(words: Sequence[str]) -> None:

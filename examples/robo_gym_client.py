@@ -43,6 +43,7 @@ MANAGER_PORTS = range(50100, 50200)  # where robo-gym looks for a server manager
 ANSWER_S = 5.0  # [s] to connect, and again to answer; robo-gym itself waits 20 s for each of a hundred ports
 VERIFY = "/robo_gym_server_manager.grpc_msgs.server_manager.ServerManager/VerifyConnection"
 GET_STATE = "/robot_server.RobotServer/GetState"
+NOT_BY_PROXY = "no_grpc_proxy"  # gRPC's variable, which goes before `no_proxy`
 INTERRUPTED = 130  # the shell's exit code for Ctrl-C
 
 
@@ -157,12 +158,20 @@ def answers(host: str, port: int, method: str) -> bool:
         return False
     except (OSError, UnicodeError) as error:  # the other ports of this host would tell the same, each as slowly
         raise errors.UnavailableError(f"{host}:{port} cannot be reached: {error}") from error
+    ask_directly(host)
     with grpc.insecure_channel(f"[{host}]:{port}" if ":" in host else f"{host}:{port}") as channel:
         try:
             channel.unary_unary(method)(b"", timeout=ANSWER_S)
         except grpc.RpcError:
             return False
     return True
+
+
+def ask_directly(host: str) -> None:
+    """Keep gRPC, robo-gym's own channels too, from asking the proxy of `http_proxy` for a host that we reach."""
+    exempt = os.environ.get(NOT_BY_PROXY) or os.environ.get("no_proxy") or ""
+    if host not in exempt.split(","):
+        os.environ[NOT_BY_PROXY] = ",".join(filter(None, (exempt, host)))
 
 
 def drive(

@@ -100,16 +100,12 @@ def serve(
 
     def ready(served: RunningServer) -> None:
         for name, default in served.policies:
-            terminal.output().print(
-                f"{served.url}/v1/policies/{name}  (version {default})", highlight=False, soft_wrap=True
-            )
+            terminal.show(f"{served.url}/v1/policies/{name}  (version {default})")
         if served.grpc is not None:
-            terminal.output().print(f"{served.grpc}  gRPC, Open Inference Protocol", highlight=False, soft_wrap=True)
+            terminal.show(f"{served.grpc}  gRPC, Open Inference Protocol")
         if served.admin_key_file is not None:
             note(f"administration: rlservo policy --help; its key is in {served.admin_key_file}")
-        terminal.output().print(
-            f"ready; status page: {served.url} (API: {served.url}/docs); Ctrl-C stops", highlight=False, soft_wrap=True
-        )
+        terminal.show(f"ready; status page: {served.url} (API: {served.url}/docs); Ctrl-C stops")
 
     serve_policies(
         directories,

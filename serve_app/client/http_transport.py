@@ -48,6 +48,7 @@ PROXIES: dict[str, Callable[..., httpcore.ConnectionPool]] = {
     "socks5": httpcore.SOCKSProxy,
     "socks5h": httpcore.SOCKSProxy,
 }
+GATEWAYS = (500, 502)  # without an error of ours: the server behind has died, which Ray's HAProxy answers with 500
 FAILURES = (
     httpcore.NetworkError,
     httpcore.ProtocolError,
@@ -126,7 +127,8 @@ class Transport:
         """Try until answered, out of time or out of retries; return the content, its address and the status.
 
         Raises DeadlineError when the answer did not come in time (never retried: the server may still be at work),
-        UnavailableError when the server cannot be reached or stays at 503, and else the error the server names.
+        UnavailableError when the server cannot be reached or stays at 503, or a gateway before it at 500 or 502, and
+        else the error the server names.
         """
         if self._is_closed:
             raise UsageError("the client is closed: make a new one")
@@ -148,7 +150,8 @@ class Transport:
                 if status < 300:
                     return content, url, status
                 refusal = decode_error(url, status, content)
-                if status != 503:
+                is_gateways = status in GATEWAYS and isinstance(refusal, UnavailableError)
+                if status != 503 and not is_gateways:
                     raise refusal
                 failure = refusal if isinstance(refusal, UnavailableError) else UnavailableError(refusal.message)
                 failure.retry_after_s = _retry_after_s(headers)

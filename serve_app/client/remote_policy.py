@@ -40,6 +40,8 @@ logger = logging.getLogger(__name__)
 
 POLL_S = 0.1  # between two looks at a server that is starting
 LONGEST_TRY_S = 5.0  # of one such look
+FOLLOWED_S = 2.0  # by all processes of a server, when a version is loaded
+ASK_AGAIN_S = 0.01  # another process may be the next to answer
 
 
 class RemotePolicy(ActingPolicy):
@@ -242,10 +244,7 @@ class RemotePolicy(ActingPolicy):
             )
         known = self._contracts.get(version)
         if known is None:
-            try:
-                known = self._fetch_version(version, deadline)
-            except UnknownVersionError as error:
-                raise UnavailableError(f"{error.message}: the action was dropped", error.details) from error
+            known = self._fetch_new_version(version, deadline)
             if (known.name, known.version) != (contract.name, version):
                 raise UnavailableError(
                     f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' and has no contract "
@@ -254,6 +253,17 @@ class RemotePolicy(ActingPolicy):
             self._learn(known)  # also one that is refused next: it is not fetched again
         self._meet(known)
         return known
+
+    def _fetch_new_version(self, version: str, deadline: float) -> Contract:
+        """Return the contract of a version that has answered, also where another process does not serve it yet."""
+        until = min(deadline, time.monotonic() + FOLLOWED_S)
+        while True:
+            try:
+                return self._fetch_version(version, deadline)
+            except UnknownVersionError as error:
+                if time.monotonic() + ASK_AGAIN_S >= until:
+                    raise UnavailableError(f"{error.message}: the action was dropped", error.details) from error
+                time.sleep(ASK_AGAIN_S)
 
     def _encode_request(
         self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None

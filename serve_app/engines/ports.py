@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import socket
+from typing import Any
 
 import psutil
 
@@ -22,6 +23,7 @@ def listen(host: str, port: int, *, option: str = "--port") -> socket.socket:
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # closed connections lingering are no obstacle
     try:
+        _check_route(family, address)
         listener.bind(address)
         listener.listen(BACKLOG)
     except OSError as error:
@@ -30,11 +32,22 @@ def listen(host: str, port: int, *, option: str = "--port") -> socket.socket:
     return listener
 
 
+def _check_route(family: int, address: Any) -> None:
+    """Raise OSError where this machine itself cannot reach an address of its own: its interface is down."""
+    host, _, *rest = address
+    if host in ("0.0.0.0", "::"):
+        return
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.connect((host, 9, *rest))  # looks for a route, and sends nothing
+
+
 def _why_not(host: str, port: int, option: str, error: OSError) -> str:
     if error.errno == errno.EADDRINUSE:
         holder = port_holder(port)
         by = "" if holder is None else f" by '{holder[1]}' (process {holder[0]})"
         return f"port {port} on {host} is in use{by}: stop it, or choose another with {option}"
+    if error.errno == errno.ENETUNREACH:
+        return f"{host} cannot be reached from this machine: is its interface up? (ip link set lo up)"
     if error.errno == errno.EACCES:
         return f"port {port} needs more rights than this user has: choose one above 1023 with {option}"
     if error.errno == errno.EADDRNOTAVAIL:

@@ -122,7 +122,7 @@ class Policy(Closeable):
         self._ort_session: onnxruntime.InferenceSession | None = ort_session
         self._run: Run = ort_session.run
         self._run_whole: Run | None = None  # with the value head, once that is asked for
-        self._rng = np.random.default_rng()
+        self._rng: np.random.Generator | None = None  # numpy.random is 2 MB, of use only to policies that explore
         self.options = options
         self.draw: Draw | None = None
         """How the last exploring action came about, for a recording; None before the first."""
@@ -431,7 +431,10 @@ class Policy(Closeable):
     def _sample(self, inputs: NDArray[Any], seed: int | None) -> dict[str, NDArray[Any]]:
         if seed is not None and seed < 0:
             raise RequestError(f"seed must be a non-negative integer, got {seed}")
-        rng = self._rng if seed is None else np.random.default_rng(seed)
+        if seed is None:
+            rng = self._rng = self._rng or np.random.default_rng()
+        else:
+            rng = np.random.default_rng(seed)
         # Minus infinity is how a policy says 'not allowed'; where it is a mean, the action is refused.
         if np.isnan(inputs).any() or np.isposinf(inputs).any():
             raise ActionError(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 
 from clusters import KEY, Cluster
+from loads import Load
 from rlservo.export.contract.errors import ObservationError, UnauthenticatedError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
@@ -192,3 +195,40 @@ def test_metrics_and_the_status_page_are_served(engine: Engine) -> None:
     assert status == 200 and b"rlservo_requests_total" in text
     status, _, page = engine.ask("GET", "/", headers={"accept": "text/html"})
     assert status == 200 and b"<html" in page.lower()
+
+
+@pytest.fixture
+def load(cluster: Cluster) -> Load:
+    versions = [Policy.load(cluster.repository / "ur5" / version).act(OBS) for version in ("1", "2")]
+    return Load(cluster.port, "ur5", OBS.tolist(), [np.asarray(action) for action in versions], api_key=KEY)
+
+
+def test_no_request_fails_while_the_production_version_changes_on_a_cluster(cluster: Cluster, load: Load) -> None:
+    url = f"http://127.0.0.1:{cluster.port}"
+    with cluster.admin() as admin, PolicyClient(url, "ur5", api_key=KEY, timeout_s=30) as policy:
+        admin.load("ur5", "2")
+        with load.run():
+            for version, right in zip(("2", "1"), load.expected[::-1], strict=True):
+                admin.alias("ur5", "production", version)
+                deadline = time.monotonic() + 30
+                in_a_row = 0
+                while in_a_row < 20:  # both replicas follow
+                    in_a_row = in_a_row + 1 if np.allclose(policy.act(OBS), right, rtol=1e-6) else 0
+                    assert time.monotonic() < deadline
+        admin.unload("ur5", "2")
+    assert load.asked > 50 and (load.wrong, load.failures) == (0, [])
+
+
+def test_a_replica_that_is_killed_is_replaced_and_its_clients_ask_another(cluster: Cluster, load: Load) -> None:
+    before = cluster.replica_pids()
+    assert len(before) == 2
+    with load.run():
+        time.sleep(1)
+        os.kill(before[0], signal.SIGKILL)
+        deadline = time.monotonic() + 120
+        while before[0] in (now := cluster.replica_pids()) or len(now) != 2:
+            assert time.monotonic() < deadline, now
+            time.sleep(0.5)
+        time.sleep(2)
+    cluster.wait_for_status("RUNNING")
+    assert load.asked > 50 and (load.wrong, load.failures) == (0, [])

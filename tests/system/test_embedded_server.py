@@ -8,25 +8,21 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
 import pytest
 
-from rlservo.export.contract.errors import BundleError, RlservoError, UsageError
-from rlservo.serve_app.client.policy_client import PolicyClient
+from loads import CLIENTS, Load
+from rlservo.export.contract.errors import BundleError, UsageError
 from rlservo.serve_app.engines.local import serve_policies
 from rlservo.serve_app.runtime.policy import Policy
 from servers import Run, ask, free_ports, launched, running, wait_until_served
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
-CLIENTS = 8
 PATIENCE_S = 120  # [s] on a busy machine
 
 
@@ -108,51 +104,12 @@ def test_few_open_files_are_a_warning_and_connections_wait(policies: Path) -> No
         assert "this process may open 256 files" in run.process.stdout.read()
 
 
-@dataclass
-class Load:
-    """Clients that never stop asking, and what they got."""
-
-    port: int
-    expected: np.ndarray[Any, Any]
-    asked: int = 0
-    failures: list[str] = field(default_factory=list)
-    wrong: int = 0
-    longest_s: float = 0.0
-
-    @contextlib.contextmanager
-    def run(self) -> Iterator[Load]:
-        ended = threading.Event()
-        threads = [threading.Thread(target=self._ask, args=(ended,)) for _ in range(CLIENTS)]
-        for thread in threads:
-            thread.start()
-        try:
-            yield self
-        finally:
-            ended.set()
-            for thread in threads:
-                thread.join(PATIENCE_S)
-
-    def _ask(self, ended: threading.Event) -> None:
-        with PolicyClient(f"http://127.0.0.1:{self.port}", "ur5", timeout_s=5, retries=3) as policy:
-            while not ended.is_set():
-                began = time.monotonic()
-                try:
-                    action = policy.act(OBS)
-                except RlservoError as error:
-                    self.failures.append(error.message)
-                else:
-                    self.wrong += not np.array_equal(action, self.expected)
-                self.longest_s = max(self.longest_s, time.monotonic() - began)
-                self.asked += 1
-                time.sleep(0.005)
-
-
 @pytest.fixture(scope="module")
 def workers(policies: Path) -> Iterator[tuple[Run, Load]]:
     expected = Policy.load(policies / "ur5" / "10").act(OBS)
     with launched(policies, workers=2) as run:
         run.wait_until_ready()
-        yield run, Load(run.port, np.asarray(expected))
+        yield run, Load(run.port, "ur5", OBS, [np.asarray(expected)])
         assert run.end(signal.SIGTERM) == 0
 
 

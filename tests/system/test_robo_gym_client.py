@@ -35,7 +35,7 @@ from servers import HEEDING_CTRL_C, ShippedServer, free_ports
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "robo_gym_client.py"
 ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")  # what the fixture robo_gym_python installs
-CLIENT = ("httpcore>=1.0.6", "pydantic>=2.6")
+CLIENT = ("httpcore>=1.0.6", "pydantic>=2.10")
 EPISODE_STEPS = 600  # after which robo-gym ends an episode of the UR
 DOCUMENT = "".join((ROOT / "docs" / "how-to" / name).read_text() for name in ("robo-gym.md", "real-arm.md"))
 

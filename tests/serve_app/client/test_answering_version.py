@@ -15,7 +15,7 @@ import pytest
 from gymnasium.envs.registration import register, registry
 
 from rlservo.export.contract.bundle import load_bundle
-from rlservo.export.contract.errors import SessionLostError, UnavailableError
+from rlservo.export.contract.errors import SessionLostError, UnavailableError, UnknownVersionError
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.export.renumber_bundle import renumber
 from rlservo.serve_app.client.policy_client import PolicyClient
@@ -104,6 +104,25 @@ def test_canary_gets_its_share_of_the_episodes_and_each_of_them_one_version(arms
                 assert step == 0 or version == chosen[-1]
                 chosen += [version] if step == 0 else []
     assert 35 <= chosen.count("2") <= 85  # of 120 fair coins, all but one in 300,000
+
+
+def test_a_version_that_another_process_does_not_serve_yet_is_asked_for_again(
+    arms: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetch = PolicyClient._fetch_version
+    unknown = [UnknownVersionError("policy 'ur5' has no version '2'")] * 2
+
+    def fetch_late(client: PolicyClient, version: str, deadline: float) -> Any:
+        if unknown:
+            raise unknown.pop()
+        return fetch(client, version, deadline)
+
+    monkeypatch.setattr(PolicyClient, "_fetch_version", fetch_late)
+    with PolicyClient(arms.url, "ur5") as client:
+        assert np.array_equal(client.act(OBS), arms.action("1"))
+        arms.move("2")
+        assert np.array_equal(client.act(OBS), arms.action("2"))
+    assert unknown == []
 
 
 def test_canary_gets_its_share_of_streams(arms: Server) -> None:

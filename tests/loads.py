@@ -1,0 +1,60 @@
+"""Clients that never stop asking a server, and what they got."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.errors import RlservoError
+from rlservo.serve_app.client.policy_client import PolicyClient
+
+CLIENTS = 8
+PATIENCE_S = 120  # [s] on a busy machine
+
+
+@dataclass
+class Load:
+    """Clients of one policy, which ask again at once where a connection breaks."""
+
+    port: int
+    policy: str
+    obs: Sequence[float]
+    expected: Sequence[NDArray[Any]]
+    """The actions that are right: one for each version that may answer."""
+    api_key: str | None = None
+    asked: int = 0
+    failures: list[str] = field(default_factory=list)
+    wrong: int = 0
+
+    @contextlib.contextmanager
+    def run(self) -> Iterator[Load]:
+        ended = threading.Event()
+        threads = [threading.Thread(target=self._ask, args=(ended,)) for _ in range(CLIENTS)]
+        for thread in threads:
+            thread.start()
+        try:
+            yield self
+        finally:
+            ended.set()
+            for thread in threads:
+                thread.join(PATIENCE_S)
+
+    def _ask(self, ended: threading.Event) -> None:
+        url = f"http://127.0.0.1:{self.port}"
+        with PolicyClient(url, self.policy, timeout_s=5, retries=3, api_key=self.api_key) as policy:
+            while not ended.is_set():
+                try:
+                    action = policy.act(self.obs)
+                except RlservoError as error:
+                    self.failures.append(error.message)
+                else:
+                    self.wrong += not any(np.allclose(action, right, rtol=1e-6) for right in self.expected)
+                self.asked += 1
+                time.sleep(0.005)
