@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import pkgutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -20,15 +19,7 @@ from pydantic import ValidationError
 from rlservo.export.contract.errors import first_line
 from rlservo.export.contract.spaces import Element
 from rlservo.export.recipe.recipe import Recipe
-
-
-@dataclass(frozen=True)
-class ElementNames:
-    """Element names in row-major order, empty where unknown, and the rate the environment asks for actions at [Hz]."""
-
-    observation: tuple[Element, ...] = ()
-    action: tuple[Element, ...] = ()
-    control_rate_hz: float | None = None
+from rlservo.export.sources.restored_policy import ElementNames
 
 
 def read_elements(
