@@ -65,7 +65,7 @@ def space_spec(
             elements=named,
         )
     if isinstance(space, MultiBinary):
-        return MultiBinarySpec(shape=shape, dtype=str(space.dtype), elements=named)
+        return MultiBinarySpec(shape=shape, dtype="int64" if action else str(space.dtype), elements=named)
     assert isinstance(space, Box)
     return BoxSpec(shape=shape, dtype=str(space.dtype), low=_bound(space.low), high=_bound(space.high), elements=named)
 

@@ -13,6 +13,7 @@ ENTRY_POINTS = "rlservo.sources"
 OURS = (
     "rlservo.export.rllib.source:NewStack",
     "rlservo.export.rllib.source:OldStack",
+    "rlservo.export.sources.sb3:StableBaselines3",
 )
 """Their modules import no framework. The first one is taken where a path does not exist."""
 
