@@ -47,6 +47,10 @@ def baked_steps(recipe: Recipe, module_class: str, module: Any, unread: Sequence
     )
     steps.append(BakedStep(step="mode", detail=_mode_detail(recipe), values={"mode": recipe.mode}))
     steps += [BakedStep(step="user_connector", detail=f"{step.name}, your own") for step in recipe.action_steps]
+    if (affine := recipe.affine) is not None:
+        limited = f"clipped to ±{affine.limit:g}, then " if affine.limit is not None else ""
+        values = {"scale": affine.scale.ravel().tolist(), "offset": affine.offset.ravel().tolist()}
+        steps.append(BakedStep(step="scale", detail=f"{limited}action * scale + offset", values=values))
     if any(leaf_transform(leaf, recipe.transform) != "none" for leaf in recipe.action_leaves.values()):
         steps.append(_transform_step(recipe))
     return tuple(steps)

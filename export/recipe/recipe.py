@@ -170,6 +170,22 @@ class StateLeaf:
 
 
 @dataclass(frozen=True)
+class Affine:
+    """What an environment makes of a policy's numbers: `clip(action, -limit, limit) * scale + offset`."""
+
+    scale: NDArray[np.float32]
+    """Of the action's shape, in its units."""
+    offset: NDArray[np.float32]
+    """The same."""
+    limit: float | None = None
+
+    def apply(self, action: NDArray[Any]) -> NDArray[Any]:
+        """Return the action in the environment's units, in numpy: what a graph is compared with."""
+        limited = action if self.limit is None else np.clip(action, -self.limit, self.limit)
+        return np.asarray(limited * self.scale + self.offset)
+
+
+@dataclass(frozen=True)
 class Recipe:
     """Everything between a raw observation and `env.step`, except the network."""
 
@@ -187,6 +203,8 @@ class Recipe:
     """A recurrent network's state, in the order the network takes and gives it."""
     action_steps: tuple[UserStep, ...] = ()
     """The user's own connectors between the distribution's mode and unsquashing."""
+    affine: Affine | None = None
+    """Of an action that is one Box: what is done to it before it is clipped."""
 
     @property
     def filter(self) -> ObservationFilter | None:

@@ -14,6 +14,7 @@ OURS = (
     "rlservo.export.rllib.source:NewStack",
     "rlservo.export.rllib.source:OldStack",
     "rlservo.export.sources.sb3:StableBaselines3",
+    "rlservo.export.sources.rsl_rl:RslRl",
 )
 """Their modules import no framework. The first one is taken where a path does not exist."""
 

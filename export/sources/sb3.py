@@ -205,7 +205,7 @@ def looks_normalized(file: Path, data: Mapping[str, Any]) -> bool:
         now, before = lasts.get(key), originals.get(key)
         if isinstance(before, np.ndarray) and isinstance(now, np.ndarray) and not np.array_equal(now, before):
             return True
-        if not (isinstance(leaf, Box) and isinstance(now, np.ndarray) and leaf.dtype.kind == "f"):
+        if not (isinstance(leaf, Box) and isinstance(now, np.ndarray) and np.dtype(leaf.dtype).kind == "f"):
             continue
         if not ((now >= leaf.low - 1e-3) & (now <= leaf.high + 1e-3)).all():
             return True

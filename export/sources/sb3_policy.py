@@ -288,7 +288,9 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
     if statistics and dict.fromkeys(statistics) != dict.fromkeys(models):
         raise CheckpointError(f"{file}: VecNormalize's statistics are of {vec.observation_space}, the model takes "
                               f"{model_space}: they do not belong together")  # fmt: skip
-    stacked, frame_spaces, transposed = {}, {}, []
+    stacked: dict[str, tuple[Any, int]] = {}
+    frame_spaces: dict[str, Any] = {}
+    transposed: list[str] = []
     normalized_first = True
     for key, model in models.items():
         channels_last = is_image_space(model) and is_image_space_channels_first(model)
@@ -319,7 +321,7 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
         for key, (_, axis) in stacked.items() if frames > 1
     ]  # fmt: skip
     filters = _filters(vec)
-    before = (*filters, *stacks) if normalized_first else (*stacks, *filters)
+    before: list[ObservationFilter | FrameStack] = [*filters, *stacks] if normalized_first else [*stacks, *filters]
     frame = Dict(frame_spaces) if is_dict else frame_spaces[""]
     return Layout(frame, frames, normalized_first, (*before, *steps))
 
@@ -340,13 +342,14 @@ def _fits(part: Sequence[int], whole: Sequence[int], axis: int) -> bool:
     return rest.pop(axis) > 0 and others.pop(axis) > 0 and rest == others
 
 
-def _channels_last(space: Box) -> Box:
-    return Box(*(np.moveaxis(side, 0, -1) for side in (space.low, space.high)), dtype=space.dtype.type)
+def _channels_last(space: Any) -> Box:
+    low, high = (np.moveaxis(side, 0, -1) for side in (space.low, space.high))
+    return Box(low, high, dtype=space.dtype.type)
 
 
-def _first_frame(space: Box, axis: int, frames: int) -> Box:
-    sides = (np.split(side, frames, axis=axis)[0] for side in (space.low, space.high))
-    return Box(*sides, dtype=space.dtype.type)
+def _first_frame(space: Any, axis: int, frames: int) -> Box:
+    low, high = (np.split(side, frames, axis=axis)[0] for side in (space.low, space.high))
+    return Box(low, high, dtype=space.dtype.type)
 
 
 def _stack_dtype(vec: Any, key: str, space: Box, normalized_first: bool) -> str:

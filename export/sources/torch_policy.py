@@ -41,14 +41,18 @@ class TorchPolicy:
     """What is traced: torch operations on the module, without the recipe's steps."""
     reference: Callable[[], Act]
     """Start the framework's own way to act, of an observation as the environment gives it, as torch tensors."""
-    finish: Callable[[NDArray[Any]], NDArray[Any]] = lambda action: action
-    """What the environment does to the framework's action before it is the contract's, in numpy."""
     names: tuple[str, ...] = ()
     """`("q_values",)` or `("action_dist_inputs",)` where the output is scores."""
 
 
-def restored(policy: TorchPolicy, elements: ElementNames | None, what: str) -> RestoredPolicy:
-    """Return the policy for the exporter; `what` names the checkpoint in errors."""
+def restored(
+    policy: TorchPolicy, elements: ElementNames | None, what: str, module_class: str = "", untrained_filter: str = ""
+) -> RestoredPolicy:
+    """Return the policy for the exporter; `what` names the checkpoint in errors.
+
+    Raises CheckpointError for weights that are not finite, UnsupportedError for a module that does not run or gives
+    something else than the action space wants.
+    """
     for key in diverged_weights(policy.module):
         raise CheckpointError(f"{what}: the weights '{key}' are not all finite: training diverged")
     policy.module.eval().requires_grad_(False)
@@ -57,9 +61,10 @@ def restored(policy: TorchPolicy, elements: ElementNames | None, what: str) -> R
     return RestoredPolicy(
         policy.recipe,
         ActNetwork(policy),
-        f"{kind.__module__}.{kind.__qualname__}",
+        module_class or f"{kind.__module__}.{kind.__qualname__}",
         lambda: ActLoop(policy),
         elements=elements,
+        untrained_filter=untrained_filter,
     )
 
 
@@ -122,8 +127,12 @@ class ActLoop:
             outputs[self._policy.names[0]] = values[0]
             values = [_choose(recipe, values[0])]
         for (name, space), value in zip(recipe.action_leaves.items(), values, strict=True):
-            whole = np.dtype(space.dtype).kind in "iu"
-            outputs[name] = value.astype(np.int64) if whole else self._policy.finish(value).astype(space.dtype)
+            if np.dtype(space.dtype).kind in "iu":
+                outputs[name] = value.astype(np.int64)
+                continue
+            sent = value if recipe.affine is None else recipe.affine.apply(value)
+            outputs[name] = np.clip(sent, space.low, space.high) if recipe.transform == "clip" else sent
+            outputs[name] = outputs[name].astype(space.dtype)
         for leaf, tensor in zip(recipe.network_state, self._state, strict=True):
             outputs[f"state_out.{leaf.name}"] = tensor.numpy().copy()
         return outputs
