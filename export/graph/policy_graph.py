@@ -141,8 +141,8 @@ class AffineNode(nn.Module):
     def __init__(self, affine: Affine) -> None:
         super().__init__()
         self.limit = affine.limit
-        self.register_buffer("scale", torch.from_numpy(affine.scale))
-        self.register_buffer("offset", torch.from_numpy(affine.offset))
+        self.register_buffer("scale", torch.tensor(affine.scale))
+        self.register_buffer("offset", torch.tensor(affine.offset))
 
     def forward(self, action: Tensor) -> Tensor:
         """Return actions `[batch, *shape]`."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError, first_line
-from rlservo.export.recipe.recipe import Recipe
+from rlservo.export.recipe.recipe import Recipe, parameter_count
 from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.samples import draw_pair
 from rlservo.export.recipe.trees import Tree, build, tree_leaves
@@ -72,18 +72,30 @@ def _check_output(policy: TorchPolicy, what: str) -> None:
     """Raise UnsupportedError where the module does not run on an observation, or gives something of another shape."""
     recipe, pair = policy.recipe, draw_pair(policy.recipe)
     try:
-        outputs = ActLoop(policy).step(pair, np.ones(2, np.bool_))
+        ActLoop(policy).step(pair, np.ones(2, np.bool_))
+    except UnsupportedError as error:
+        error.prefix(what)
+        raise
     except Exception as error:  # a module of the user's own raises anything
         raise UnsupportedError(
             f"{what}: {type(policy.module).__name__} does not run on an observation of {recipe.observation_space}: "
             f"{first_line(error)}"
         ) from error
-    for name, space in recipe.action_leaves.items():
-        if outputs[name].shape != (2, *space.shape):
-            raise UnsupportedError(
-                f"{what}: {type(policy.module).__name__} gives for two observations an action of shape "
-                f"{outputs[name].shape}, the action space {space} wants {(2, *space.shape)}"
-            )
+
+
+def _check_shape(recipe: Recipe, values: list[NDArray[Any]], rows: int) -> None:
+    """Raise UnsupportedError where a module gives something of another shape than the action space wants."""
+    spaces = list(recipe.action_leaves.values())
+    if recipe.mode == "argmax":
+        wanted, which = [(rows, sum(parameter_count(space) for space in spaces))], "scores"
+    else:
+        wanted, which = [(rows, *space.shape) for space in spaces], "an action"
+    got = [value.shape for value in values]
+    if got != wanted:
+        raise UnsupportedError(
+            f"it gives for {rows} observations {which} of shape {', '.join(map(str, got))}, the action space "
+            f"{recipe.action_space} wants {', '.join(map(str, wanted))}"
+        )
 
 
 class ActNetwork(nn.Module):
@@ -122,6 +134,7 @@ class ActLoop:
         with torch.no_grad():
             output, self._state = self._act(build(recipe.observation_space, leaves), state)
         values = [leaf.numpy().copy() for leaf in tree_leaves(output)]
+        _check_shape(recipe, values, len(restart))
         outputs: Outputs = {}
         if recipe.mode == "argmax":
             outputs[self._policy.names[0]] = values[0]
