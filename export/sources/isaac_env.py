@@ -161,9 +161,10 @@ def _values(given: Any, joints: Sequence[str], count: int, missing: float, what:
 
 def _rate(env: Mapping[str, Any]) -> float | None:
     simulation = env.get("sim") or {}
-    step = simulation.get("dt") or (simulation.get("mujoco") or {}).get("timestep")
-    decimation = env.get("decimation")
+    step: Any = simulation.get("dt") or (simulation.get("mujoco") or {}).get("timestep")
+    decimation: Any = env.get("decimation")
     try:
-        return 1.0 / (float(step) * int(decimation))
+        rate = 1.0 / (float(step) * int(decimation))
     except (TypeError, ValueError, ZeroDivisionError):
         return None
+    return rate if np.isfinite(rate) and rate > 0 else None

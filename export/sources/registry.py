@@ -15,6 +15,7 @@ OURS = (
     "rlservo.export.rllib.source:OldStack",
     "rlservo.export.sources.sb3:StableBaselines3",
     "rlservo.export.sources.rsl_rl:RslRl",
+    "rlservo.export.sources.skrl:Skrl",
 )
 """Their modules import no framework. The first one is taken where a path does not exist."""
 

@@ -145,7 +145,7 @@ def _affine(spec: ModuleSpec) -> Affine | None:
             ) from None
         if not np.isfinite(values).all():
             raise UsageError(f"{name} is not finite: {values}")
-    return Affine(*sides)
+    return Affine(sides[0], sides[1])
 
 
 def _check_spaces(spec: ModuleSpec) -> None:
