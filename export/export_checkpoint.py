@@ -12,7 +12,7 @@ import datetime
 import logging
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -239,7 +239,7 @@ def _build(
         elements = read_elements(facts.env_id, facts.env_config, restored.recipe, options.notify)
     folder = folders.enter_context(_temporary_folder(target))
     with one_thread():
-        labels = [element.name for element in elements.action]
+        labels = [] if isinstance(elements.action, Mapping) else [element.name for element in elements.action]
         parity, inputs, outputs = _write_graphs(folder, restored, labels, options)
         recipe = restored.recipe
         unread = recipe.observation_leaves.keys() - inputs.keys()
@@ -248,7 +248,7 @@ def _build(
             version=target.name,
             description=options.description,
             observation_space=space_spec(recipe.observation_space, elements.observation, unread=unread),
-            action_space=space_spec(recipe.action_space, elements.action, action=True),
+            action_space=space_spec(recipe.action_space, elements.action, action=True, name="action"),
             inputs=tuple(_tensor(name, values) for name, values in inputs.items()),
             outputs=tuple(_tensor(output, values) for output, values in outputs.items()),
             state=tuple(state_spec(leaf) for leaf in recipe.state),

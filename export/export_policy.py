@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlservo.export.checkpoints.facts import CheckpointFacts
@@ -63,7 +64,8 @@ def export_policy(
         _elements("action", action_names, action_units),
         control_rate_hz,
     )
-    spec = ModuleSpec(observation_space, action_space, scale, offset, clip, dict(state or {}), elements, facts)
+    initial = {name: np.asarray(values, np.float32) for name, values in (state or {}).items()}
+    spec = ModuleSpec(observation_space, action_space, scale, offset, clip, initial, elements, facts)
     options = ExportOptions(
         TorchModule(spec), Path(out), name, version, description, RestoreOptions(Path()), False, notify, progress
     )

@@ -16,6 +16,7 @@ OURS = (
     "rlservo.export.sources.sb3:StableBaselines3",
     "rlservo.export.sources.rsl_rl:RslRl",
     "rlservo.export.sources.skrl:Skrl",
+    "rlservo.export.sources.leapp:Leapp",
 )
 """Their modules import no framework. The first one is taken where a path does not exist."""
 

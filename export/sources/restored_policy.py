@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -35,12 +35,18 @@ class RestoredNetwork(Protocol):
     def __call__(self, obs: Tree, *state: list[Tensor]) -> tuple[Tensor, ...]: ...
 
 
+Elements: TypeAlias = tuple[Element, ...] | Mapping[str, tuple[Element, ...]]
+
+
 @dataclass(frozen=True)
 class ElementNames:
-    """Element names in row-major order, empty where unknown, and the rate the environment asks for actions at [Hz]."""
+    """Element names in row-major order, empty where unknown, and the rate the environment asks for actions at [Hz].
 
-    observation: tuple[Element, ...] = ()
-    action: tuple[Element, ...] = ()
+    Of a nested space they are by the leaf's tensor name.
+    """
+
+    observation: Elements = ()
+    action: Elements = ()
     control_rate_hz: float | None = None
 
 

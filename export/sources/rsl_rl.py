@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from rlservo.export.sources.restored_policy import RestoredPolicy
-    from rlservo.export.sources.torch_policy import Act
 
 AGENT, ENVIRONMENT = Path("params/agent.yaml"), Path("params/env.yaml")
 ACTORS = {"actor": "actor_state_dict", "student": "student_state_dict"}
@@ -147,7 +146,7 @@ def _restore(file: Path, notify: Notify) -> RestoredPolicy:
 
         exported.obs_normalizer = torch.nn.Identity()  # it is the recipe's
     untrained = f"the normalizer's statistics are of {frozen.count} observations" if frozen and not frozen.count else ""
-    policy = TorchPolicy(recipe, exported, _traced(exported, len(memory)), lambda: _Reference(acting))
+    policy = TorchPolicy(recipe, exported, _traced(len(memory)), lambda: _Reference(acting))
     elements = ElementNames((), terms.elements, terms.control_rate_hz)
     return restored(policy, elements, str(file), f"{type(acting).__module__}.{type(acting).__qualname__}", untrained)
 
@@ -211,10 +210,10 @@ def _memory(actor: Any) -> tuple[StateLeaf, ...]:
     return tuple(StateLeaf(name, zeros) for name in names)
 
 
-def _traced(exported: Any, count: int) -> Act:
-    """Return rsl_rl's own module for ONNX as a function of an observation and a state."""
+def _traced(count: int) -> Any:
+    """Return how rsl_rl's own module for ONNX takes an observation and a state."""
 
-    def act(obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
+    def act(exported: Any, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
         if not count:
             return exported(obs), []
         action, *after = exported(obs, *(leaf.transpose(0, 1).contiguous() for leaf in state))

@@ -203,8 +203,10 @@ class Network(nn.Module):
         else:
             action, next_state = policy._predict(obs, deterministic=True, **how), []
         actions = [_shaped(action, policy.action_space)] if rule.mode == "given" else []
-        scores = self._scores.take(mask) if rule.mode != "given" else None
-        named = [policy.predict_values(obs).squeeze(-1) if name == "value" else scores for name in self.names]
+        named = [
+            policy.predict_values(obs).squeeze(-1) if name == "value" else self._scores.take(mask)
+            for name in self.names
+        ]
         return (*actions, *named, *next_state)
 
 
@@ -286,8 +288,8 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
     models = _leaves(model_space)
     statistics = _leaves(vec.observation_space) if vec is not None else {}
     if statistics and dict.fromkeys(statistics) != dict.fromkeys(models):
-        raise CheckpointError(f"{file}: VecNormalize's statistics are of {vec.observation_space}, the model takes "
-                              f"{model_space}: they do not belong together")  # fmt: skip
+        raise CheckpointError(f"{file}: VecNormalize's statistics are of the parts {', '.join(statistics)}, the model "
+                              f"takes {', '.join(models)}: they do not belong together")  # fmt: skip
     stacked: dict[str, tuple[Any, int]] = {}
     frame_spaces: dict[str, Any] = {}
     transposed: list[str] = []

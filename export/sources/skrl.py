@@ -125,7 +125,7 @@ def _restore(file: Path, agent_file: Path, notify: Notify) -> RestoredPolicy:
         affine=terms.affine,
     )
 
-    def act(obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
+    def act(policy: Any, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
         return policy.compute({"observations": obs, "states": None}, "policy")[0], state
 
     def reference(obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,27 +106,21 @@ class TorchModule(Source):
             mode,
             "clip" if spec.clip and mode == "given" else "none",
             None,
-            tuple(StateLeaf(name, np.asarray(initial, np.float32)) for name, initial in spec.state.items()),
+            tuple(StateLeaf(name, initial) for name, initial in spec.state.items()),
             affine=_affine(spec),
         )
         names = () if mode == "given" else (Q_VALUES,)
-        policy = TorchPolicy(recipe, traced, _act(traced, spec), lambda: _act(acting, spec), names)
+        policy = TorchPolicy(recipe, traced, partial(_act, spec), lambda: partial(_act, spec, acting), names)
         return restored(policy, spec.elements, what)
 
 
-def _act(module: nn.Module, spec: ModuleSpec) -> Any:
-    """Return the module as a function of an observation and a state."""
-
-    def act(obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
-        outputs = module(obs, *state)
-        first, after = (outputs[0], list(outputs[1:])) if isinstance(outputs, tuple) else (outputs, [])
-        if len(after) != len(spec.state):
-            raise ValueError(
-                f"it gives {len(after)} tensors of state, {len(spec.state)} were named ({list(spec.state)})"
-            )
-        return first, after
-
-    return act
+def _act(spec: ModuleSpec, module: nn.Module, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
+    """Return the module's output and its next state."""
+    outputs = module(obs, *state)
+    first, after = (outputs[0], list(outputs[1:])) if isinstance(outputs, tuple) else (outputs, [])
+    if len(after) != len(spec.state):
+        raise ValueError(f"it gives {len(after)} tensors of state, {len(spec.state)} were named ({list(spec.state)})")
+    return first, after
 
 
 def _affine(spec: ModuleSpec) -> Affine | None:

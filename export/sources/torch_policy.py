@@ -37,8 +37,8 @@ class TorchPolicy:
     """Its mode says what the module's output is: the action ("given"), or scores to choose by ("argmax")."""
     module: nn.Module
     """It holds all weights."""
-    act: Act
-    """What is traced: torch operations on the module, without the recipe's steps."""
+    act: Callable[[Any, Tree, list[Tensor]], tuple[Tree, list[Tensor]]]
+    """What is traced, given the module, observation and state: torch operations, without the recipe's steps."""
     reference: Callable[[], Act]
     """Start the framework's own way to act, of an observation as the environment gives it, as torch tensors."""
     names: tuple[str, ...] = ()
@@ -109,7 +109,7 @@ class ActNetwork(nn.Module):
 
     def forward(self, obs: Tree, *state: list[Tensor]) -> tuple[Tensor, ...]:
         """Return the action or the scores, then the next state."""
-        output, after = self._act(obs, list(state[0]) if state else [])
+        output, after = self._act(self.module, obs, list(state[0]) if state else [])
         return (*tree_leaves(output), *after)
 
 
