@@ -116,9 +116,9 @@ def export_checkpoint(
 ) -> ExportResult:
     """Export one policy of a checkpoint to `out/<name>/<version>/`.
 
-    `checkpoint` is a path that a source knows (docs/sources.md), or a URI of such a file or folder; `source` names the
-    source, which the path tells otherwise. `name` defaults to the environment's (of
-    several policies with the module's behind it), `version` to the next integer after the newest one present.
+    `checkpoint` is a path that a source knows (docs/how-to/sources.md), or a URI of such a folder; `source` names the
+    source, which the path tells otherwise. `name` defaults to the environment's (of several policies with the module's
+    behind it), `version` to the next integer after the newest one present.
     `app_dir` holds the user's own classes, if the checkpoint needs any. `value` False leaves the value head out, which
     other servers compute for each action, too: a third of a small policy's time. `untrained_filter` also exports an
     observation filter whose statistics are empty, or only evaluation's. `vecnormalize` and `frame_stack` are for

@@ -62,7 +62,9 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "ray.tune": ("export/rllib/",),
     "uvicorn": ("serve_app/engines/local.py", "serve_app/engines/http_bounds.py"),
     "fastapi": ("serve_app/protocols/",),
-    "torch": ("export/graph/", "export/proof/", "export/rllib/", "export/sources/"),
+    "torch": (
+        "export/graph/", "export/proof/", "export/rllib/", "export/sources/", "export/export_policy.py",
+    ),
     "rsl_rl": ("export/sources/rsl_rl.py",),
     "skrl": ("export/sources/skrl.py",),
     "leapp": ("export/sources/leapp.py",),

@@ -93,7 +93,7 @@ def _parameters(file: Path, name: str, model: Mapping[str, Any]) -> Mapping[str,
             f"{file}: stage '{name}' is of the backend {parameters.get('backend')!r}: only TorchScript can be traced; "
             "export it with export_with='jit-trace'"
         )
-    return parameters  # type: ignore[no-any-return]
+    return dict(parameters)
 
 
 class _Tensor:
@@ -138,7 +138,7 @@ def _restore(file: Path) -> RestoredPolicy:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", r"`torch\.jit\.\w+` is deprecated", DeprecationWarning)
             manager = InferenceManager(str(file))  # it checks the hashes and the connections
-            stages = torch.nn.ModuleList([torch.jit.load(path) for path in paths])
+            stages = torch.nn.ModuleList([torch.jit.load(path) for path in paths])  # type: ignore[no-untyped-call]
         initial = load_file(file.with_name(pipeline["initial_values"])) if pipeline.get("initial_values") else {}
     except Exception as error:  # LEAPP, torch and safetensors raise several unrelated types
         raise CheckpointError(f"{file} cannot be loaded by LEAPP: {explain(error)}") from error
@@ -167,13 +167,14 @@ def _restore(file: Path) -> RestoredPolicy:
                 values.update(dict.fromkeys(flows.get(key, ()), result))
         return _tree({name: values[f"={tensor.key}"] for name, tensor in given.items()}), [values[k] for k in feedback]
 
-    def replay(obs: Any, before: list[Tensor]) -> tuple[Any, list[Tensor]]:
+    def replay(obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
         actions: list[dict[str, Tensor]] = []
         after: list[list[Tensor]] = []
         for row in range(len(next(iter(obs.values())) if isinstance(obs, dict) else obs)):
-            for key, leaf in zip(feedback, before, strict=True):
-                manager.set_input_value(*key.split("/"), leaf[row : row + 1])
-            one = {t.key: (obs if name is None else obs[name])[row : row + 1] for name, t in seen.items()}
+            for key, leaf in zip(feedback, state, strict=True):
+                stage, _, name = key.partition("/")
+                manager.set_input_value(stage, name, leaf[row : row + 1])
+            one = {t.key: (obs if part is None else obs[part])[row : row + 1] for part, t in seen.items()}
             actions.append({key: value.clone() for key, value in manager.run_policy(one).items()})
             after.append([manager.value_dict[key.split("/")[0]][key.split("/")[1]].clone() for key in feedback])
         tree = {name: torch.cat([each[tensor.key] for each in actions]) for name, tensor in given.items()}

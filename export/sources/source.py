@@ -1,8 +1,8 @@
 """Source: a trainer's checkpoints, as the exporter reads them.
 
 A source finds a policy by the names of files, says what loading it takes, and restores it: the recipe around its
-network, the network to trace, and the framework's own way to act, which the parity gate compares with. docs/sources.md
-shows how to add one.
+network, the network to trace, and the framework's own way to act, which the parity gate compares with. How to add one:
+docs/how-to/sources.md.
 """
 
 from __future__ import annotations

@@ -14,12 +14,12 @@ from rlservo.export.export_checkpoint import export_checkpoint
 from rlservo.export.sources.registry import find_source, sources
 from rlservo.serve_app.runtime.policy import Policy
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "sources.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "how-to" / "sources.md"
 
 
 @pytest.fixture
 def other_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A package beside ours, as pip installs it, with the source that docs/sources.md shows."""
+    """A package beside ours, as pip installs it, with the source that docs/how-to/sources.md shows."""
     (tmp_path / "site").mkdir()
     example = DOCUMENT.read_text().rpartition("```python\n")[2].partition("```")[0]
     (tmp_path / "site" / "linear_source.py").write_text(example)
