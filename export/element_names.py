@@ -11,7 +11,6 @@ import importlib
 import math
 import pkgutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -22,15 +21,7 @@ from rlservo.export.contract.environment_id import importing_id
 from rlservo.export.contract.errors import first_line
 from rlservo.export.contract.spaces import Element
 from rlservo.export.recipe.recipe import Recipe
-
-
-@dataclass(frozen=True)
-class ElementNames:
-    """Element names in row-major order, empty where unknown, and the rate the environment asks for actions at [Hz]."""
-
-    observation: tuple[Element, ...] = ()
-    action: tuple[Element, ...] = ()
-    control_rate_hz: float | None = None
+from rlservo.export.sources.restored_policy import ElementNames
 
 
 def read_elements(

@@ -7,15 +7,16 @@ there whole or not at all.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import datetime
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -23,8 +24,7 @@ from numpy.typing import NDArray
 
 import rlservo
 from rlservo.export.bundle_names import bundle_name, check_names, choose_target, default_name
-from rlservo.export.checkpoints.facts import CheckpointFacts, read_facts
-from rlservo.export.checkpoints.location import Files, locate_checkpoint, locate_modules
+from rlservo.export.checkpoints.facts import CheckpointFacts
 from rlservo.export.checkpoints.remote import fetch, is_uri
 from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.contract.bundle import (
@@ -45,6 +45,7 @@ from rlservo.export.contract.contract import (
     contract_json,
 )
 from rlservo.export.contract.errors import AgentsDifferError, CheckpointError, NoNetworkError, ParityError, UsageError
+from rlservo.export.contract.extras import require
 from rlservo.export.contract.spaces import leaf_specs
 from rlservo.export.element_names import read_elements
 from rlservo.export.graph.one_thread import one_thread
@@ -54,20 +55,18 @@ from rlservo.export.recipe.recipe import Recipe, loose_bounds
 from rlservo.export.recipe.runners import Inputs, Outputs, Runner
 from rlservo.export.recipe.samples import BATCH_SIZES, draw_batches
 from rlservo.export.recipe.to_contract import space_spec, state_spec
+from rlservo.export.sources.registry import find_source
+from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source
 
 if TYPE_CHECKING:
-    from rlservo.export.rllib.restored_policy import RestoredPolicy
+    from rlservo.export.sources.restored_policy import RestoredPolicy
 
 logger = logging.getLogger(__name__)
 
 GOLDEN_SAMPLES = {"likely": 48, "wide": 8, "extreme": 8}
 GOLDEN_BYTES = 2_000_000  # of images a few observations are as much as a bundle should carry
 SEED = 20240
-LOADING_RUNS_CODE = "loading {path}: checkpoints are pickles and run code when loaded; export only those you trust"
-
-
-Notify: TypeAlias = Callable[[str], None]
-"""Takes one sentence for a person."""
+TORCH = ("torch", "onnx", "onnxscript", "gymnasium")
 
 
 def silent(_sentence: str) -> None:
@@ -83,14 +82,15 @@ class ExportResult:
 
 
 @dataclass(frozen=True)
-class _Options:
+class ExportOptions:
     """Options that all bundles of one export share."""
 
+    source: Source
     out: Path
     name: str | None
     version: str | None
     description: str
-    value: bool
+    restore: RestoreOptions
     untrained_filter: bool
     notify: Notify
     progress: Notify
@@ -108,25 +108,37 @@ def export_checkpoint(
     app_dir: str | Path = ".",
     value: bool = True,
     untrained_filter: bool = False,
+    source: str | None = None,
+    vecnormalize: str | Path | None = None,
+    frame_stack: int = 1,
     notify: Notify = logger.warning,
     progress: Notify = silent,
 ) -> ExportResult:
-    """Export one policy of an RLlib checkpoint to `out/<name>/<version>/`.
+    """Export one policy of a checkpoint to `out/<name>/<version>/`.
 
-    `checkpoint` is what `locate_checkpoint` takes, or a URI of such a folder. `name` defaults to the environment's (of
-    several policies with the module's behind it), `version` to the next integer after the newest one present.
+    `checkpoint` is a path that a source knows (docs/how-to/sources.md), or a URI of such a folder; `source` names the
+    source, which the path tells otherwise. `name` defaults to the environment's (of several policies with the module's
+    behind it), `version` to the next integer after the newest one present.
     `app_dir` holds the user's own classes, if the checkpoint needs any. `value` False leaves the value head out, which
     other servers compute for each action, too: a third of a small policy's time. `untrained_filter` also exports an
-    observation filter whose statistics are empty, or only evaluation's. `notify` gets one sentence for each
-    thing a person should know (by default they are logged), `progress` what is being done.
+    observation filter whose statistics are empty, or only evaluation's. `vecnormalize` and `frame_stack` are for
+    Stable-Baselines3: its observation statistics, where they are not beside the model, and how many frames it stacked.
+    `notify` gets one sentence for each thing a person should know (by default they are logged), `progress` what is
+    being done.
 
     Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
-    cannot be exported, ParityError when the graph does not give RLlib's own actions. Nothing is left behind then.
+    cannot be exported, ParityError when the graph does not give the trainer's own actions. Nothing is left behind then.
     """
     with fetch(checkpoint, progress) as local:
-        files = locate_checkpoint(local, module_id, agent_id)
-        options = _Options(Path(out), name, version, description, value, untrained_filter, notify, progress)
-        return _export([files], options, app_dir, checkpoint)[0]
+        chosen = find_source(Path(local), source, notify)
+        files = chosen.locate(Path(local), module_id, agent_id)
+        restore = RestoreOptions(
+            Path(app_dir), value, None if vecnormalize is None else Path(vecnormalize), frame_stack=frame_stack
+        )
+        options = ExportOptions(
+            chosen, Path(out), name, version, description, restore, untrained_filter, notify, progress
+        )
+        return export_files([files], options, checkpoint)[0]
 
 
 def export_all_modules(
@@ -139,6 +151,7 @@ def export_all_modules(
     app_dir: str | Path = ".",
     value: bool = True,
     untrained_filter: bool = False,
+    source: str | None = None,
     notify: Notify,
     progress: Notify = silent,
 ) -> list[ExportResult]:
@@ -149,20 +162,27 @@ def export_all_modules(
     as for `export_checkpoint`.
     """
     with fetch(checkpoint, progress) as local:
-        options = _Options(Path(out), name, version, description, value, untrained_filter, notify, progress)
-        return _export(locate_modules(local), options, app_dir, checkpoint, name_all=True)
+        chosen = find_source(Path(local), source, notify)
+        restore = RestoreOptions(Path(app_dir), value)
+        options = ExportOptions(
+            chosen, Path(out), name, version, description, restore, untrained_filter, notify, progress
+        )
+        return export_files(chosen.locate_all(Path(local)), options, checkpoint, name_all=True)
 
 
-def _export(
-    policies: Sequence[Files], options: _Options, app_dir: str | Path, checkpoint: str | Path, *, name_all: bool = False
+def export_files(
+    policies: Sequence[PolicyFiles], options: ExportOptions, checkpoint: str | Path, *, name_all: bool = False
 ) -> list[ExportResult]:
     """Write a bundle for each of `policies`; they get their names when all of them are proven."""
     check_names(options.name, options.version)
-    root = policies[0].root
-    options.notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else root))
-    with user_code(app_dir) as folder, contextlib.ExitStack() as folders:
+    root, source = policies[0].root, options.source
+    require(source.extra, *source.packages, *TORCH, what=f"exporting from {source.framework}")
+    if warning := source.loads(policies[0]):
+        options.notify(f"loading {checkpoint if is_uri(checkpoint) else root}: {warning}")
+    with user_code(options.restore.app_dir) as folder, contextlib.ExitStack() as folders:
+        options = dataclasses.replace(options, restore=dataclasses.replace(options.restore, app_dir=folder))
         options.progress("reading the checkpoint")
-        facts = read_facts(root, options.notify)
+        facts = source.facts(policies[0], options.notify)
         base = options.name or default_name(facts.env_id, facts.env_config, root)
         written: list[tuple[Path, ExportResult]] = []
         queue = list(policies)
@@ -174,11 +194,11 @@ def _export(
             if any(result.path == target for _, result in written):
                 raise UsageError(f"two modules would both be written to {target}: export them one by one, with --name")
             try:
-                written.append(_build(files, facts, folder, target, options, folders))
+                written.append(_build(files, facts, target, options, folders))
             except AgentsDifferError as error:
                 if not name_all:
                     raise
-                queue[:0] = [locate_checkpoint(files.root, files.module_id, agent) for agent in error.agents]
+                queue[:0] = [source.locate(files.root, files.module_id, agent) for agent in error.agents]
             except NoNetworkError as error:
                 if not name_all or not (written or queue):
                     raise
@@ -201,24 +221,26 @@ def _publish(written: Sequence[tuple[Path, ExportResult]]) -> None:
 
 
 def _build(
-    files: Files, facts: CheckpointFacts, app_dir: Path, target: Path, options: _Options, folders: contextlib.ExitStack
+    files: PolicyFiles,
+    facts: CheckpointFacts,
+    target: Path,
+    options: ExportOptions,
+    folders: contextlib.ExitStack,
 ) -> tuple[Path, ExportResult]:
     """Return the finished bundle in a folder that only wants its name."""
-    options.progress(f"restoring '{files.module_id}' (importing torch and RLlib takes seconds)")
-    # Here and not at the top: torch and RLlib take seconds to import, and a wrong path should not have to wait for it.
-    from rlservo.export.rllib.restore import restore
-
-    restored = restore(files, app_dir, options.notify, value=options.value)
-    _check_filter(files, facts, restored.recipe, options)
+    source = options.source
+    options.progress(f"restoring '{files.module_id}' (importing torch and {source.framework} takes seconds)")
+    restored = source.restore(files, options.restore, options.notify)
+    _check_filter(files, facts, restored, options)
     for warning in loose_bounds(restored.recipe):
         options.notify(warning)
-    elements = read_elements(facts.env_id, facts.env_config, restored.recipe, options.notify)
+    elements = restored.elements
+    if elements is None:
+        elements = read_elements(facts.env_id, facts.env_config, restored.recipe, options.notify)
     folder = folders.enter_context(_temporary_folder(target))
     with one_thread():
-        labels = [element.name for element in elements.action]
-        parity, inputs, outputs = _write_graphs(
-            folder, restored, labels, files.api_stack, options.notify, options.progress
-        )
+        labels = [] if isinstance(elements.action, Mapping) else [element.name for element in elements.action]
+        parity, inputs, outputs = _write_graphs(folder, restored, labels, options)
         recipe = restored.recipe
         unread = recipe.observation_leaves.keys() - inputs.keys()
         contract = Contract(
@@ -226,7 +248,7 @@ def _build(
             version=target.name,
             description=options.description,
             observation_space=space_spec(recipe.observation_space, elements.observation, unread=unread),
-            action_space=space_spec(recipe.action_space, elements.action, action=True),
+            action_space=space_spec(recipe.action_space, elements.action, action=True, name="action"),
             inputs=tuple(_tensor(name, values) for name, values in inputs.items()),
             outputs=tuple(_tensor(output, values) for output, values in outputs.items()),
             state=tuple(state_spec(leaf) for leaf in recipe.state),
@@ -235,29 +257,27 @@ def _build(
             ),
             baked_in=baked_steps(recipe, restored.module_class, restored.network.module, sorted(unread)),
             control_rate_hz=elements.control_rate_hz,
-            provenance=_provenance(files, facts, restored),
+            provenance=_provenance(files, facts, restored, source),
             parity=parity,
         )
         _write_rest(folder, contract, inputs, outputs)
     return folder, ExportResult(target, contract)
 
 
-def _check_filter(files: Files, facts: CheckpointFacts, recipe: Recipe, options: _Options) -> None:
+def _check_filter(files: PolicyFiles, facts: CheckpointFacts, restored: RestoredPolicy, options: ExportOptions) -> None:
     """Raise CheckpointError for an observation filter that training has not filled, unless it was asked for."""
-    from rlservo.export.rllib.frozen_filter import why_untrained
-
-    steps = facts.env_steps
+    steps, frozen = facts.env_steps, restored.recipe.filter
     trained = "how long training took is unknown" if steps is None else f"training took {steps:,} environment steps"
-    if why := why_untrained(files, recipe):
+    if why := restored.untrained_filter:
         if not options.untrained_filter:
             raise CheckpointError(
                 f"{files.root}: {why}; {trained}. Give --untrained-filter to export what the checkpoint holds, or "
                 "train on and save again"
             )
         options.notify(f"{why}; {trained}")
-    elif recipe.filter is not None and steps is not None and recipe.filter.count < steps / 2:
+    elif frozen is not None and steps is not None and frozen.count < steps / 2:
         options.notify(
-            f"the observation filter's statistics are of {recipe.filter.count:,} observations; {trained}: those that "
+            f"the observation filter's statistics are of {frozen.count:,} observations; {trained}: those that "
             "acted in training had seen more than the checkpoint holds"
         )
 
@@ -282,7 +302,7 @@ def _temporary_folder(target: Path) -> Iterator[Path]:
 
 
 def _write_graphs(
-    folder: Path, restored: RestoredPolicy, labels: list[str], api_stack: str, notify: Notify, progress: Notify
+    folder: Path, restored: RestoredPolicy, labels: list[str], options: ExportOptions
 ) -> tuple[Parity, Inputs, Outputs]:
     """Write both formats, prove them, and return the proof and the golden vectors.
 
@@ -293,10 +313,10 @@ def _write_graphs(
     from rlservo.export.graph.torchscript_file import run_torchscript, write_torchscript
     from rlservo.export.proof.why_different import why_different
 
-    recipe = restored.recipe
+    recipe, progress, framework = restored.recipe, options.progress, options.source.framework
     batches = draw_batches(recipe, SEED)
-    progress(f"asking RLlib itself for {sum(len(batch) for batch in batches):,} actions")
-    references = record(restored.start_loop, batches)
+    progress(f"asking {framework} itself for {sum(len(batch) for batch in batches):,} actions")
+    references = record(restored.start_loop, batches, framework)
     pair = next(batch for batch in batches if len(batch) == BATCH_SIZES[1])
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(len(pair), np.bool_))
     progress("writing TorchScript and ONNX")
@@ -312,16 +332,17 @@ def _write_graphs(
         graph, frozen = write(left_out)
     only_valued = _left_out(recipe, inputs_read(folder / ONNX_FILE, without=VALUE)) - left_out
     if only_valued:
-        notify(
+        options.notify(
             f"{', '.join(sorted(only_valued))}: only the value head reads it, and the policy asks for it; --no-value "
             "exports without both"
         )
     onnx = run_onnx(folder / ONNX_FILE)
     script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
-    progress("proving both against RLlib's actions")
+    progress(f"proving both against {framework}'s actions")
     perturb = partial(record_perturbed, restored.start_loop, references)
     try:
-        parity = prove(recipe, references, {"onnx": onnx, "torchscript": script}, labels, api_stack, perturb)
+        runners = {"onnx": onnx, "torchscript": script}
+        parity = prove(recipe, references, runners, labels, options.source.reference, perturb)
     except ParityError as error:
         if why := why_different(restored.start_loop, references, frozen):
             raise ParityError(f"{error.message}; {why}", error.details) from error
@@ -380,12 +401,14 @@ def _tensor(name: str, values: NDArray[Any]) -> TensorSpec:
     return TensorSpec(name=name, dtype=str(values.dtype), shape=(-1, *values.shape[1:]))
 
 
-def _provenance(files: Files, facts: CheckpointFacts, restored: RestoredPolicy) -> Provenance:
+def _provenance(files: PolicyFiles, facts: CheckpointFacts, restored: RestoredPolicy, source: Source) -> Provenance:
     from importlib.metadata import version
 
     return Provenance(
         algorithm=facts.algorithm,
-        api_stack=files.api_stack,
+        source=source.name,
+        framework=f"{source.framework} {version(source.distribution)}",
+        api_stack=getattr(files, "api_stack", None),
         module_id=files.module_id,
         agents=restored.agents,
         module_class=restored.module_class,
@@ -394,7 +417,7 @@ def _provenance(files: Files, facts: CheckpointFacts, restored: RestoredPolicy) 
         env_steps=facts.env_steps,
         env_id=facts.env_id,
         env_config=facts.env_config,
-        ray_version=facts.ray_version or version("ray"),
+        ray_version=facts.ray_version,
         torch_version=version("torch"),
         rlservo_version=rlservo.__version__,
         exported_at=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),

@@ -16,7 +16,8 @@ from rlservo.export.checkpoints.old_location import RLLIB_FILE
 from rlservo.export.checkpoints.remote import fetch
 from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.contract.errors import UsageError
-from rlservo.export.export_checkpoint import LOADING_RUNS_CODE, silent
+from rlservo.export.export_checkpoint import silent
+from rlservo.export.sources.source import PICKLES
 
 
 def prune_checkpoint(
@@ -42,7 +43,7 @@ def prune_checkpoint(
 def _prune(files: Files, target: Path, app_dir: str | Path, notify: Callable[[str], None]) -> list[Path]:
     if target.exists():
         raise UsageError(f"{target} exists already: give a folder that does not, to prune into")
-    notify(LOADING_RUNS_CODE.format(path=files.root))
+    notify(f"loading {files.root}: {PICKLES}")
     with user_code(app_dir):
         facts = read_facts(files.root, notify)
     target.mkdir(parents=True)

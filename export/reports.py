@@ -51,11 +51,13 @@ def export_report(contract: Contract) -> Text:
     steps = contract.provenance.env_steps
     trained = f"; training took {steps:,} environment steps" if steps is not None else ""
     seen = f"filter    statistics of {frozen.values['count']:,} observations{trained}\n" if frozen else ""
+    framework = contract.provenance.framework.rpartition(" ")[0] or "RLlib"
     return Text(
         f"policy    {contract.name} version {contract.version}\n"
         f"graph     {observation.size} observation elements to {outcome}{rate}\n"
         f"baked in  {', '.join(step.step for step in contract.baked_in)}\n"
-        f"{seen}proven    {contract.parity.samples:,} observations; largest relative difference to RLlib: {differences}"
+        f"{seen}proven    {contract.parity.samples:,} observations; largest relative difference to {framework}: "
+        f"{differences}"
     )
 
 
@@ -84,16 +86,18 @@ def _summary(contract: Contract) -> Table:
         if count is not None
     ]
     rate = f"{contract.control_rate_hz:g} Hz" if contract.control_rate_hz else "not known"
+    stack = f" ({origin.api_stack} API stack)" if origin.api_stack else ""
+    trainer = ", ".join(filter(None, [origin.framework, f"ray {origin.ray_version}" if origin.ray_version else ""]))
     rows = {
         "description": contract.description,
-        "algorithm": f"{origin.algorithm} ({origin.api_stack} API stack), module {origin.module_id}",
+        "algorithm": f"{origin.algorithm}{stack}, module {origin.module_id}",
         "agents": ", ".join(origin.agents),
         "environment": origin.env_id or "not known",
         "environment arguments": ", ".join(f"{key}={value}" for key, value in origin.env_config.items()),
         "trained for": ", ".join(progress) or "not known",
         "control rate": rate,
         "explores by": _exploration(contract),
-        "made with": f"ray {origin.ray_version}, torch {origin.torch_version}, rlservo {origin.rlservo_version}",
+        "made with": f"{trainer}, torch {origin.torch_version}, rlservo {origin.rlservo_version}",
         "exported": origin.exported_at,
         "checkpoint sha256": origin.checkpoint_sha256,
     }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 from typing_extensions import Self
 
-from rlservo.export.checkpoints.location import Files, locate_checkpoint
 from rlservo.export.checkpoints.remote import fetch, is_uri
 from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.contract.bundle import Bundle, load_bundle, write_contract
 from rlservo.export.contract.contract import REWARD, Contract, Evaluation, Parity
 from rlservo.export.contract.errors import BundleError, UsageError, first_line
+from rlservo.export.contract.extras import require
 from rlservo.export.contract.spaces import leaf_specs
-from rlservo.export.export_checkpoint import LOADING_RUNS_CODE, Notify, silent
+from rlservo.export.export_checkpoint import TORCH, silent
 from rlservo.export.graph.one_thread import one_thread
 from rlservo.export.proof.parity import GraphLoop, prove, record
 from rlservo.export.recipe.recipe import Recipe
@@ -31,6 +31,8 @@ from rlservo.export.recipe.runners import Loop
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.recipe.to_contract import space_spec
 from rlservo.export.recipe.trees import build, named_leaves
+from rlservo.export.sources.registry import find_source
+from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.rollout.report import RolloutReport
 
@@ -56,6 +58,7 @@ def verify_bundle(
     episodes: int = 20,
     first_seed: int = 0,
     app_dir: str | Path = ".",
+    vecnormalize: str | Path | None = None,
     notify: Notify,
     progress: Notify = silent,
 ) -> VerifyResult:
@@ -73,38 +76,44 @@ def verify_bundle(
     with fetch(checkpoint, progress) as local:
         origin = loaded.contract.provenance
         arguments = origin.env_config if env_config is None else env_config
-        files = locate_checkpoint(local, origin.module_id, origin.agents[0] if origin.agents else None)
-        notify(LOADING_RUNS_CODE.format(path=checkpoint if is_uri(checkpoint) else files.root))
-        return _verify(
-            loaded, files, env_id, arguments, range(first_seed, first_seed + episodes), app_dir, notify, progress
+        source = find_source(Path(local), notify=notify)
+        require(source.extra, *source.packages, *TORCH)
+        files = source.locate(Path(local), origin.module_id, origin.agents[0] if origin.agents else None)
+        if warning := source.loads(files):
+            notify(f"loading {checkpoint if is_uri(checkpoint) else files.root}: {warning}")
+        options = RestoreOptions(
+            Path(app_dir),
+            any(output.name == "value" for output in loaded.contract.outputs),
+            None if vecnormalize is None else Path(vecnormalize),
+            _frames(loaded.contract),
         )
+        seeds = range(first_seed, first_seed + episodes)
+        return _verify(loaded, source, files, options, env_id, arguments, seeds, notify, progress)
 
 
 def _verify(
     loaded: Bundle,
-    files: Files,
+    source: Source,
+    files: PolicyFiles,
+    options: RestoreOptions,
     env_id: str | None,
     arguments: Mapping[str, Any],
     seeds: range,
-    app_dir: str | Path,
     notify: Notify,
     progress: Notify,
 ) -> VerifyResult:
     same = files.sha256() == loaded.contract.provenance.checkpoint_sha256
     if not same:
         notify("the bundle was exported from another checkpoint: expect a difference")
-    progress("importing torch and RLlib")
-    with user_code(app_dir) as folder, one_thread():
-        from rlservo.export.rllib.restore import restore
-
-        has_value = any(output.name == "value" for output in loaded.contract.outputs)
-        restored = restore(files, folder, notify, value=has_value)
+    progress(f"importing torch and {source.framework}")
+    with user_code(options.app_dir) as folder, one_thread():
+        restored = source.restore(files, replace(options, app_dir=folder), notify)
         _check_spaces(loaded.contract, restored.recipe)
         formats = _formats(loaded)
         labels = [element.name for element in loaded.contract.action_space.elements]
-        progress("comparing both formats with RLlib's actions")
-        references = record(restored.start_loop, draw_batches(restored.recipe, SEED))
-        parity = prove(restored.recipe, references, formats, labels, files.api_stack)
+        progress(f"comparing both formats with {source.framework}'s actions")
+        references = record(restored.start_loop, draw_batches(restored.recipe, SEED), source.framework)
+        parity = prove(restored.recipe, references, formats, labels, source.reference)
         evaluation = None
         if env_id is not None:
             run, recipe = formats["onnx"], restored.recipe
@@ -117,6 +126,11 @@ def _verify(
             contract = loaded.contract.model_copy(update={"evaluations": (*loaded.contract.evaluations, evaluation)})
             write_contract(loaded.path, contract)
     return VerifyResult(parity, evaluation, same)
+
+
+def _frames(contract: Contract) -> int:
+    """Return how many frames of an observation the bundle stacks by itself."""
+    return next((int(step.values["frames"]) for step in contract.baked_in if step.step == "frame_stack"), 1)
 
 
 def _formats(bundle: Bundle) -> dict[str, Any]:

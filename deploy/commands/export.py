@@ -17,7 +17,7 @@ from rlservo.export.contract.extras import needs_extra
 
 def export(
     checkpoint: Annotated[
-        str, typer.Argument(help="RLlib checkpoint folder (of a Tune trial the newest), or a URI such as s3://...")
+        str, typer.Argument(help="Checkpoint file or folder (of a Tune trial the newest), or a URI such as s3://...")
     ],
     out: Annotated[Path, typer.Option(help="Repository folder; the bundle goes to OUT/<name>/<version>/.")],
     name: Annotated[str | None, typer.Option(help="Policy name; the environment's by default.")] = None,
@@ -42,6 +42,15 @@ def export(
             "--untrained-filter", help="Export even if the observation filter's statistics are empty or evaluation's."
         ),
     ] = False,
+    source: Annotated[
+        str | None, typer.Option(help="Which trainer wrote it: rllib, sb3, rsl_rl, skrl, leapp; the path tells it.")
+    ] = None,
+    vecnormalize: Annotated[
+        Path | None, typer.Option(help="Of Stable-Baselines3, vecnormalize.pkl where it is not beside the model.")
+    ] = None,
+    frame_stack: Annotated[
+        int, typer.Option(min=1, help="Of Stable-Baselines3, how many frames VecFrameStack put into an observation.")
+    ] = 1,
     metric: Annotated[
         str | None, typer.Option(help="Of a Tune trial or experiment, the checkpoint with the best of this metric.")
     ] = None,
@@ -50,26 +59,28 @@ def export(
     ] = "max",
     as_json: Json = False,
 ) -> None:
-    """Turn an RLlib checkpoint into a policy bundle. It is proven equal to RLlib's own actions, or nothing is written.
+    """Turn a checkpoint into a policy bundle. It is proven equal to the trainer's own actions, or nothing is written.
 
     Examples: `rlservo export examples/checkpoints/ur_positioning --out policies`,
+    `rlservo export model.zip --out policies`,
     `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
     """
     start = time.perf_counter()
     if all_modules and (module_id is not None or agent_id is not None):
         raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
     with terminal.status("importing") as show, ExitStack() as fetching:
-        with needs_extra("train", "ray", "torch", "onnx", "onnxscript", "gymnasium"):
+        with needs_extra("train", "gymnasium"):
             from rlservo.export.rllib import quick_import
 
             quick_import.prepare()
             from rlservo.export.checkpoints.experiment import best_checkpoint
             from rlservo.export.checkpoints.remote import fetch
-            from rlservo.export.export_checkpoint import LOADING_RUNS_CODE, export_all_modules, export_checkpoint
+            from rlservo.export.export_checkpoint import export_all_modules, export_checkpoint
             from rlservo.export.reports import export_report, peak_memory_mb
+            from rlservo.export.sources.source import PICKLES
 
         if metric is not None:
-            note(LOADING_RUNS_CODE.format(path=checkpoint))
+            note(f"loading {checkpoint}: {PICKLES}")
             local = fetching.enter_context(fetch(checkpoint, show))
             best = best_checkpoint(local, metric, mode, app_dir=app_dir, notify=note)
             note(f"{best.path} has the {mode} {metric}: {best.score:g}")
@@ -84,6 +95,7 @@ def export(
                 app_dir=app_dir,
                 value=value,
                 untrained_filter=untrained_filter,
+                source=source,
                 notify=note,
                 progress=show,
             )
@@ -99,6 +111,9 @@ def export(
                 app_dir=app_dir,
                 value=value,
                 untrained_filter=untrained_filter,
+                source=source,
+                vecnormalize=vecnormalize,
+                frame_stack=frame_stack,
                 notify=note,
                 progress=show,
             )

@@ -97,7 +97,7 @@ def _verify_against(
     checkpoint: str, bundle: Path, env: str | None, episodes: int, seed: int, app_dir: Path, as_json: bool
 ) -> dict[str, Any]:
     """Compare a bundle with its checkpoint; return the document for programs, and print it for people otherwise."""
-    with needs_extra("train", "ray", "torch", "onnx", "onnxscript", "gymnasium"):
+    with needs_extra("train", "gymnasium"):
         from rlservo.export.reports import verification_report
         from rlservo.export.verify_bundle import verify_bundle
 

@@ -16,6 +16,7 @@ TYPE_CHECKING = False  # type checkers read the name as true; importing it from 
 if TYPE_CHECKING:
     from rlservo.export.contract import errors
     from rlservo.export.export_checkpoint import export_checkpoint
+    from rlservo.export.export_policy import export_policy
     from rlservo.serve_app.client.admin_client import AdminClient
     from rlservo.serve_app.client.policy_client import PolicyClient
     from rlservo.serve_app.client.stream_client import StreamClient
@@ -40,6 +41,7 @@ __all__ = [
     "__version__",
     "errors",
     "export_checkpoint",
+    "export_policy",
     "rollout",
 ]
 
@@ -55,6 +57,7 @@ _MODULES = {
     "WithRecording": "rlservo.serve_app.recording.recorded_policy",
     "errors": "rlservo.export.contract",
     "export_checkpoint": "rlservo.export.export_checkpoint",
+    "export_policy": "rlservo.export.export_policy",
     "rollout": "rlservo.serve_app.rollout.control_loop",
 }
 
@@ -66,6 +69,7 @@ _EXTRAS = {
     "StreamClient": "client",
     "WithRecording": "record",
     "export_checkpoint": "train",
+    "export_policy": "export",
 }
 
 if not TYPE_CHECKING:  # a type checker would take it for a promise of every name

@@ -18,7 +18,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from rlservo import Policy, errors
-from rlservo.export.export_checkpoint import LOADING_RUNS_CODE
+from rlservo.export.sources.source import PICKLES
 from rlservo.serve_app.rollout.environment import check_fit, make_env
 from rlservo.serve_app.rollout.episode import success_of
 from shared.help_text import DefaultsFormatter
@@ -61,7 +61,7 @@ def main(env_id: str, env_kwargs: Mapping[str, Any], description: str) -> None:
             check_fit(policy.contract, env, arguments)
             act = from_bundle(policy, env.action_space)
         else:
-            print(LOADING_RUNS_CODE.format(path=args.checkpoint))
+            print(f"loading {args.checkpoint}: {PICKLES}")
             act = from_checkpoint(args.checkpoint, args.app_dir, env)
         run_episodes(env, act, args.num_episodes, args.seed)
     finally:

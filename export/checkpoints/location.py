@@ -32,6 +32,7 @@ STATE_SUFFIXES = (".pkl", ".msgpack", ".pt")
 FACTS_FILE = "rlservo_facts.json"
 """Written by `prune.py` in place of RLlib's own configuration pickles."""
 
+NO_CHECKPOINT = "is not an RLlib checkpoint"
 _BEFORE_COMPONENTS = Path("learner") / "module_state"
 _TUNE_CHECKPOINT = re.compile(r"checkpoint_(\d{6,})")
 
@@ -162,6 +163,20 @@ def locate_checkpoint(path: str | Path, module_id: str | None = None, agent_id: 
     return files
 
 
+def is_known(path: Path, stack: type[Files]) -> bool:
+    """Return whether `path` is of RLlib, and of this API stack; one that only an older Ray could read is of the new."""
+    if not path.is_dir():
+        return False
+    try:
+        root = _find_root(path)
+    except UnsupportedError:
+        return stack is CheckpointFiles
+    except CheckpointError as error:
+        return stack is CheckpointFiles and NO_CHECKPOINT not in error.message
+    is_new = _is_module(root) or (root / MODULES).is_dir()
+    return stack is (CheckpointFiles if is_new else OldStackFiles)
+
+
 def locate_modules(path: str | Path) -> list[Files]:
     """Return the files of every policy of a checkpoint, by module id (old API stack: policy id).
 
@@ -197,7 +212,7 @@ def _find_root(given: Path) -> Path:
         names = ", ".join(trial.name for trial in trials[:4]) + (", ..." if len(trials) > 4 else "")
         raise CheckpointError(f"{given} holds {len(trials)} trials with checkpoints ({names}): name one of them")
     raise CheckpointError(
-        f"{given} is not an RLlib checkpoint: looked for {MODULES}/ (an algorithm checkpoint of the new API stack), "
+        f"{given} {NO_CHECKPOINT}: looked for {MODULES}/ (an algorithm checkpoint of the new API stack), "
         "policies/ (the old stack) and checkpoint_NNNNNN/ (a Tune trial), found none of them"
     )
 

@@ -34,7 +34,10 @@ class OldStackFiles:
     """The algorithm checkpoint; the policy's own folder where that is all there is."""
     module_id: str
     """The policy's id, under the name the rest of the exporter has for it."""
-    agent_id: ClassVar[None] = None
+
+    @property
+    def agent_id(self) -> None:
+        """No agent is ever named: a policy filters alike for all of its own."""
 
     @property
     def is_one_of_several(self) -> bool:

@@ -5,6 +5,7 @@ Loading a pickle runs the code it names; callers say so first.
 
 from __future__ import annotations
 
+import io
 import pickle
 import sys
 from collections.abc import Iterator
@@ -43,13 +44,25 @@ def unpickle(file: Path, *, missing_ok: bool = False) -> Any:
     """
     try:
         with file.open("rb") as stream:
-            return _Unpickler(stream, missing_ok=missing_ok).load()
+            return _load(stream, str(file), missing_ok=missing_ok)
     except OSError as error:
         raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from error
+
+
+def unpickle_bytes(pickled: bytes, name: str) -> Any:
+    """Return the object that `pickled` holds, which messages call `name`. Raises CheckpointError as `unpickle` does."""
+    return _load(io.BytesIO(pickled), name, missing_ok=False)
+
+
+def _load(stream: BinaryIO, name: str, *, missing_ok: bool) -> Any:
+    try:
+        return _Unpickler(stream, missing_ok=missing_ok).load()
+    except OSError:
+        raise
     except Exception as error:  # a damaged pickle raises almost anything, and so does the code it runs
         damaged = isinstance(error, UnicodeDecodeError | IndexError | KeyError | MemoryError)
         reason = TRUNCATED.format(first_line(error)) if damaged else explain(error)
-        raise CheckpointError(f"{file} cannot be loaded: {reason}") from error
+        raise CheckpointError(f"{name} cannot be loaded: {reason}") from error
 
 
 def unpickle_plain(file: Path) -> Any:

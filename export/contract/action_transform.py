@@ -26,9 +26,10 @@ def transform_of(contract: Contract) -> Transform:
 
 
 def is_invertible(contract: Contract) -> bool:
-    """Return whether own actions can be told from sent ones: not where a connector of the user's own changes them."""
+    """Return whether own actions can be told from sent ones: not where something else changes them, too."""
     steps = [step.step for step in contract.baked_in]
-    return "user_connector" not in steps[steps.index("mode") :] if "mode" in steps else True
+    after = steps[steps.index("mode") :] if "mode" in steps else []
+    return not {"user_connector", "scale"} & set(after)
 
 
 def to_sent(own: NDArray[Any], transform: Transform, leaf: LeafSpec) -> NDArray[Any]:

@@ -81,7 +81,9 @@ class Provenance(FrozenModel):
     """Where the policy came from."""
 
     algorithm: str
-    api_stack: Literal["new", "old"]
+    source: str = Field("rllib", description="Which source read it: 'rllib', 'sb3', ...")
+    framework: str = Field("", description="The framework that restored it, with its version")
+    api_stack: Literal["new", "old"] | None = Field(None, description="Of RLlib's")
     module_id: str
     agents: tuple[str, ...] = Field(default=(), description="For which agents of a multi-agent environment")
     module_class: str
@@ -90,21 +92,21 @@ class Provenance(FrozenModel):
     env_steps: int | None = None
     env_id: str | None = None
     env_config: dict[str, Any] = Field(default_factory=dict)
-    ray_version: str
+    ray_version: str | None = Field(None, description="The Ray that wrote the checkpoint")
     torch_version: str
     rlservo_version: str
     exported_at: str = Field(description="UTC, ISO 8601")
 
 
 class FormatParity(FrozenModel):
-    """The largest differences between one written format and RLlib's own pipeline."""
+    """The largest differences between one written format and the framework's own pipeline."""
 
     max_abs: float = Field(ge=0.0)
     max_rel: float = Field(ge=0.0, description="Relative to the scale that the gate measures with")
 
 
 class Parity(FrozenModel):
-    """How the export was proven equal to what RLlib itself would send to env.step."""
+    """How the export was proven equal to what the framework itself would send to env.step."""
 
     reference: str
     samples: int = Field(ge=0)

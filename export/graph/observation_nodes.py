@@ -25,6 +25,7 @@ from rlservo.export.recipe.recipe import (
     Previous,
     Recipe,
     SineAndCosine,
+    Transpose,
     UserStep,
 )
 from rlservo.export.recipe.trees import Tree, space_leaves, tree_leaves
@@ -44,20 +45,20 @@ class ObservationNode(nn.Module, abc.ABC):
 
 def observation_nodes(recipe: Recipe) -> nn.ModuleList:
     """Return one node a step of the recipe."""
-    space = recipe.observation_space
-    dtype = torch.from_numpy(np.zeros(0, space.dtype)).dtype if isinstance(space, Box) else torch.int64
+    dtypes = {name: _dtype(space) for name, space in recipe.observation_leaves.items()}
     nodes = nn.ModuleList()
     for step in recipe.steps:
         if isinstance(step, ObservationFilter):
-            nodes.append(FilterNode(step, dtype))
-        elif isinstance(step, Flatten):
-            nodes.append(FlattenNode(step))
-            dtype = torch.float32
-        elif isinstance(step, Preprocess):
-            nodes.append(PreprocessNode(step))
-            dtype = torch.float32
+            nodes.append(FilterNode(step, dtypes.get(step.leaf, torch.float32)))
+            if not step.keeps_integers:
+                dtypes[step.leaf] = torch.float32
+        elif isinstance(step, Flatten | Preprocess):
+            nodes.append(FlattenNode(step) if isinstance(step, Flatten) else PreprocessNode(step))
+            dtypes = {"obs": torch.float32}
         elif isinstance(step, FrameStack):
             nodes.append(FrameStackNode(step))
+        elif isinstance(step, Transpose):
+            nodes.append(TransposeNode(step))
         elif isinstance(step, Logarithm):
             nodes.append(LogarithmNode(step))
         elif isinstance(step, SineAndCosine):
@@ -67,6 +68,18 @@ def observation_nodes(recipe: Recipe) -> nn.ModuleList:
         else:
             nodes.append(UserNode(step))
     return nodes
+
+
+def _dtype(space: Any) -> torch.dtype:
+    return torch.from_numpy(np.zeros(0, space.dtype)).dtype if isinstance(space, Box) else torch.int64
+
+
+def _replace(obs: Tree, leaf: str, function: Callable[[Tensor], Tensor]) -> Tree:
+    """Return the observation with `function` applied to one leaf: all of it, or a Dict's key."""
+    if leaf == "obs":
+        return function(obs)
+    key = leaf.removeprefix("obs.")
+    return {**obs, key: function(obs[key])}
 
 
 class FlattenNode(ObservationNode):
@@ -149,8 +162,10 @@ class FilterNode(ObservationNode):
     def __init__(self, frozen: ObservationFilter, dtype: torch.dtype) -> None:
         super().__init__()
         self.clip = frozen.clip
-        self.integer = None if dtype.is_floating_point else dtype
-        if self.integer is not None:
+        self.leaf = frozen.leaf
+        self.in_double = not dtype.is_floating_point
+        self.integer = dtype if self.in_double and frozen.keeps_integers else None
+        if self.in_double:
             dtype = torch.float64
         offset, scale = frozen.offset(), 1.0 / frozen.divisor().astype(np.float64)
         rest = offset - offset.astype(np.float32)
@@ -161,7 +176,10 @@ class FilterNode(ObservationNode):
         self.register_buffer("divisor", torch.tensor(frozen.divisor(), dtype=dtype))
 
     def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it has no state
-        if self.integer is not None:
+        return _replace(obs, self.leaf, self._filter)
+
+    def _filter(self, obs: Tensor) -> Tensor:
+        if self.in_double:
             obs = (obs.double() - self.offset) / self.divisor
         else:
             obs = obs - self.offset
@@ -178,16 +196,37 @@ class FrameStackNode(ObservationNode):
 
     def __init__(self, step: FrameStack) -> None:
         super().__init__()
-        self.depth = step.shape[-1]
+        self.name = step.state_name
+        self.leaf = step.leaf
+        self.channels_first = step.channels_first
+        self.depth = step.shape[0 if step.channels_first else -1]
         self.every = step.every
 
     def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:
-        stacked = torch.cat((state["frames"], obs), dim=-1)
-        state["frames"] = stacked[..., self.depth :]
+        return _replace(obs, self.leaf, lambda frame: self._stack(frame, state))
+
+    def _stack(self, frame: Tensor, state: dict[str, Tensor]) -> Tensor:
+        if self.channels_first:
+            stacked = torch.cat((state[self.name], frame), dim=1)
+            state[self.name] = stacked[:, self.depth :]
+            return stacked
+        stacked = torch.cat((state[self.name], frame), dim=-1)
+        state[self.name] = stacked[..., self.depth :]
         if self.every == 1:
             return stacked
         frames = stacked.reshape(*stacked.shape[:-1], -1, self.depth)
         return frames[..., :: self.every, :].flatten(-2)
+
+
+class TransposeNode(ObservationNode):
+    """Images with their channels first."""
+
+    def __init__(self, step: Transpose) -> None:
+        super().__init__()
+        self.leaf = step.leaf
+
+    def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it has no state
+        return _replace(obs, self.leaf, lambda image: image.permute(0, 3, 1, 2))
 
 
 class LogarithmNode(ObservationNode):

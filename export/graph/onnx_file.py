@@ -103,10 +103,15 @@ def _export(graph: PolicyGraph, example: Inputs, file: Path, *, dynamo: bool) ->
     if dynamo:
         how = {"dynamo": True, "opset_version": DYNAMO_OPSET, "external_data": False, "verbose": False}
         how["dynamic_shapes"] = {"inputs": tuple({0: torch.export.Dim("batch")} for _ in inputs)}
+    arguments = tuple(torch.from_numpy(example[name]) for name in inputs)
     with _quiet(), exact_operators():
+        model: Any = graph
+        if not dynamo and any(isinstance(part, torch.jit.ScriptModule) for part in graph.modules()):
+            # The exporter's own trace calls no TorchScript; a module that was traced before has it inlined.
+            model = torch.jit.freeze(torch.jit.trace(graph, arguments, check_trace=False))  # type: ignore[no-untyped-call]
         torch.onnx.export(
-            graph,
-            tuple(torch.from_numpy(example[name]) for name in inputs),
+            model,
+            arguments,
             str(file),
             input_names=inputs,
             output_names=outputs,

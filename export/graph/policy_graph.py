@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from rlservo.export.contract.contract import REWARD
 from rlservo.export.graph.observation_nodes import ObservationNode, as_dtype, observation_nodes
-from rlservo.export.recipe.recipe import Recipe, leaf_transform, parameter_count
+from rlservo.export.recipe.recipe import Affine, Recipe, leaf_transform, parameter_count
 from rlservo.export.recipe.trees import Tree, build, map_tree, named_leaves
 
 
@@ -109,6 +109,7 @@ class ActionNode(nn.Module):
         self.leaves = nn.ModuleList(ActionLeaf(recipe, space) for space in spaces.values())
         self.widths = [parameter_count(space) for space in spaces.values()]
         self.user_steps = [step.function for step in recipe.action_steps]
+        self.affine = None if recipe.affine is None else AffineNode(recipe.affine)
         self.choices = self.widths[0]
 
     def forward(self, parameters: Tensor) -> tuple[Tensor, ...]:
@@ -123,10 +124,31 @@ class ActionNode(nn.Module):
             for function in self.user_steps:
                 tree = function(tree)
             chosen = list(named_leaves(tree, "action").values())
+        if self.affine is not None:
+            chosen = [self.affine(one) for one in chosen]
         return tuple(leaf.finish(one) for leaf, one in zip(self._leaves(), chosen, strict=True))
 
     def _leaves(self) -> list[ActionLeaf]:
         return [leaf for leaf in self.leaves if isinstance(leaf, ActionLeaf)]
+
+
+class AffineNode(nn.Module):
+    """The policy's numbers in the environment's units."""
+
+    scale: Tensor
+    offset: Tensor
+
+    def __init__(self, affine: Affine) -> None:
+        super().__init__()
+        self.limit = affine.limit
+        self.register_buffer("scale", torch.tensor(affine.scale))
+        self.register_buffer("offset", torch.tensor(affine.offset))
+
+    def forward(self, action: Tensor) -> Tensor:
+        """Return actions `[batch, *shape]`."""
+        if self.limit is not None:
+            action = torch.clamp(action, -self.limit, self.limit)
+        return action * self.scale + self.offset
 
 
 class ActionLeaf(nn.Module):

@@ -1,4 +1,4 @@
-"""Parity gate: an exported policy gives RLlib's own numbers, or it is not written.
+"""Parity gate: an exported policy gives the framework's own numbers, or it is not written.
 
 Functions from observations to named outputs are compared, of a policy with a state over whole sequences, each side fed
 with its own.
@@ -7,11 +7,11 @@ A difference passes when it is at most `RTOL * max(|reference|, scale) + ATOL`. 
 bounded action element; elsewhere the largest number in the same row of the output, at least 1, because the rounding
 of a matrix product grows with its terms and not with their sum. `value` has one number a row, which may be a small
 difference of large terms: its scale is the largest value seen over all observations. A discrete action must be the
-same, unless RLlib's own scores for the two choices are that close.
+same, unless the framework's own scores for the two choices are that close.
 
 Far outside the usual, a network takes the small difference of huge terms, and no two orders of adding them agree. What
-is still rounding there, RLlib itself tells: a difference also passes when it is at most ROUNDING times what RLlib's own
-numbers for that sample move by when every floating-point observation moves by its last bit.
+is still rounding there, the framework itself tells: a difference also passes when it is at most ROUNDING times what
+its own numbers for that sample move by when every floating-point observation moves by its last bit.
 """
 
 from __future__ import annotations
@@ -40,17 +40,10 @@ MASKED = 1e30
 """A score beyond this stands for 'not allowed' (RLlib's action masks add -3.4e38); it measures nothing."""
 RULE = (
     "a difference passes up to rtol * scale + atol; the scale is half the range of a bounded action, else the largest "
-    "number in the output's row (of value: over all observations), at least 1; also up to 8 times what RLlib's own "
-    "numbers move by when the observation moves by its last bit"
+    "number in the output's row (of value: over all observations), at least 1; also up to 8 times what the "
+    "checkpoint's own numbers move by when the observation moves by its last bit"
 )
 """What the contract says of the tolerances."""
-REFERENCES: dict[str, str] = {
-    "new": "RLlib's own env-to-module connectors, inference forward and module-to-env connectors, restored from the "
-    "checkpoint, observation filter frozen, exploration off",
-    "old": "RLlib's own agent connectors, compute_actions_from_input_dict and action connectors (old API stack), "
-    "restored from the checkpoint, observation filter frozen, exploration off",
-}
-"""What an export is compared with, by API stack."""
 
 
 class GraphLoop:
@@ -80,27 +73,29 @@ class GraphLoop:
 
 @dataclass(frozen=True)
 class Reference:
-    """One batch and what RLlib computed for it."""
+    """One batch and what the framework computed for it."""
 
     batch: Batch
     outputs: Outputs
+    framework: str = "RLlib"
+    """Whose numbers they are, for messages."""
 
 
-def record(start_loop: Callable[[], Loop], batches: Sequence[Batch]) -> list[Reference]:
-    """Run RLlib on every batch; `start_loop` starts RLlib acting step after step.
+def record(start_loop: Callable[[], Loop], batches: Sequence[Batch], framework: str = "RLlib") -> list[Reference]:
+    """Run the framework on every batch; `start_loop` starts it acting step after step.
 
-    The observations are copied: a connector may write into what it is given. Raises UnsupportedError when RLlib's own
+    The observations are copied: a connector may write into what it is given. Raises UnsupportedError when its own
     pipeline fails on an observation of the policy's own space.
     """
     try:
-        return _record(start_loop, batches)
-    except Exception as error:  # RLlib's own connectors and the user's raise anything
+        return _record(start_loop, batches, framework)
+    except Exception as error:  # the framework's code and the user's raise anything
         raise UnsupportedError(
-            f"RLlib's own pipeline fails on an observation of the policy's space: {first_line(error)}"
+            f"{framework}'s own pipeline fails on an observation of the policy's space: {first_line(error)}"
         ) from error
 
 
-def _record(start_loop: Callable[[], Loop], batches: Sequence[Batch]) -> list[Reference]:
+def _record(start_loop: Callable[[], Loop], batches: Sequence[Batch], framework: str) -> list[Reference]:
     references: list[Reference] = []
     loop: Loop | None = None
     for batch in batches:
@@ -111,18 +106,18 @@ def _record(start_loop: Callable[[], Loop], batches: Sequence[Batch]) -> list[Re
             if loop is None or len(references[-1].batch) != len(batch):
                 loop = start_loop()
             outputs = loop.step(inputs, batch.restart)
-        references.append(Reference(batch, outputs))
+        references.append(Reference(batch, outputs, framework))
     return references
 
 
 def record_perturbed(start_loop: Callable[[], Loop], references: Sequence[Reference]) -> list[Reference]:
-    """Return what RLlib computes when every floating-point observation is moved up or down by its last bit."""
+    """Return what the framework computes when every floating-point observation is moved up or down by its last bit."""
     rng = np.random.default_rng(0)
     batches = [
         replace(each.batch, inputs={name: _by_last_bit(values, rng) for name, values in each.batch.inputs.items()})
         for each in references
     ]
-    return _record(start_loop, batches)
+    return _record(start_loop, batches, references[0].framework)
 
 
 def _by_last_bit(values: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
@@ -136,7 +131,7 @@ def _by_last_bit(values: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]
 def replay(
     references: Sequence[Reference], run: Runner, state: Sequence[StateLeaf]
 ) -> Iterator[tuple[Inputs, Outputs]]:
-    """Run an exported graph over what RLlib computed; yield its full inputs and its outputs for each batch."""
+    """Run an exported graph over what the framework computed; yield its full inputs and its outputs for each batch."""
     loop, size = GraphLoop(run, state), 0
     for reference in references:
         inputs, restart = _copy(reference.batch.inputs), reference.batch.restart
@@ -153,19 +148,20 @@ def prove(
     references: Sequence[Reference],
     formats: Mapping[str, Runner],
     labels: Sequence[str] = (),
-    api_stack: str = "new",
+    reference: str = "",
     perturb: Callable[[], list[Reference]] | None = None,
 ) -> Parity:
-    """Compare every format with what RLlib computed and return the largest differences.
+    """Compare every format with what the framework computed and return the largest differences.
 
-    `labels` name the action's elements for the message; `perturb` gives what `record_perturbed` does, called
-    once and only where a difference is too large. Raises ParityError at the first output that differs, saying
-    which element of which sample by how much.
+    `labels` name the action's elements for the message; `reference` says for the contract what was compared with;
+    `perturb` gives what `record_perturbed` does, called once and only where a difference is too large.
+
+    Raises ParityError at the first output that differs, saying which element of which sample by how much.
     """
     rounding = _Rounding(references, perturb)
     results = {name: _prove_format(name, recipe, references, run, labels, rounding) for name, run in formats.items()}
     return Parity(
-        reference=REFERENCES[api_stack],
+        reference=reference,
         samples=sum(len(reference.batch) for reference in references),
         batch_sizes=BATCH_SIZES,
         rtol=RTOL,
@@ -176,7 +172,7 @@ def prove(
 
 
 class _Rounding:
-    """How far RLlib's own numbers move when the observations move by their last bit; asked for when first needed."""
+    """How far the framework's own numbers move with the last bit of the observations; asked for when first needed."""
 
     def __init__(self, references: Sequence[Reference], perturb: Callable[[], list[Reference]] | None) -> None:
         self._references = references
@@ -221,7 +217,7 @@ def _prove_format(
             raise ParityError(f"{where}: the exported graph does not run: {str(error).splitlines()[0]}") from error
         for output, expected in reference.outputs.items():
             space = actions.get(output)
-            _check_form(where, output, got.get(output), expected, space)
+            _check_form(where, output, got.get(output), expected, space, reference.framework)
             if space is not None and not isinstance(space, Box):
                 scores = scores_name(reference.outputs)
                 _check_choices(where, output, got[output], reference, recipe, partial(rounding.of, number, scores))
@@ -234,11 +230,13 @@ def _prove_format(
     return FormatParity(max_abs=max_abs, max_rel=max_rel)
 
 
-def _check_form(where: str, output: str, got: NDArray[Any] | None, expected: NDArray[Any], space: Any) -> None:
+def _check_form(
+    where: str, output: str, got: NDArray[Any] | None, expected: NDArray[Any], space: Any, framework: str
+) -> None:
     if got is None:
         raise ParityError(f"{where}: the exported graph has no output '{output}'")
     if got.shape != expected.shape:
-        raise ParityError(f"{where}: output '{output}' has shape {got.shape}, RLlib's has {expected.shape}")
+        raise ParityError(f"{where}: output '{output}' has shape {got.shape}, {framework}'s has {expected.shape}")
     if space is not None:
         dtype = np.dtype(space.dtype) if isinstance(space, Box) else np.dtype(np.int64)
         if got.dtype != dtype:
@@ -272,9 +270,9 @@ def _compare(
         row, element = index[0], int(np.ravel_multi_index(index[1:], b.shape[1:])) if b.ndim > 1 else 0
         label = f"{element} ({labels[element]})" if output == "action" and element < len(labels) else str(element)
         raise ParityError(
-            f"{where}: output '{output}', element {label}, sample {row}: the export gives {a[index]:.9g}, RLlib "
-            f"{b[index]:.9g} (allowed difference {allowed[index]:.2g}); {len(np.unique(np.argwhere(bad)[:, 0]))} of "
-            f"{len(b)} samples differ",
+            f"{where}: output '{output}', element {label}, sample {row}: the export gives {a[index]:.9g}, "
+            f"{reference.framework} {b[index]:.9g} (allowed difference {allowed[index]:.2g}); "
+            f"{len(np.unique(np.argwhere(bad)[:, 0]))} of {len(b)} samples differ",
             {
                 "output": output, "element": element, "sample": row, "exported": float(a[index]),
                 "reference": float(b[index]), "observation": _row(reference.batch, row),
@@ -311,7 +309,7 @@ def _check_choices(
     recipe: Recipe,
     moves: Callable[[], NDArray[np.float64]],
 ) -> None:
-    """Compare discrete actions; a tie in RLlib's scores excuses a difference, and so do scores that are no numbers."""
+    """Compare discrete actions; a tie in its scores excuses a difference, and so do scores that are no numbers."""
     columns = _columns(reference.outputs[output])
     scored = choice_scores(recipe, reference.outputs).get(output) or [np.full((len(c), 1), np.inf) for c in columns]
     for part, (exported, wanted, scores) in enumerate(zip(_columns(got), columns, scored, strict=True)):
@@ -324,7 +322,8 @@ def _check_choices(
             if not apart <= width[row] and not apart <= width[row] + ROUNDING * _at(moves(), int(row)):
                 element = f", element {part}" if len(columns) > 1 else ""
                 raise ParityError(
-                    f"{where}: output '{output}'{element}, sample {row}: the export chooses {chosen}, RLlib {right}",
+                    f"{where}: output '{output}'{element}, sample {row}: the export chooses {chosen}, "
+                    f"{reference.framework} {right}",
                     {"output": output, "sample": int(row), "exported": chosen, "reference": right},
                 )
 

@@ -1,4 +1,4 @@
-"""Explain why an exported graph differs from RLlib's own numbers."""
+"""Explain why an exported graph differs from the trainer's own numbers."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from rlservo.export.proof.parity import ATOL, RTOL, Reference
 from rlservo.export.recipe.runners import Loop, first_step
 
-ALONE = 4  # samples that are also shown to RLlib one at a time
+ALONE = 4  # samples that are also shown to the framework one at a time
 
 
 def why_different(start_loop: Callable[[], Loop], references: Sequence[Reference], frozen: Sequence[str]) -> str:
-    """Return a clause that says why a graph may differ from RLlib's own numbers; '' if nothing is found."""
+    """Return a clause that says why a graph may differ from the framework's own numbers; '' if nothing is found."""
     if sample := _depends_on_batch(start_loop, references):
         return (
-            f"RLlib's own action for sample {sample[0]} is another when it is alone: the network's result depends on "
-            "the other observations of the batch, which cannot be exported"
+            f"{references[0].framework}'s own action for sample {sample[0]} is another when it is alone: the network's "
+            "result depends on the other observations of the batch, which cannot be exported"
         )
     if frozen:
         return (

@@ -19,6 +19,7 @@ from rlservo.export.recipe.recipe import (
     Previous,
     Recipe,
     SineAndCosine,
+    Transpose,
     leaf_transform,
 )
 from rlservo.export.recipe.trees import space_leaves
@@ -46,6 +47,10 @@ def baked_steps(recipe: Recipe, module_class: str, module: Any, unread: Sequence
     )
     steps.append(BakedStep(step="mode", detail=_mode_detail(recipe), values={"mode": recipe.mode}))
     steps += [BakedStep(step="user_connector", detail=f"{step.name}, your own") for step in recipe.action_steps]
+    if (affine := recipe.affine) is not None:
+        limited = f"clipped to ±{affine.limit:g}, then " if affine.limit is not None else ""
+        values = {"scale": affine.scale.ravel().tolist(), "offset": affine.offset.ravel().tolist()}
+        steps.append(BakedStep(step="scale", detail=f"{limited}action * scale + offset", values=values))
     if any(leaf_transform(leaf, recipe.transform) != "none" for leaf in recipe.action_leaves.values()):
         steps.append(_transform_step(recipe))
     return tuple(steps)
@@ -80,9 +85,12 @@ def observation_step(step: ObservationStep) -> BakedStep:
         apart = f", {step.every} steps apart," if step.every > 1 else ""
         return BakedStep(
             step="frame_stack",
-            detail=f"the last {step.frames} observations{apart} side by side, zeros before the episode's start",
+            detail=f"the last {step.frames} observations{apart} side by side, zeros before the episode's start"
+            + _of_leaf(step.leaf),
             values={"frames": step.frames, **({"every": step.every} if step.every > 1 else {})},
         )
+    if isinstance(step, Transpose):
+        return BakedStep(step="transpose", detail=f"images from channels last to channels first{_of_leaf(step.leaf)}")
     if isinstance(step, Logarithm):
         return BakedStep(
             step="logarithm",
@@ -131,11 +139,17 @@ def _preprocess_step(step: Preprocess) -> BakedStep:
     return flat.model_copy(update={"detail": f"{flat.detail}; {detail}"})
 
 
+def _of_leaf(leaf: str) -> str:
+    return "" if leaf == "obs" else f", of {leaf}"
+
+
 def _filter_step(frozen: ObservationFilter) -> BakedStep:
     clipped = f", clipped to ±{frozen.clip:g}" if frozen.clip is not None else ""
+    small = f" + {frozen.epsilon:g}".replace("e-0", "e-") if frozen.epsilon else ""
     return BakedStep(
         step="mean_std_filter",
-        detail=f"(obs - mean) / (std + 1e-6){clipped}; frozen after {frozen.count:,} observations",
+        detail=f"(obs - mean) / (std{small}){clipped}{_of_leaf(frozen.leaf)}; frozen after {frozen.count:,} "
+        "observations",
         values={
             "count": frozen.count,
             "mean": frozen.mean.ravel().tolist(),
@@ -143,6 +157,7 @@ def _filter_step(frozen: ObservationFilter) -> BakedStep:
             "clip": frozen.clip,
             "demean": frozen.demean,
             "destd": frozen.destd,
+            **({} if frozen.leaf == "obs" else {"leaf": frozen.leaf}),
         },
     )
 

@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from gymnasium.spaces import Box, MultiDiscrete
+from gymnasium.spaces import Box, MultiBinary, MultiDiscrete
 from numpy.typing import NDArray
 
 from rlservo.export.recipe.trees import space_leaves
@@ -22,27 +23,36 @@ SMALL_NUMBER = 1e-6
 
 @dataclass(frozen=True)
 class ObservationFilter:
-    """RLlib's MeanStdFilter, frozen: `clip((x - mean) / (std + 1e-6), -clip, clip)` (ray/rllib/utils/filter.py)."""
+    """A running filter, frozen: `clip((x - mean) / (std + epsilon), -clip, clip)`.
+
+    RLlib's MeanStdFilter (ray/rllib/utils/filter.py), Stable-Baselines3's VecNormalize, skrl's RunningStandardScaler.
+    """
 
     count: int
     """How many observations the statistics were gathered from."""
     mean: NDArray[np.float64]
     """Of the observation's shape, in its units."""
-    std: NDArray[np.float32]
-    """Unbiased (n - 1), zero for n <= 1, and single precision because RLlib computes it so."""
+    std: NDArray[np.floating[Any]]
+    """Of RLlib's unbiased (n - 1), zero for n <= 1, and single precision because RLlib computes it so."""
     clip: float | None
     demean: bool = True
     """Whether the mean is subtracted at all (`de_mean_to_zero`)."""
     destd: bool = True
     """Whether the standard deviation divides at all (`de_std_to_one`)."""
+    epsilon: float = SMALL_NUMBER
+    """What is added to the standard deviation."""
+    leaf: str = "obs"
+    """Which part of the observation is filtered, by input name."""
+    keeps_integers: bool = True
+    """Whether filtered integers are cut back to integers, as RLlib does it."""
 
     def offset(self) -> NDArray[np.float64]:
         """Return what is subtracted, of the observation's shape."""
         return self.mean if self.demean else np.zeros_like(self.mean)
 
-    def divisor(self) -> NDArray[np.float32]:
+    def divisor(self) -> NDArray[np.floating[Any]]:
         """Return what divides, of the observation's shape."""
-        return self.std + np.float32(SMALL_NUMBER) if self.destd else np.ones_like(self.std)
+        return self.std + self.std.dtype.type(self.epsilon) if self.destd else np.ones_like(self.std)
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,29 @@ class FrameStack:
     shape: tuple[int, ...]
     dtype: str
     every: int = 1
+    leaf: str = "obs"
+    """Which part of the observation is stacked, by input name."""
+    channels_first: bool = False
+    """Whether the frames are side by side on the first axis."""
+
+    @property
+    def state_name(self) -> str:
+        return "frames" + self.leaf.removeprefix("obs")
+
+    @property
+    def past_shape(self) -> tuple[int, ...]:
+        """The shape of the frames that are kept."""
+        kept = (self.frames - 1) * self.every
+        if self.channels_first:
+            return (kept * self.shape[0], *self.shape[1:])
+        return (*self.shape[:-1], kept * self.shape[-1])
+
+
+@dataclass(frozen=True)
+class Transpose:
+    """Images from `[height, width, channel]`, as environments give them, to `[channel, height, width]`."""
+
+    leaf: str = "obs"
 
 
 @dataclass(frozen=True)
@@ -115,7 +148,7 @@ class Preprocess:
 
 
 ObservationStep: TypeAlias = (
-    ObservationFilter | Flatten | FrameStack | Logarithm | SineAndCosine | Previous | UserStep | Preprocess
+    ObservationFilter | Flatten | FrameStack | Transpose | Logarithm | SineAndCosine | Previous | UserStep | Preprocess
 )
 
 Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax", "given"]
@@ -137,13 +170,29 @@ class StateLeaf:
 
 
 @dataclass(frozen=True)
+class Affine:
+    """What an environment makes of a policy's numbers: `clip(action, -limit, limit) * scale + offset`."""
+
+    scale: NDArray[np.float32]
+    """Of the action's shape, in its units."""
+    offset: NDArray[np.float32]
+    """The same."""
+    limit: float | None = None
+
+    def apply(self, action: NDArray[Any]) -> NDArray[Any]:
+        """Return the action in the environment's units, in numpy: what a graph is compared with."""
+        limited = action if self.limit is None else np.clip(action, -self.limit, self.limit)
+        return np.asarray(limited * self.scale + self.offset)
+
+
+@dataclass(frozen=True)
 class Recipe:
     """Everything between a raw observation and `env.step`, except the network."""
 
     observation_space: Any
     """A Box, Discrete, MultiDiscrete or MultiBinary, or a Dict or Tuple of such, nested at will."""
     action_space: Any
-    """A Box, Discrete or MultiDiscrete, or a Dict or Tuple of such."""
+    """A Box, Discrete or MultiDiscrete, or a Dict or Tuple of such; a MultiBinary whose mode is "given"."""
     steps: tuple[ObservationStep, ...]
     mode: Mode
     """Of the Box leaves (discrete ones are always argmax); of the whole action where it is only one leaf."""
@@ -154,11 +203,19 @@ class Recipe:
     """A recurrent network's state, in the order the network takes and gives it."""
     action_steps: tuple[UserStep, ...] = ()
     """The user's own connectors between the distribution's mode and unsquashing."""
+    affine: Affine | None = None
+    """Of an action that is one Box: what is done to it before it is clipped."""
 
     @property
     def filter(self) -> ObservationFilter | None:
         """The observation filter, if there is one."""
         return next((step for step in self.steps if isinstance(step, ObservationFilter)), None)
+
+    @property
+    def first_filters(self) -> dict[str, ObservationFilter]:
+        """The filters that meet the raw observation, by the leaf they are of."""
+        first = itertools.takewhile(lambda step: isinstance(step, ObservationFilter), self.steps)
+        return {step.leaf: step for step in first if isinstance(step, ObservationFilter)}
 
     @property
     def observation_leaves(self) -> dict[str, Any]:
@@ -176,8 +233,7 @@ class Recipe:
         carried: list[StateLeaf] = []
         for step in self.steps:
             if isinstance(step, FrameStack):
-                past = (*step.shape[:-1], (step.frames - 1) * step.every * step.shape[-1])
-                carried.append(StateLeaf("frames", np.zeros(past, step.dtype), "frames"))
+                carried.append(StateLeaf(step.state_name, np.zeros(step.past_shape, step.dtype), "frames"))
             elif isinstance(step, Previous):
                 if step.actions:
                     codes = np.zeros(step.actions * step.choices, np.float32)
@@ -195,7 +251,7 @@ class Recipe:
 
 def parameter_count(space: Any) -> int:
     """Return how many distribution parameters one action leaf has."""
-    if isinstance(space, Box):
+    if isinstance(space, Box | MultiBinary):
         return 2 * math.prod(space.shape)
     if isinstance(space, MultiDiscrete):
         return int(space.nvec.sum())

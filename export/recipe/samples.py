@@ -85,9 +85,9 @@ def _sequence(recipe: Recipe, rng: np.random.Generator, size: int) -> Iterator[B
 
 
 def _observations(recipe: Recipe, kind: str, rng: np.random.Generator, size: int) -> Inputs:
-    filtered_first = bool(recipe.steps) and isinstance(recipe.steps[0], ObservationFilter)
+    first = recipe.first_filters
     return {
-        name: _draw(kind, _Leaf(space, recipe.filter, filtered_first), rng, size)
+        name: _draw(kind, _Leaf(space, first.get(name, recipe.filter), name in first), rng, size)
         for name, space in recipe.observation_leaves.items()
     }
 

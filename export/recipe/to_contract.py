@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,13 +26,13 @@ from rlservo.export.recipe.trees import space_leaves
 
 def space_spec(
     space: Any,
-    elements: Sequence[Element] = (),
+    elements: Sequence[Element] | Mapping[str, Sequence[Element]] = (),
     *,
     action: bool = False,
     unread: Collection[str] = (),
     name: str = "obs",
 ) -> SpaceSpec:
-    """Return the contract's form of `space`; only a leaf names `elements`.
+    """Return the contract's form of `space`; only a leaf names `elements`, of a nested space by its tensor name.
 
     A Dict's key of which all leaves are `unread` (by input name) is only mentioned; a Tuple keeps its length. An
     action's Discrete loses its `start`: the contract says what goes to `env.step`, and RLlib sends 0 .. n - 1.
@@ -41,7 +41,7 @@ def space_spec(
         paths = {key: f"{name}.{key}" for key in sorted(space.spaces)}
         ignored = [key for key, path in paths.items() if all(leaf in unread for leaf in space_leaves(space[key], path))]
         kept = {
-            key: space_spec(space[key], action=action, unread=unread, name=path)
+            key: space_spec(space[key], elements, action=action, unread=unread, name=path)
             for key, path in paths.items()
             if key not in ignored
         }
@@ -49,9 +49,11 @@ def space_spec(
     if isinstance(space, Tuple):
         inside = enumerate(space.spaces)
         return TupleSpec(
-            spaces=tuple(space_spec(child, action=action, unread=unread, name=f"{name}.{i}") for i, child in inside)
+            spaces=tuple(
+                space_spec(child, elements, action=action, unread=unread, name=f"{name}.{i}") for i, child in inside
+            )
         )
-    named = tuple(elements)
+    named = tuple(elements.get(name, ()) if isinstance(elements, Mapping) else elements)
     if isinstance(space, Discrete):
         return DiscreteSpec(n=int(space.n), start=0 if action else int(space.start), dtype="int64", elements=named)
     shape = tuple(int(size) for size in space.shape)
@@ -65,7 +67,7 @@ def space_spec(
             elements=named,
         )
     if isinstance(space, MultiBinary):
-        return MultiBinarySpec(shape=shape, dtype=str(space.dtype), elements=named)
+        return MultiBinarySpec(shape=shape, dtype="int64" if action else str(space.dtype), elements=named)
     assert isinstance(space, Box)
     return BoxSpec(shape=shape, dtype=str(space.dtype), low=_bound(space.low), high=_bound(space.high), elements=named)
 

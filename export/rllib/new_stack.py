@@ -67,8 +67,8 @@ from rlservo.export.rllib.older_components import (
     set_saved_state,
 )
 from rlservo.export.rllib.restore_order import connectors_that_rllib_restores
-from rlservo.export.rllib.restored_policy import RestoredPolicy, diverged_weights
 from rlservo.export.rllib.supported_spaces import check_spaces
+from rlservo.export.sources.restored_policy import RestoredPolicy, diverged_weights
 
 PIPELINE_SETTINGS = (
     "normalize_actions",

@@ -45,8 +45,8 @@ from rlservo.export.rllib.gaussian_heads import replace_heads
 from rlservo.export.rllib.old_connectors import check_connectors, read_old_steps, read_old_transform
 from rlservo.export.rllib.old_models import register_custom_parts
 from rlservo.export.rllib.older_policies import MIXTURES, update_policy_state
-from rlservo.export.rllib.restored_policy import RestoredPolicy, diverged_weights
 from rlservo.export.rllib.supported_spaces import check_spaces
+from rlservo.export.sources.restored_policy import RestoredPolicy, diverged_weights
 
 AGENT = "agent0"  # what RLlib calls the one agent of an environment
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,8 +10,9 @@ from rlservo.export.checkpoints.location import Files
 from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.recipe.describe import unexpected_steps
 from rlservo.export.rllib import quick_import
-from rlservo.export.rllib.restored_policy import RestoredPolicy
+from rlservo.export.rllib.frozen_filter import why_untrained
 from rlservo.export.rllib.supported_spaces import check_unsquashing
+from rlservo.export.sources.restored_policy import RestoredPolicy
 
 
 def restore(files: Files, app_dir: Path, notify: Callable[[str], None], *, value: bool = True) -> RestoredPolicy:
@@ -32,4 +34,4 @@ def restore(files: Files, app_dir: Path, notify: Callable[[str], None], *, value
     check_unsquashing(restored.recipe.action_space, restored.recipe.transform)
     for sentence in unexpected_steps(restored.recipe):
         notify(sentence)
-    return restored
+    return dataclasses.replace(restored, untrained_filter=why_untrained(files, restored.recipe))

@@ -22,7 +22,7 @@ from rlservo.export.recipe.recipe import ObservationFilter, Recipe, Transform
 from rlservo.export.recipe.runners import Outputs, Runner, first_step
 from rlservo.export.recipe.samples import BATCH_SIZES, draw_batches
 from rlservo.export.rllib.restore import restore
-from rlservo.export.rllib.restored_policy import RestoredPolicy
+from rlservo.export.sources.restored_policy import RestoredPolicy
 
 
 @pytest.fixture

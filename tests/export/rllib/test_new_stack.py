@@ -33,7 +33,7 @@ from rlservo.export.recipe.runners import first_step
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.recipe.trees import named_leaves
 from rlservo.export.rllib.restore import restore
-from rlservo.export.rllib.restored_policy import RestoredPolicy
+from rlservo.export.sources.restored_policy import RestoredPolicy
 from rlservo.serve_app.runtime.policy import Policy
 
 RECURRENT = ["lstm_box", "lstm_discrete", "lstm_previous", "previous", "user_gru", "appo_lstm", "stacked",

@@ -33,7 +33,7 @@ from rlservo.export.recipe.runners import Loop, first_step
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.rllib.old_models import Registration, find_registrations
 from rlservo.export.rllib.restore import restore
-from rlservo.export.rllib.restored_policy import RestoredPolicy
+from rlservo.export.sources.restored_policy import RestoredPolicy
 from rlservo.export.verify_bundle import verify_bundle
 from rlservo.serve_app.runtime.policy import Policy
 

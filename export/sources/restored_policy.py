@@ -1,14 +1,15 @@
-"""A policy that RLlib restored: the recipe around its network, the network to trace, and RLlib's own way to act."""
+"""A restored policy: the recipe around its network, the network to trace, and the framework's own way to act."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import torch
 from torch import Tensor, nn
 
+from rlservo.export.contract.spaces import Element
 from rlservo.export.recipe.recipe import Recipe
 from rlservo.export.recipe.runners import Loop
 from rlservo.export.recipe.trees import Tree
@@ -34,14 +35,33 @@ class RestoredNetwork(Protocol):
     def __call__(self, obs: Tree, *state: list[Tensor]) -> tuple[Tensor, ...]: ...
 
 
+Elements: TypeAlias = tuple[Element, ...] | Mapping[str, tuple[Element, ...]]
+
+
+@dataclass(frozen=True)
+class ElementNames:
+    """Element names in row-major order, empty where unknown, and the rate the environment asks for actions at [Hz].
+
+    Of a nested space they are by the leaf's tensor name.
+    """
+
+    observation: Elements = ()
+    action: Elements = ()
+    control_rate_hz: float | None = None
+
+
 @dataclass(frozen=True)
 class RestoredPolicy:
-    """A policy of either API stack."""
+    """A policy of any source."""
 
     recipe: Recipe
     network: RestoredNetwork
     module_class: str
     start_loop: Callable[[], Loop]
-    """Start RLlib acting step after step, exploration off and filter frozen: the truth an export is compared with."""
+    """Start the framework acting step after step, exploration off and filter frozen: what an export is compared to."""
     agents: tuple[str, ...] = ()
     """The agents of an environment with several that it is for; empty where there is one, or all are alike."""
+    elements: ElementNames | None = None
+    """What the checkpoint says of its elements; None where the environment's class may be asked."""
+    untrained_filter: str = ""
+    """Why the observation filter's statistics are not training's; '' where they are or there is no filter."""

@@ -1,0 +1,1 @@
+"""Sources: the trainers whose policies are exported, behind one interface."""

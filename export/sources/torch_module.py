@@ -1,0 +1,164 @@
+"""Source of a torch module in memory: the user says what a checkpoint would."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+from numpy.typing import NDArray
+
+from rlservo.export.checkpoints.facts import CheckpointFacts
+from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.scores import Q_VALUES
+from rlservo.export.recipe.recipe import Affine, Mode, Recipe, StateLeaf
+from rlservo.export.recipe.trees import space_leaves
+from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from rlservo.export.sources.restored_policy import ElementNames, RestoredPolicy
+
+ACTIONS = (Box, Discrete, MultiDiscrete)
+
+
+@dataclass(frozen=True)
+class ModuleFiles:
+    """A module stands where others have files."""
+
+    module: nn.Module
+    module_id: str = "default_policy"
+    agent_id: str | None = None
+    is_one_of_several: bool = False
+
+    @property
+    def root(self) -> Path:
+        return Path(type(self.module).__name__)
+
+    def sha256(self) -> str:
+        """Return a hash over the weights' names and values."""
+        digest = hashlib.sha256()
+        for name, weights in self.module.state_dict().items():
+            digest.update(name.encode() + b"\0")
+            digest.update(np.ascontiguousarray(weights.detach().cpu().numpy()).tobytes())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class ModuleSpec:
+    """What the user says of a module (`rlservo.export_policy`)."""
+
+    observation_space: Any
+    action_space: Any
+    scale: float | NDArray[Any] | None
+    offset: float | NDArray[Any] | None
+    clip: bool
+    state: Mapping[str, NDArray[Any]]
+    elements: ElementNames
+    facts: CheckpointFacts
+
+
+class TorchModule(Source):
+    """One module; it detects no path."""
+
+    name = "torch"
+    framework = "torch"
+    distribution = "torch"
+    extra = "export"
+    expects = "a module given to rlservo.export_policy"
+    reference = (
+        "the torch module's own forward pass in evaluation mode, then the scale, offset and clip that were given"
+    )
+
+    def __init__(self, spec: ModuleSpec) -> None:
+        self._spec = spec
+
+    def detects(self, path: Path) -> bool:  # noqa: ARG002
+        return False
+
+    def locate(self, path: Path, module_id: str | None, agent_id: str | None) -> PolicyFiles:
+        raise NotImplementedError("a module has no files")
+
+    def loads(self, files: PolicyFiles) -> str:  # noqa: ARG002
+        return ""
+
+    def facts(self, files: PolicyFiles, notify: Notify) -> CheckpointFacts:  # noqa: ARG002
+        return self._spec.facts
+
+    def restore(self, files: PolicyFiles, options: RestoreOptions, notify: Notify) -> RestoredPolicy:  # noqa: ARG002
+        from rlservo.export.sources.torch_policy import TorchPolicy, restored, second
+
+        assert isinstance(files, ModuleFiles)
+        spec, what = self._spec, type(files.module).__name__
+        _check_spaces(spec)
+        traced, acting = (second(files.module, what).cpu().eval() for _ in range(2))
+        mode: Mode = "given" if isinstance(spec.action_space, Box) else "argmax"
+        recipe = Recipe(
+            spec.observation_space,
+            spec.action_space,
+            (),
+            mode,
+            "clip" if spec.clip and mode == "given" else "none",
+            None,
+            tuple(StateLeaf(name, initial) for name, initial in spec.state.items()),
+            affine=_affine(spec),
+        )
+        names = () if mode == "given" else (Q_VALUES,)
+        policy = TorchPolicy(recipe, traced, partial(_act, spec), lambda: partial(_act, spec, acting), names)
+        return restored(policy, spec.elements, what)
+
+
+def _act(spec: ModuleSpec, module: nn.Module, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
+    """Return the module's output and its next state."""
+    outputs = module(obs, *state)
+    first, after = (outputs[0], list(outputs[1:])) if isinstance(outputs, tuple) else (outputs, [])
+    if len(after) != len(spec.state):
+        raise ValueError(f"it gives {len(after)} tensors of state, {len(spec.state)} were named ({list(spec.state)})")
+    return first, after
+
+
+def _affine(spec: ModuleSpec) -> Affine | None:
+    if spec.scale is None and spec.offset is None:
+        return None
+    if not isinstance(spec.action_space, Box):
+        raise UsageError(f"scale and offset are for a Box of actions, got {spec.action_space}")
+    sides = []
+    for name, given, default in (("scale", spec.scale, 1.0), ("offset", spec.offset, 0.0)):
+        values = np.asarray(default if given is None else given, np.float32)
+        try:
+            sides.append(np.ascontiguousarray(np.broadcast_to(values, spec.action_space.shape)))
+        except ValueError:
+            raise UsageError(
+                f"{name} has shape {values.shape}, the action {spec.action_space.shape}: expected one number, or one "
+                "for each element"
+            ) from None
+        if not np.isfinite(values).all():
+            raise UsageError(f"{name} is not finite: {values}")
+    return Affine(sides[0], sides[1])
+
+
+def _check_spaces(spec: ModuleSpec) -> None:
+    """Raise UsageError for spaces or names that no bundle has."""
+    if not isinstance(spec.observation_space, Box | Discrete | MultiDiscrete | MultiBinary | Dict | Tuple):
+        raise UsageError(f"the observation space {spec.observation_space!r} is not exported: it has no fixed shape")
+    if not isinstance(spec.action_space, ACTIONS):
+        raise UsageError(f"the action space {spec.action_space!r} is not exported: expected a Box, Discrete or "
+                         "MultiDiscrete")  # fmt: skip
+    for name, space in (*space_leaves(spec.observation_space, "obs").items(), ("action", spec.action_space)):
+        if isinstance(space, Box) and np.dtype(space.dtype).kind == "f" and space.dtype not in (np.float32, np.float64):
+            raise UsageError(
+                f"{name}: {space} is not exported: only float32 and float64 are, of floating-point numbers"
+            )
+    for name, space, elements in (
+        ("observation", spec.observation_space, spec.elements.observation),
+        ("action", spec.action_space, spec.elements.action),
+    ):
+        size = int(np.prod(space.shape)) if space.shape is not None else 0
+        if elements and len(elements) != size:
+            raise UsageError(f"{len(elements)} {name} names were given, the space has {size} elements")

@@ -1,0 +1,101 @@
+"""LEAPP bundles of two stages with a state, against LEAPP's own replay."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rlservo.export.contract.errors import CheckpointError, RlservoError, UnsupportedError
+from rlservo.export.export_checkpoint import export_checkpoint
+from rlservo.serve_app.runtime.policy import Policy
+
+leapp = pytest.importorskip("leapp")
+torch = pytest.importorskip("torch")
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An arm: joints and velocities are put side by side with the last action, then a network gives targets."""
+    folder = tmp_path_factory.mktemp("leapp")
+    torch.manual_seed(0)
+    layers = torch.nn.Sequential(torch.nn.Linear(7, 8), torch.nn.ELU(), torch.nn.Linear(8, 3))
+    net = layers.eval().requires_grad_(False)
+    kinds = leapp.InputKindEnum
+    leapp.start("arm", save_path=str(folder), max_cached_io=2)
+    for _ in range(2):
+        joints, velocities = leapp.annotate.input_tensors("before", [
+            leapp.TensorSemantics(name="q", ref=torch.randn(1, 2), kind=kinds.JOINT_POSITION,
+                                  element_names=[["pan", "lift"]]),
+            leapp.TensorSemantics(name="dq", ref=torch.randn(1, 2), kind=kinds.JOINT_VELOCITY),
+        ])  # fmt: skip
+        last = _only(leapp.annotate.state_tensors("before", {"last": torch.full((1, 3), 0.25)}))
+        seen = torch.cat([2.0 * joints, velocities, last], dim=-1)
+        leapp.annotate.update_state("before", {"last": 0.5 * last + 0.1 * seen[:, :3]})
+        seen = _only(leapp.annotate.output_tensors("before", {"seen": seen}, export_with="jit-trace"))
+        seen = _only(leapp.annotate.input_tensors("network", {"seen": seen}))
+        target = leapp.TensorSemantics(
+            name="target",
+            ref=0.5 * net(seen),
+            kind=leapp.OutputKindEnum.JOINT_POSITION,
+            element_names=[["a", "b", "c"]],
+        )
+        leapp.annotate.output_tensors("network", [target], export_with="jit-trace")
+    leapp.stop()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # LEAPP's own, about torch.jit
+        leapp.compile_graph(visualize=False, graph_configs=leapp.GraphConfigs(frequency=20.0))
+    return folder / "arm"
+
+
+def _only(tensors: Any) -> Any:
+    return tensors[0] if isinstance(tensors, tuple | list) else tensors
+
+
+def test_stages_are_chained_and_kinds_become_names_and_units(bundle: Path, tmp_path: Path, notices: list[str]) -> None:
+    result = export_checkpoint(bundle, tmp_path, notify=notices.append)
+    contract = result.contract
+    assert not any("loading" in notice for notice in notices)
+    assert [(e.name, e.unit) for e in contract.action_space.elements] == [("a", "rad"), ("b", "rad"), ("c", "rad")]
+    joints = contract.observation_space.spaces["q"]  # type: ignore[union-attr]
+    assert [(e.name, e.unit) for e in joints.elements] == [("pan", "rad"), ("lift", "rad")]
+    assert contract.control_rate_hz == 20.0
+    assert [leaf.initial for leaf in contract.state] == [0.25]
+    rng = np.random.default_rng(0)
+    with Policy.load(result.path) as policy:
+        for _ in range(2):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                manager = leapp.InferenceManager(str(bundle / "arm.yaml"))
+            policy.reset()
+            for _ in range(6):
+                obs = {"q": rng.normal(size=2).astype(np.float32), "dq": rng.normal(size=2).astype(np.float32)}
+                given = {f"before/{key}": torch.from_numpy(value)[None] for key, value in obs.items()}
+                wanted = manager.run_policy(given)["network/target"][0].numpy()
+                np.testing.assert_allclose(policy.act(obs), wanted, rtol=1e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "words"),
+    [
+        (("backend: jit", "backend: onnx"), UnsupportedError, "backend 'onnx': only TorchScript can be traced"),
+        (("model_path: before.pt", "model_path: after.pt"), CheckpointError, "after.pt is not beside it"),
+        (("sha256sum: ", "sha256sum: 0"), CheckpointError, "cannot be loaded by LEAPP"),
+        (("shape: [1, 2]", "shape: [2]"), UnsupportedError, r"has shape \[2\]: expected 1 for the batch, first"),
+    ],
+)  # fmt: skip
+def test_broken_bundles_are_refused_with_the_reason(
+    change: tuple[str, str], kind: type[RlservoError], words: str, bundle: Path, tmp_path: Path
+) -> None:
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    for file in bundle.iterdir():
+        (broken / file.name).write_bytes(file.read_bytes())
+    described = (broken / "arm.yaml").read_text()
+    assert change[0] in described
+    (broken / "arm.yaml").write_text(described.replace(*change))
+    with pytest.raises(kind, match=words):
+        export_checkpoint(broken, tmp_path / "out", notify=lambda _: None)
