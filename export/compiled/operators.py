@@ -400,19 +400,18 @@ def _softmax(program: Program, node: Node) -> None:
 
 
 def _arg(program: Program, node: Node) -> None:
-    """Return the first of the largest (smallest); not a number is larger than any, as in onnxruntime."""
+    """The place of the largest (smallest), of equals the first or last."""
     source = program.ref(node.inputs[0])
     axis = int(node.attributes.get("axis", 0)) % program.value(node.inputs[0]).ndim
     outer, _, (kept, _) = _split_axes(program, node.inputs[0], [axis])
     stride, count = row_major(program.value(node.inputs[0]).shape)[axis], program.value(node.inputs[0]).shape[axis]
     beyond = {"ArgMax": (">", ">="), "ArgMin": ("<", "<=")}[node.op][int(node.attributes.get("select_last_index", 0))]
-    unordered, ordered = (" || x != x", " && a == a") if source.dtype.kind == "f" else ("", "")
     result = program.new(node.outputs[0])
     program.emit(
         f"{{\n    int o = 0;\n    {outer}{{\n        int64_t best = 0;\n        {source.c_type} a = ({source})[{kept}];\n"
-        f"        for (int k = 1; k < {count}{ordered}; k++) {{\n"
+        f"        for (int k = 1; k < {count}; k++) {{\n"
         f"            const {source.c_type} x = ({source})[{kept} + {stride} * k];\n"
-        f"            if (x {beyond} a{unordered}) {{\n                a = x;\n                best = k;\n            }}\n"
+        f"            if (x {beyond} a) {{\n                a = x;\n                best = k;\n            }}\n"
         f"        }}\n        ({result})[o++] = best;\n    }}\n}}"
     )
 

@@ -34,7 +34,14 @@ class Ref:
         return c_type(self.dtype)
 
     def __str__(self) -> str:
+        if self.in_scratch:
+            return f"{self.base[:-1]}+{self.offset}@"
         return f"{self.base} + {self.offset}" if self.offset else self.base
+
+    @property
+    def in_scratch(self) -> bool:
+        """Whether it is a place, which `Program.text` decides."""
+        return self.base.startswith("@")
 
 
 @dataclass
@@ -89,7 +96,7 @@ class Program:
             array = self.value(name)
             return Ref(array.dtype, self.constant(array))
         found = self._refs[name]
-        if found.base.startswith("@"):
+        if found.in_scratch:
             self._places[int(found.base.strip("@"))].last = self._now
         return found
 
@@ -165,11 +172,11 @@ class Program:
 
         def place_text(match: re.Match[str]) -> str:
             number_of = int(match[1])
-            offset = offsets[number_of] + int(match[2] or 0)
+            offset = offsets[number_of] + int(match[2])
             member = f"state->scratch.{self._places[number_of].c_type.removesuffix('_t')}s"
             return f"{member} + {offset}" if offset else member
 
-        return re.sub(r"@(\d+)@(?: \+ (\d+))?", place_text, "\n".join(self._lines))
+        return re.sub(r"@(\d+)\+(\d+)@", place_text, "\n".join(self._lines))
 
     def constants_text(self, prefix: str, least_in_file: int | None) -> tuple[str, NDArray[np.float32] | None]:
         """Return (definitions of the array constants, those that are left to a file of weights instead).

@@ -165,7 +165,7 @@ def _own_range(dtype: np.dtype[np.generic]) -> tuple[float | int, float | int]:
 def _in_scratch(program: Program, tensor: str, member: Member) -> Ref:
     """Return where an output lies, copied where that is not scratch memory."""
     ref = program.ref(tensor)
-    if ref.base.startswith("@"):
+    if ref.in_scratch:
         return ref
     copied = program.temporary(member.dtype, member.size)
     program.emit(f"memcpy({copied}, {ref}, {member.size} * sizeof({copied.c_type}));")

@@ -24,7 +24,8 @@ def allowed_differences(
     """Return how far each number of an action or next state may be from `outputs`, the graph's own.
 
     A float by the contract's tolerance of its scale: half the range of a bounded action, else the largest number in its
-    row. A choice by nothing, unless another one's score ties with its own: then by the distance between those choices.
+    row. A choice by nothing, unless another one's score ties with its own, or scores are not numbers: then by the
+    distance between those choices.
     `moved` is what the graph computes for observations moved by their last bit: by 8 times what that changes, too.
     """
     rtol, atol = contract.parity.rtol, contract.parity.atol
@@ -74,7 +75,7 @@ def _ties(contract: Contract, name: str, outputs: Arrays, moved: Arrays | None) 
         inside = (own >= 0) & (own < scores.shape[1])
         best = scores[rows, np.where(inside, own, 0)]
         with np.errstate(invalid="ignore"):
-            tied = np.abs(scores - best[:, None]) <= width[:, None]
+            tied = (np.abs(scores - best[:, None]) <= width[:, None]) | np.isnan(scores).any(axis=1, keepdims=True)
         apart = np.abs(np.arange(scores.shape[1])[None] - own[:, None])
         distance[:, column] = np.where(inside, (apart * tied).max(axis=1), 0)
     return distance.reshape(chosen.shape)
