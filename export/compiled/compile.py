@@ -23,7 +23,6 @@ from rlservo.export.compiled.source import write_source
 from rlservo.export.compiled.static_graph import read_static_graph
 from rlservo.export.compiled.tolerance import allowed_differences
 from rlservo.export.contract.bundle import CONTRACT_FILE, ONNX_FILE, load_bundle
-from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.runtime.compiled_policy import COMPILE_FILE, acting_contract
 from rlservo.serve_app.runtime.loading import check_contract, check_copy, check_golden_vectors, check_graph, open_graph
@@ -36,8 +35,8 @@ class Compiled:
     """What was written."""
 
     folder: Path
-    contract: Contract
-    prefix: str
+    about: Mapping[str, Any]
+    """As `compile.json` has it."""
     proof: Proof | None
     """None where there was no compiler."""
 
@@ -118,7 +117,7 @@ def compile_bundle(
         }
         (beside / COMPILE_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
         _take_places(beside, folder, earlier)
-    return Compiled(folder, contract, face.prefix, proof)
+    return Compiled(folder, about, proof)
 
 
 def _check_free(folder: Path, name: str) -> dict[str, str]:

@@ -48,6 +48,8 @@ class Proof:
     """Median, 99% and longest of 20,000 steps on this machine."""
     stack_bytes: int | None
     """Of the deepest call, libm's own aside; None where the compiler does not tell."""
+    state_bytes: int
+    """Of the caller's struct: what is remembered, and memory to compute in."""
     code_bytes: int
     """The shared library, weights and all."""
 
@@ -108,9 +110,8 @@ def prove(
     median, late, longest = (
         float(each) / 1e3 for each in re.findall(r"nanoseconds: (\d+) (\d+) (\d+)", test.stdout)[0]
     )
-    refused, max_abs, max_rel = _compare_all(
-        contract, CompiledLibrary(folder / library, prefix, acting_contract(contract)), compute, golden
-    )
+    loaded = CompiledLibrary(folder / library, prefix, acting_contract(contract))
+    refused, max_abs, max_rel = _compare_all(contract, loaded, compute, golden)
     return Proof(
         compiler=_version(compiler),
         flags=flags,
@@ -121,6 +122,7 @@ def prove(
         max_rel=max_rel,
         step_us={"median": median, "p99": late, "longest": longest},
         stack_bytes=_stack(folder),
+        state_bytes=loaded.state_size,
         code_bytes=(folder / library).stat().st_size,
     )
 

@@ -17,7 +17,7 @@ from rlservo.export.compiled.program import Program, Ref
 from rlservo.export.compiled.static_graph import StaticGraph
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.spaces import BoxSpec
-from rlservo.serve_app.runtime.elements import rounding_slack
+from rlservo.serve_app.runtime.input_numbers import rounding_slack
 
 SMALLEST_IN_BIN = 256  # elements of a constant that goes into the file of weights, where there is one
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import Self
 
 from rlservo.export.contract.bundle import CONTRACT_FILE, Bundle, read_contract
 from rlservo.export.contract.contract import REWARD, Contract
@@ -66,10 +65,12 @@ class CompiledPolicy(Policy):
         bundle = Bundle(folder, contract, recorded, about["bundle"])
         super().__init__(bundle, library, options, graph_hash=recorded[file.name])  # type: ignore[arg-type]  # it has `run`
 
-    @classmethod
-    def load(cls, path: str | Path, *, options: PolicyOptions = DEFAULT_OPTIONS, **_: Any) -> Self:  # type: ignore[override]
-        """Return the policy in a folder, as `Policy.load` does for a bundle."""
-        return cls(path, options=options)
+
+def open_policy(path: str | Path, *, options: PolicyOptions = DEFAULT_OPTIONS, check_golden: bool = True) -> Policy:
+    """Return the policy of a bundle, or of a folder that `rlservo compile` wrote. Raises what either raises."""
+    if (Path(path) / COMPILE_FILE).is_file():
+        return CompiledPolicy(path, options=options)
+    return Policy.load(path, options=options, check_golden=check_golden)
 
 
 def acting_contract(contract: Contract) -> Contract:
@@ -102,7 +103,7 @@ class CompiledLibrary:
             self._act, self._reset, self._element = (
                 library[f"{prefix}_{name}"] for name in ("act", "reset", "element")
             )
-            self._state_size = ctypes.c_size_t.in_dll(library, f"{prefix}_state_size").value
+            self.state_size = ctypes.c_size_t.in_dll(library, f"{prefix}_state_size").value
             self.bundle = ctypes.string_at(ctypes.addressof(ctypes.c_char.in_dll(library, f"{prefix}_bundle"))).decode()
         except (OSError, AttributeError, ValueError) as error:
             raise BundleError(f"{file} is no library of a compiled policy: {error}") from error
@@ -155,7 +156,7 @@ class CompiledLibrary:
         if not hasattr(self._own, "structs"):
             places: dict[str, NDArray[Any]] = {}
             raws = []
-            for struct, size in zip(self._structs, (0, self._state_size, 0), strict=True):
+            for struct, size in zip(self._structs, (0, self.state_size, 0), strict=True):
                 raws.append(np.zeros(max(struct.itemsize, size, 1) // 8 + 1, np.int64))
                 members = np.frombuffer(raws[-1], struct, 1) if struct.itemsize else None
                 places |= {name: members[name][0, ...] for name in struct.names or ()} if members is not None else {}
