@@ -15,7 +15,9 @@ from rlservo.export.contract.extras import needs_extra
 def compile(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
     out: Annotated[Path, typer.Option(help="Folder for the C; an earlier one of the same policy is replaced.")],
-    cc: Annotated[str | None, typer.Option(help="C compiler for the proof; $CC or the machine's own by default.")] = None,
+    cc: Annotated[
+        str | None, typer.Option(help="C compiler for the proof; $CC or the machine's own by default.")
+    ] = None,
     embed_weights: Annotated[
         Literal["c", "bin"], typer.Option(help="Weights in the C file, or in a binary file beside it (large networks).")
     ] = "c",

@@ -49,12 +49,16 @@ def verify(
     seed: Annotated[int, typer.Option(help="Seed of the first episode.")] = 0,
     env_arg: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="With --disturb or --compiled, environment constructor argument (JSON)."),
+        typer.Option(
+            metavar="NAME=VALUE", help="With --disturb or --compiled, environment constructor argument (JSON)."
+        ),
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="With --disturb, draw the table into this file.")] = None,
     compiled: Annotated[
         Path | None,
-        typer.Option(help="Folder of `rlservo compile`: drive --env with it too, on the same seeds, to the same endings."),
+        typer.Option(
+            help="Folder of `rlservo compile`: drive --env with it too, on the same seeds, to the same endings."
+        ),
     ] = None,
     write: Annotated[
         bool, typer.Option("--write", help="With --disturb, write the rows into the contract as evaluations.")

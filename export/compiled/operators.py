@@ -93,7 +93,7 @@ def emit_node(program: Program, node: Node) -> None:
     moved = MOVEMENTS.get(node.op, ())
     sources = range(len(node.inputs)) if moved is None else [i for i in moved if i < len(node.inputs)]
     if node.op in MOVEMENTS and all(program.is_constant(x) for i, x in enumerate(node.inputs) if i not in sources):
-        _move(program, node, [node.inputs[i] for i in sources if node.inputs[i]])
+        _move(program, node, [i for i in sources if node.inputs[i]])
     elif node.op in SPECIAL:
         SPECIAL[node.op](program, node)
     elif node.op in REDUCTIONS:
@@ -197,17 +197,18 @@ def _is_infinite(program: Program, node: Node) -> None:
 # Movements
 
 
-def _move(program: Program, node: Node, sources: Sequence[str]) -> None:
+def _move(program: Program, node: Node, positions: Sequence[int]) -> None:
     """Copy numbers from place to place, or just say where they lie when they lie so already.
 
     The node is run once on the numbers of places instead of values: what comes out says where each number comes from.
     """
-    for output, places in zip((name for name in node.outputs if name), _places(program, node, sources), strict=True):
-        ends = np.cumsum([program.value(name).size for name in sources])
-        owners = np.searchsorted(ends, places, side="right")
-        if places.size and (owners == owners.flat[0]).all():
+    sources = [node.inputs[position] for position in positions]
+    for output, places in zip((name for name in node.outputs if name), _places(program, node, positions), strict=True):
+        ends = np.cumsum([1, *(program.value(name).size for name in sources)])
+        owners = np.searchsorted(ends, places, side="right") - 1
+        if places.size and owners.flat[0] >= 0 and (owners == owners.flat[0]).all():
             owner = int(owners.flat[0])
-            found = affine(places - (ends[owner] - program.value(sources[owner]).size))
+            found = affine(places - ends[owner])
             if (
                 found is not None
                 and found[1] == _dense_strides(places.shape)
@@ -216,37 +217,39 @@ def _move(program: Program, node: Node, sources: Sequence[str]) -> None:
                 base = program.ref(sources[owner])
                 program.alias(output, Ref(base.dtype, base.base, base.offset + found[0]))
                 continue
+        reads: list[Ref | str] = [literal(program, source) for source in sources]
         result = program.new(output)
-        for owner, source in enumerate(sources):
+        for owner, read in enumerate(["0", *reads], start=-1):
             if (owners == owner).any():
-                _copy(program, source, places - (ends[owner] - program.value(source).size), owners == owner, result)
+                _copy(program, read, places - ends[max(owner, 0)], owners == owner, result)
 
 
 def _dense_strides(shape: Sequence[int]) -> list[int]:
     return [stride if size > 1 else 0 for size, stride in zip(shape, row_major(shape), strict=True)]
 
 
-def _places(program: Program, node: Node, sources: Sequence[str]) -> list[NDArray[np.int64]]:
-    """Return, for each output, where its elements come from in the sources, which are counted through."""
-    model_inputs, feed, begin = [], {}, 0
-    for name in dict.fromkeys(name for name in node.inputs if name):
-        feed[name] = program.value(name)
-    for name in sources:
-        if sources.count(name) > 1:
-            raise refused(node, "one value is its operand twice")
+def _places(program: Program, node: Node, positions: Sequence[int]) -> list[NDArray[np.int64]]:
+    """Return, for each output, where its elements come from in the sources, counted through from 1; 0 is a zero."""
+    names, feed, begin = [], {}, 1
+    for position, name in enumerate(node.inputs):
+        if not name:
+            names.append("")
+            continue
         array = program.value(name)
-        feed[name] = np.arange(begin, begin + array.size, dtype=np.float64).reshape(array.shape)
-        begin += array.size
+        if position in positions:
+            array = np.arange(begin, begin + array.size, dtype=np.float64).reshape(array.shape)
+            begin += array.size
+        names.append(f"operand_{position}")
+        feed[names[-1]] = array
     outputs = [name for name in node.outputs if name]
-    for name, array in feed.items():
-        kind = helper.np_dtype_to_tensor_dtype(array.dtype)
-        model_inputs.append(helper.make_tensor_value_info(name, kind, array.shape))
-    one = helper.make_node(node.op, node.inputs, node.outputs, **node.attributes)
+    inputs = [
+        helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(array.dtype), array.shape)
+        for name, array in feed.items()
+    ]
+    one = helper.make_node(node.op, names, node.outputs, **node.attributes)
     empty = [onnx.ValueInfoProto(name=name) for name in outputs]
     opset = [helper.make_opsetid("", node.opset)]
-    model = helper.make_model(
-        helper.make_graph([one], "places", model_inputs, empty), opset_imports=opset, ir_version=8
-    )
+    model = helper.make_model(helper.make_graph([one], "places", inputs, empty), opset_imports=opset, ir_version=8)
     with tempfile.TemporaryDirectory(prefix="rlservo-") as folder:
         file = Path(folder) / "places.onnx"
         onnx.save(model, str(file))
@@ -254,9 +257,8 @@ def _places(program: Program, node: Node, sources: Sequence[str]) -> list[NDArra
     return [np.asarray(each).astype(np.int64) for each in found]
 
 
-def _copy(program: Program, source: str, places: NDArray[np.int64], mine: NDArray[np.bool_], result: Ref) -> None:
+def _copy(program: Program, read: Ref | str, places: NDArray[np.int64], mine: NDArray[np.bool_], result: Ref) -> None:
     """Copy one source's numbers to where they belong: in loops where they are a regular block, else by a table."""
-    read = literal(program, source)
     where = np.argwhere(mine)
     corner, shape = where.min(axis=0), where.max(axis=0) - where.min(axis=0) + 1
     block = tuple(slice(c, c + s) for c, s in zip(corner, shape, strict=True))

@@ -40,7 +40,7 @@ class Ref:
 
     @property
     def in_scratch(self) -> bool:
-        """Whether it is a place, which `Program.text` decides."""
+        """Whether it is a place, which `Program.texts` decides."""
         return self.base.startswith("@")
 
 
@@ -70,12 +70,12 @@ class Program:
         self.kernels: set[str] = set()
         self._constants: dict[tuple[str, bytes], tuple[str, NDArray[Any]]] = {}
         self.scratch: dict[str, int] = {}
-        """Elements of scratch memory by C type, known after `text`."""
+        """Elements of scratch memory by C type, known after `texts`."""
         self._refs: dict[str, Ref] = {
             name: Ref(graph.values[name].dtype, expression) for name, expression in inputs.items()
         }
         self._places: list[_Place] = []
-        self._lines: list[str] = []
+        self._sections: list[list[str]] = [[]]
         self._now = 0
 
     def value(self, name: str) -> NDArray[Any]:
@@ -88,7 +88,7 @@ class Program:
     def begin(self, what: str) -> None:
         """Begin the statements of a node, which are called so in a comment."""
         self._now += 1
-        self._lines.append(f"    /* {comment(what)} */")
+        self._sections.append([f"    /* {comment(what)} */"])
 
     def ref(self, name: str) -> Ref:
         """Return where a value lies, in scratch memory up to now at least."""
@@ -125,7 +125,7 @@ class Program:
 
     def emit(self, text: str) -> None:
         """Add statements."""
-        self._lines += [f"    {line}" if line else line for line in text.splitlines()]
+        self._sections[-1] += [f"    {line}" if line else line for line in text.splitlines()]
 
     def loop(
         self, shape: Sequence[int], reads: Sequence[tuple[Ref | str, Sequence[int]]], out: Ref, out_strides: Sequence[int],
@@ -151,8 +151,8 @@ class Program:
         lines.append(f"    {body.format(*names, y=f'y[{_index(strides[-1])}]')}")
         self.emit("{\n" + "\n".join(f"    {line}" for line in lines) + "\n}")
 
-    def text(self) -> str:
-        """Return the statements, with every place decided."""
+    def texts(self) -> list[str]:
+        """Return the statements, with every place decided: those before the first `begin`, then each node's."""
         arenas: dict[str, list[tuple[_Place, int]]] = {}
         offsets: list[int] = []
         for place in self._places:
@@ -176,7 +176,7 @@ class Program:
             member = f"state->scratch.{self._places[number_of].c_type.removesuffix('_t')}s"
             return f"{member} + {offset}" if offset else member
 
-        return re.sub(r"@(\d+)\+(\d+)@", place_text, "\n".join(self._lines))
+        return [re.sub(r"@(\d+)\+(\d+)@", place_text, "\n".join(lines)) for lines in self._sections]
 
     def constants_text(self, prefix: str, least_in_file: int | None) -> tuple[str, NDArray[np.float32] | None]:
         """Return (definitions of the array constants, those that are left to a file of weights instead).

@@ -20,6 +20,7 @@ from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.runtime.input_numbers import rounding_slack
 
 SMALLEST_IN_BIN = 256  # elements of a constant that goes into the file of weights, where there is one
+NODES_TOGETHER = 24
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,9 @@ def write_source(face: Interface, contract: Contract, graph: StaticGraph, *, wei
     for struct, members, refs in (("action", face.action, actions), ("state", face.state, states)):
         for member in members:
             program.emit(f"memcpy({struct}->{member.name}, {refs[member.name]}, sizeof {struct}->{member.name});")
-    statements = program.text()
+    before, *nodes, after = program.texts()
     p, u = face.prefix, face.upper
+    functions, calls = _functions(p, nodes)
     constants, weights = program.constants_text(p, SMALLEST_IN_BIN if weights_in_file else None)
     text = f"""\
 /* Policy '{comment(contract.name)}', version {contract.version}, compiled by rlservo. {p}.h says how to call it. */
@@ -66,8 +68,10 @@ def write_source(face: Interface, contract: Contract, graph: StaticGraph, *, wei
 #endif
 #if defined(__GNUC__)
 #define ALIGNED __attribute__((aligned(64)))
+#define APART __attribute__((noinline))
 #else
 #define ALIGNED
+#define APART
 #endif
 
 const char {p}_bundle[] = {u}_BUNDLE;
@@ -75,16 +79,32 @@ const size_t {p}_state_size = sizeof({p}_state);
 
 {constants}
 
-{_kernels(program.kernels)}{_reset(face, contract)}
+{_kernels(program.kernels)}{functions}{_reset(face, contract)}
 int32_t {p}_act(const {p}_obs *obs, {p}_state *state, {p}_action *action) {{
     int32_t notice = {u}_OK;
     (void)state;
-{statements}
+{before}
+{calls}
+{after}
     return notice;
 }}
 
 {_names(face)}"""
     return Source(text, program.scratch, weights)
+
+
+def _functions(p: str, nodes: list[str]) -> tuple[str, str]:
+    """Return (functions, calls of them) for the nodes of a large graph: a compiler takes long for one large function."""
+    if len(nodes) <= NODES_TOGETHER:
+        return "", "\n".join(nodes)
+    functions, calls = [], []
+    for first in range(0, len(nodes), NODES_TOGETHER):
+        name = f"nodes_{first}"
+        body = "\n".join(nodes[first : first + NODES_TOGETHER])
+        head = f"static APART void {name}(const {p}_obs *obs, {p}_state *state) {{\n    (void)obs;\n    (void)state;"
+        functions.append(f"{head}\n{body}\n}}\n\n")
+        calls.append(f"    {name}(obs, state);")
+    return "".join(functions), "\n".join(calls)
 
 
 def _kernels(wanted: set[str]) -> str:

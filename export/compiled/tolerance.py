@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,14 +19,14 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def allowed_differences(
-    contract: Contract, outputs: Arrays, moved: Arrays | None = None
+    contract: Contract, outputs: Arrays, moved: Sequence[Arrays] = ()
 ) -> dict[str, NDArray[np.float64]]:
     """Return how far each number of an action or next state may be from `outputs`, the graph's own.
 
     A float by the contract's tolerance of its scale: half the range of a bounded action, else the largest number in its
     row. A choice by nothing, unless another one's score ties with its own, or scores are not numbers: then by the
     distance between those choices.
-    `moved` is what the graph computes for observations moved by their last bit: by 8 times what that changes, too.
+    `moved` is what the graph computes for observations moved by their last bit: by 8 times what that changes at most, too.
     """
     rtol, atol = contract.parity.rtol, contract.parity.atol
     leaves = leaf_specs(contract.action_space, "action")
@@ -42,9 +42,9 @@ def allowed_differences(
             low, high = (bound.ravel() for bound in leaf.bounds())
             if np.isfinite(low).all() and np.isfinite(high).all():
                 scale = ((high - low) / 2)[None]
-        limit = rtol * np.maximum(flat, scale) + atol
-        if moved is not None:
-            limit = limit + ROUNDING * _movement(values, moved[name]).max(axis=1, keepdims=True)
+        limit = usual = rtol * np.maximum(flat, scale) + atol
+        for each in moved:
+            limit = np.maximum(limit, usual + ROUNDING * _movement(values, each[name]).max(axis=1, keepdims=True))
         allowed[name] = limit.reshape(values.shape)
     return allowed
 
@@ -55,7 +55,7 @@ def _movement(before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.float64]:
     return np.nan_to_num(movement, nan=0.0, posinf=0.0)
 
 
-def _ties(contract: Contract, name: str, outputs: Arrays, moved: Arrays | None) -> NDArray[np.float64]:
+def _ties(contract: Contract, name: str, outputs: Arrays, moved: Sequence[Arrays]) -> NDArray[np.float64]:
     chosen = outputs[name]
     none = np.zeros(chosen.shape)
     scored = outputs.get(scores_name(outputs))
@@ -69,8 +69,9 @@ def _ties(contract: Contract, name: str, outputs: Arrays, moved: Arrays | None) 
     for column, scores in enumerate(parts):
         measured = np.where(np.isfinite(scores) & (np.abs(scores) < MASKED), np.abs(scores), 0.0)
         width = contract.parity.rtol * np.maximum(measured.max(axis=1), 1.0) + contract.parity.atol
-        if moved is not None and scored is not None:
-            width = width + ROUNDING * _movement(scored, moved[scores_name(outputs)]).max(axis=1)
+        if moved and scored is not None:
+            changes = [_movement(scored, each[scores_name(outputs)]).max(axis=1) for each in moved]
+            width = width + ROUNDING * np.max(changes, axis=0)
         own = index[:, column].astype(np.int64)
         inside = (own >= 0) & (own < scores.shape[1])
         best = scores[rows, np.where(inside, own, 0)]
