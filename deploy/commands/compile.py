@@ -44,7 +44,7 @@ def compile(
         lines.append(f"unproven  {made.about['unproven']}")
     else:
         lines += [
-            f"proven    {proof.golden_vectors} golden vectors and {proof.observations:,} observations beside onnxruntime, "
+            f"proven    {proof.golden_vectors} golden vectors, {proof.observations:,} observations beside onnxruntime, "
             f"largest difference {proof.max_abs:.2g} ({proof.max_rel:.0%} of what is allowed)",
             f"step      {proof.step_us['median']:.1f} µs median, {proof.step_us['p99']:.1f} µs 99%, "
             f"{proof.step_us['longest']:.0f} µs longest here ({proof.compiler}, {' '.join(proof.flags)})",

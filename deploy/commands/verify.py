@@ -169,8 +169,8 @@ def _verify_compiled(
     for a, b in pairs:
         if (a.final_status, a.steps) != (b.final_status, b.steps):
             raise ParityError(
-                f"episode {a.index} (seed {a.seed}) ends otherwise: the bundle '{a.final_status}' after {a.steps} steps, "
-                f"its C '{b.final_status}' after {b.steps}"
+                f"episode {a.index} (seed {a.seed}) ends otherwise: with the bundle '{a.final_status}' after {a.steps}"
+                f" steps, with its C '{b.final_status}' after {b.steps}"
             )
     apart = max(abs(a.episode_return - b.episode_return) for a, b in pairs)
     if not as_json:

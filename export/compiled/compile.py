@@ -1,4 +1,4 @@
-"""`rlservo compile`: a bundle as one C file with header, self-test and build files, proven where there is a compiler."""
+"""Bundle as one C file with header, self-test and build files, proven where there is a compiler: `rlservo compile`."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def _codes(p: str, u: str) -> list[str]:
         "/* Begin an episode: call it once before the first step, and at the start of each further episode. */",
         f"void {p}_reset({p}_state *state);",
         "",
-        "/* Compute the action for an observation. Where the code is refused, neither action nor memory has changed. */",
+        "/* Compute the action for an observation. A refused one changes neither action nor memory. */",
         f"int32_t {p}_act(const {p}_obs *obs, {p}_state *state, {p}_action *action);",
         "",
         "/* The name of the element of a code, or of the array that it is in where it has none of its own. */",

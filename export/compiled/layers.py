@@ -6,7 +6,7 @@ All but products of two computed matrices come down to one kernel, `dense`, whos
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from rlservo.export.compiled.static_graph import Node
 from rlservo.export.contract.errors import UnsupportedError
 
 ACTIVATIONS = {
-    "tanh": "tanh_of({0})", "sigmoid": "sigmoid_of({0})", "relu": "({0} < 0 ? 0 : {0})", "affine": "{0}",
+    "tanh": "tanh_of({0})", "sigmoid": "sigmoid_of({0})", "relu": "({0} < 0 ? 0 : {0})", "affine": "({0})",
 }  # fmt: skip
 
 
@@ -253,9 +253,9 @@ def _recurrent(program: Program, node: Node) -> None:
             program.emit(f"for (int i = 0; i < {hidden}; i++) ({memory})[i] = {value};")
     outputs = [*node.outputs, "", ""][:3]
     y = program.new(outputs[0]) if outputs[0] in program.graph.values else None
-    cell = {"LSTM": _lstm, "GRU": _gru, "RNN": _rnn}[node.op]
+    emit_cell = {"LSTM": _lstm, "GRU": _gru, "RNN": _rnn}[node.op]
     for step in range(steps):
-        cell(program, node, at(sequence, step * width), h, c, w[0], r[0], biases, functions)
+        emit_cell(program, Cell(node, at(sequence, step * width), h, c, w[0], r[0], biases, functions))
         if y is not None:
             program.emit(f"for (int i = 0; i < {hidden}; i++) ({at(y, step * hidden)})[i] = ({h})[i];")
     for name, memory in ((outputs[1], h), (outputs[2], c)):
@@ -264,39 +264,55 @@ def _recurrent(program: Program, node: Node) -> None:
             program.emit(f"for (int i = 0; i < {hidden}; i++) ({last})[i] = ({memory})[i];")
 
 
-Biases = tuple[NDArray[Any] | None, NDArray[Any] | None]
+class Cell(NamedTuple):
+    """One step of a recurrent layer: its input, its memory, and its weights, gate by gate."""
+
+    node: Node
+    x: Ref
+    h: Ref
+    c: Ref
+    """An LSTM's cell state; room for as many numbers elsewhere."""
+    w: NDArray[Any]
+    r: NDArray[Any]
+    biases: tuple[NDArray[Any] | None, NDArray[Any] | None]
+    functions: list[str]
+
+    @property
+    def width(self) -> int:
+        return int(self.r.shape[1])
 
 
-def _gates(program: Program, x: Ref, h: Ref, w: NDArray[Any], r: NDArray[Any], biases: Biases) -> tuple[Ref, Ref]:
+def _gates(program: Program, cell: Cell) -> tuple[Ref, Ref]:
     """Return W x + its bias and R h + its bias."""
     found = []
-    for source, weights, bias in ((x, w, biases[0]), (h, r, biases[1])):
+    for source, weights, bias in ((cell.x, cell.w, cell.biases[0]), (cell.h, cell.r, cell.biases[1])):
         found.append(program.temporary(np.float32, len(weights)))
         dense(program, source, weights.T, bias, found[-1])
     return found[0], found[1]
 
 
-def _lstm(program: Program, node: Node, x: Ref, h: Ref, c: Ref, w: Any, r: Any, biases: Biases, of: list[str]) -> None:
-    n = r.shape[1]
-    a, b = _gates(program, x, h, w, r, biases)
+def _lstm(program: Program, cell: Cell) -> None:
+    n, h, c = cell.width, cell.h, cell.c
+    a, b = _gates(program, cell)
     i, o, f, g = (f"({a})[i + {k * n}] + ({b})[i + {k * n}]" for k in range(4))
-    gate, inner, outer = (ACTIVATIONS[name] for name in of[:3])
+    gate, inner, outer = (ACTIVATIONS[name] for name in cell.functions[:3])
     program.emit(
         f"for (int i = 0; i < {n}; i++) {{\n    ({c})[i] = {gate.format(f)} * ({c})[i] + {gate.format(i)} * "
         f"{inner.format(g)};\n    ({h})[i] = {gate.format(o)} * {outer.format(f'({c})[i]')};\n}}"
     )
 
 
-def _gru(program: Program, node: Node, x: Ref, h: Ref, c: Ref, w: Any, r: Any, biases: Biases, of: list[str]) -> None:
-    n = r.shape[1]
-    gate, inner = (ACTIVATIONS[name] for name in of[:2])
-    a, b = _gates(program, x, h, w, r, biases)
+def _gru(program: Program, cell: Cell) -> None:
+    n, h, c = cell.width, cell.h, cell.c
+    gate, inner = (ACTIVATIONS[name] for name in cell.functions[:2])
+    a, b = _gates(program, cell)
     reset = gate.format(f"({a})[i + {n}] + ({b})[i + {n}]")
-    if node.attributes.get("linear_before_reset"):
+    if cell.node.attributes.get("linear_before_reset"):
         candidate = f"({a})[i + {2 * n}] + {reset} * ({b})[i + {2 * n}]"
     else:  # the reset comes before the product
         program.emit(f"for (int i = 0; i < {n}; i++) ({c})[i] = {reset} * ({h})[i];")
-        dense(program, c, r[2 * n :].T, None if biases[1] is None else biases[1][2 * n :], at(b, 2 * n))
+        bias = None if cell.biases[1] is None else cell.biases[1][2 * n :]
+        dense(program, c, cell.r[2 * n :].T, bias, at(b, 2 * n))
         candidate = f"({a})[i + {2 * n}] + ({b})[i + {2 * n}]"
     program.emit(
         f"for (int i = 0; i < {n}; i++) {{\n    const float z = {gate.format(f'({a})[i] + ({b})[i]')};\n"
@@ -304,10 +320,10 @@ def _gru(program: Program, node: Node, x: Ref, h: Ref, c: Ref, w: Any, r: Any, b
     )
 
 
-def _rnn(program: Program, node: Node, x: Ref, h: Ref, c: Ref, w: Any, r: Any, biases: Biases, of: list[str]) -> None:
-    a, b = _gates(program, x, h, w, r, biases)
-    value = ACTIVATIONS[of[0]].format(f"(({a})[i] + ({b})[i])")
-    program.emit(f"for (int i = 0; i < {r.shape[1]}; i++) ({h})[i] = {value};")
+def _rnn(program: Program, cell: Cell) -> None:
+    a, b = _gates(program, cell)
+    value = ACTIVATIONS[cell.functions[0]].format(f"(({a})[i] + ({b})[i])")
+    program.emit(f"for (int i = 0; i < {cell.width}; i++) ({cell.h})[i] = {value};")
 
 
 LAYERS: dict[str, Callable[[Program, Node], None]] = {

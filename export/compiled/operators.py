@@ -9,7 +9,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -29,7 +28,6 @@ from rlservo.export.compiled.program import (
     row_major,
 )
 from rlservo.export.compiled.static_graph import Node
-from rlservo.export.contract.errors import UnsupportedError
 from rlservo.export.contract.ort_session import open_ort_session
 
 # {0}, {1}, ...: operands; {f}: the suffix of libm's functions; {T}: the type of the result. Of floats.
@@ -58,9 +56,10 @@ ELEMENTWISE: dict[str, str] = {
 # Of integers, where they differ. Sums wrap around as onnxruntime's do; dividing by zero gives zero.
 INTEGER: dict[str, str] = {
     "Add": "(uint64_t){0} + (uint64_t){1}", "Sub": "(uint64_t){0} - (uint64_t){1}",
-    "Mul": "(uint64_t){0} * (uint64_t){1}", "Neg": "0 - (uint64_t){0}", "Abs": "{0} < 0 ? 0 - (uint64_t){0} : (uint64_t){0}",
-    "Div": "{1} == 0 ? 0 : {0} / {1}", "Pow": "pow((double){0}, (double){1})",
-    "Mod": "{1} == 0 ? 0 : ({0} % {1} != 0 && ({0} < 0) != ({1} < 0)) ? {0} % {1} + {1} : {0} % {1}",
+    "Mul": "(uint64_t){0} * (uint64_t){1}", "Neg": "0 - (uint64_t){0}",
+    "Abs": "{0} < 0 ? 0 - (uint64_t){0} : (uint64_t){0}",
+    "Div": "{1} == 0 ? 0 : {1} == -1 ? 0 - (uint64_t){0} : (uint64_t)({0} / {1})", "Pow": "pow((double){0}, (double){1})",
+    "Mod": "{1} == 0 || {1} == -1 ? 0 : ({0} % {1} != 0 && ({0} < 0) != ({1} < 0)) ? {0} % {1} + {1} : {0} % {1}",
     "Sign": "({0} > 0) - ({0} < 0)", "Max": "{0} < {1} ? {1} : {0}", "Min": "{0} > {1} ? {1} : {0}",
 }  # fmt: skip
 DEFAULTS = {
@@ -115,8 +114,10 @@ def _elementwise(program: Program, node: Node, template: str | None = None) -> N
     if template is None:
         is_float = operand.dtype.kind == "f"
         template = ELEMENTWISE.get(node.op, "") if is_float else INTEGER.get(node.op, ELEMENTWISE.get(node.op, ""))
-        if node.op == "Mod" and (is_float or operand.dtype.kind != "i" or node.attributes.get("fmod")):
-            template = "fmod{f}({0}, {1})" if is_float else "{1} == 0 ? 0 : {0} % {1}"
+        if operand.dtype.kind == "u" and node.op in ("Div", "Mod"):
+            template = f"{{1}} == 0 ? 0 : {{0}} {'/' if node.op == 'Div' else '%'} {{1}}"
+        elif node.op == "Mod" and node.attributes.get("fmod"):
+            template = "fmod{f}({0}, {1})" if is_float else "{1} == 0 || {1} == -1 ? 0 : {0} % {1}"
         if not template or (not is_float and "{f}" in template):
             raise refused(node, f"of {operand.dtype.name} values")
     settings = {**DEFAULTS.get(node.op, {}), **{k: v for k, v in node.attributes.items() if isinstance(v, float)}}
@@ -316,7 +317,8 @@ def _one_hot(program: Program, node: Node) -> None:
     index, result = program.ref(node.inputs[0]), program.new(node.outputs[0])
     rows = program.value(node.inputs[0]).size
     program.emit(
-        f"for (int i = 0; i < {rows}; i++)\n    for (int j = 0; j < {depth}; j++)\n        ({result})[{depth} * i + j] = "
+        f"for (int i = 0; i < {rows}; i++)\n    for (int j = 0; j < {depth}; j++)\n"
+        f"        ({result})[{depth} * i + j] = "
         f"({index})[i] == j || ({index})[i] + {depth} == j ? {number(on)} : {number(off)};"
     )
 
@@ -410,7 +412,8 @@ def _arg(program: Program, node: Node) -> None:
     beyond = {"ArgMax": (">", ">="), "ArgMin": ("<", "<=")}[node.op][int(node.attributes.get("select_last_index", 0))]
     result = program.new(node.outputs[0])
     program.emit(
-        f"{{\n    int o = 0;\n    {outer}{{\n        int64_t best = 0;\n        {source.c_type} a = ({source})[{kept}];\n"
+        f"{{\n    int o = 0;\n    {outer}{{\n        int64_t best = 0;\n"
+        f"        {source.c_type} a = ({source})[{kept}];\n"
         f"        for (int k = 1; k < {count}; k++) {{\n"
         f"            const {source.c_type} x = ({source})[{kept} + {stride} * k];\n"
         f"            if (x {beyond} a) {{\n                a = x;\n                best = k;\n            }}\n"
@@ -426,7 +429,8 @@ def _cumulative_sum(program: Program, node: Node) -> None:
     outer, inner, (kept, reduced) = _split_axes(program, node.inputs[0], [axis])
     place = f"[{kept} + {reduced}]"
     program.emit(
-        f"{outer}{{\n    {source.c_type} sum = 0;\n    {inner}{{\n        sum = ({source.c_type})(sum + ({source}){place});\n"
+        f"{outer}{{\n    {source.c_type} sum = 0;\n    {inner}{{\n"
+        f"        sum = ({source.c_type})(sum + ({source}){place});\n"
         f"        ({result}){place} = sum;\n    }}\n}}"
     )
 
@@ -440,7 +444,7 @@ def _top_k(program: Program, node: Node) -> None:
         raise refused(node, "not along the last axis, or of a computed number")
     k, count = int(program.value(node.inputs[1]).ravel()[0]), shape[-1]
     better = ">" if node.attributes.get("largest", 1) else "<"
-    named = [name for name in (*node.outputs, "")][:2]
+    named = [*node.outputs, ""][:2]
     values = program.new(named[0]) if named[0] in program.graph.values else program.temporary(source.dtype, k)
     places = program.new(named[1]) if named[1] in program.graph.values else program.temporary(np.int64, k * _rows(
         shape))  # fmt: skip

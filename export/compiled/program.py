@@ -128,8 +128,8 @@ class Program:
         self._sections[-1] += [f"    {line}" if line else line for line in text.splitlines()]
 
     def loop(
-        self, shape: Sequence[int], reads: Sequence[tuple[Ref | str, Sequence[int]]], out: Ref, out_strides: Sequence[int],
-        body: str,
+        self, shape: Sequence[int], reads: Sequence[tuple[Ref | str, Sequence[int]]], out: Ref,
+        out_strides: Sequence[int], body: str,
     ) -> None:  # fmt: skip
         """Emit loops over `shape`; in `body`, {y} is the written element and {0}, {1}, ... the read ones.
 

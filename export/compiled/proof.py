@@ -234,8 +234,8 @@ def _fail(
     if (here != there).any():
         row = int(np.flatnonzero(here != there)[0])
         raise ParityError(
-            f"observation {step * ROWS + row}: the compiled policy {'refuses' if here[row] else 'gives'} an action that "
-            f"onnxruntime {'gives' if here[row] else 'may not give'}"
+            f"observation {step * ROWS + row}: the compiled policy {'refuses' if here[row] else 'gives'} an action "
+            f"that onnxruntime {'gives' if here[row] else 'may not give'}"
         )
     name = max(worst, key=lambda each: worst[each])
     row = int(np.where(both, shares[name], -1.0).argmax())
@@ -243,6 +243,6 @@ def _fail(
     with np.errstate(invalid="ignore", divide="ignore"):
         element = int(np.nan_to_num(np.abs(a - b) / limit).argmax())
     raise ParityError(
-        f"observation {step * ROWS + row}: output '{name}', element {element}: the compiled policy gives {a[element]:.9g}, "
-        f"onnxruntime {b[element]:.9g} (allowed difference {limit[element]:.2g})"
+        f"observation {step * ROWS + row}: output '{name}', element {element}: the compiled policy gives "
+        f"{a[element]:.9g}, onnxruntime {b[element]:.9g} (allowed difference {limit[element]:.2g})"
     )

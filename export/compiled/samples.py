@@ -1,4 +1,4 @@
-"""Observations beyond the golden vectors: usual ones, corners of the space, far outside of it, zeros and tiny numbers."""
+"""Observations beyond the golden vectors: usual ones, corners of the space, far outside, zeros and tiny numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROWS = 100  # episodes side by side
 def sample_inputs(
     contract: Contract, golden: Mapping[str, NDArray[Any]], steps: int
 ) -> Iterator[dict[str, NDArray[Any]]]:
-    """Yield `steps` times ROWS observations (and rewards) by tensor name; always the same ones for the same contract."""
+    """Yield `steps` times ROWS observations (and rewards) by tensor name; of one contract always the same."""
     rng = np.random.default_rng(0)
     leaves: dict[str, LeafSpec] = leaf_specs(contract.observation_space, "obs")
     if any(tensor.name == REWARD for tensor in contract.inputs):

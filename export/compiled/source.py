@@ -94,7 +94,7 @@ int32_t {p}_act(const {p}_obs *obs, {p}_state *state, {p}_action *action) {{
 
 
 def _functions(p: str, nodes: list[str]) -> tuple[str, str]:
-    """Return (functions, calls of them) for the nodes of a large graph: a compiler takes long for one large function."""
+    """Return (functions, calls of them) for the nodes of a large graph: one large function takes long to compile."""
     if len(nodes) <= NODES_TOGETHER:
         return "", "\n".join(nodes)
     functions, calls = [], []
@@ -126,7 +126,7 @@ def _check_observation(program: Program, face: Interface, member: Member) -> Non
     if member.leaf is None:
         return
     slack = rounding_slack(*member.leaf.bounds(), member.dtype)
-    tests = _outside(program, member, bounds_of(member, slack), x)
+    tests = _outside(program, bounds_of(member, slack), x)
     if tests and isinstance(member.leaf, BoxSpec) and member.dtype != np.bool_:
         keep = f"{{\n    notice = ({u}_OUT_OF_BOUNDS << 24) | ({member.first} + i);\n    break;\n}}"
         program.emit(f"for (int i = 0; notice == {u}_OK && i < {member.size}; i++)\n    if ({tests}) {keep}")
@@ -148,7 +148,7 @@ def _check_action(program: Program, face: Interface, member: Member, action: Ref
     if member.dtype.kind == "f":  # the largest number stands for unbounded, as in the runtime
         largest_number = float(np.finfo(member.dtype).max)
         low, high = np.maximum(low, -largest_number), np.minimum(high, largest_number)
-    tests = _outside(program, member, bounds_of(member, rounding_slack(low, high, member.dtype)), x)
+    tests = _outside(program, bounds_of(member, rounding_slack(low, high, member.dtype)), x)
     if tests:
         program.emit(f"{loop}\n    if ({tests}) return ({u}_ACTION_OUT_OF_SPACE << 24) | {where};")
     if tests and member.dtype.kind == "f":
@@ -158,7 +158,7 @@ def _check_action(program: Program, face: Interface, member: Member, action: Ref
                 program.emit(f"{loop}\n    if ({x} {sign} {bound}) {x} = {bound};")
 
 
-def _outside(program: Program, member: Member, bounds: tuple[NDArray[np.generic], ...], x: str) -> str:
+def _outside(program: Program, bounds: tuple[NDArray[np.generic], ...], x: str) -> str:
     """Return the test for a number outside its bounds, '' where its type has no such numbers."""
     texts = zip("<>", _bound_texts(program, bounds), strict=True)
     return " || ".join(f"{x} {sign} {bound}" for sign, bound in texts if bound)
@@ -227,5 +227,5 @@ def _names(face: Interface) -> str:
                 tests.append(f"{test} return {string(member.tensor)};")
     body = [f"const char *{face.prefix}_element(int32_t code) {{",
             f"    const int32_t element = {face.upper}_ELEMENT(code);",
-            f'    if (code <= 0) return "";', *tests, '    return "";', "}", ""]  # fmt: skip
+            '    if (code <= 0) return "";', *tests, '    return "";', "}", ""]  # fmt: skip
     return "\n".join([*lines, *body])

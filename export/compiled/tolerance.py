@@ -26,7 +26,7 @@ def allowed_differences(
     A float by the contract's tolerance of its scale: half the range of a bounded action, else the largest number in its
     row. A choice by nothing, unless another one's score ties with its own, or scores are not numbers: then by the
     distance between those choices.
-    `moved` is what the graph computes for observations moved by their last bit: by 8 times what that changes at most, too.
+    `moved` is what the graph computes for observations moved by their last bit: also by 8 times what that changes.
     """
     rtol, atol = contract.parity.rtol, contract.parity.atol
     leaves = leaf_specs(contract.action_space, "action")

@@ -22,8 +22,8 @@ from rlservo.export.contract.nested import build_action
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.policy_format import PolicyFormat, element_differences
 from rlservo.serve_app.recording.reader import Recording
-from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.compiled_policy import open_policy
+from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.runtime.recurrent_state import State
 

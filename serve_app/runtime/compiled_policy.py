@@ -1,6 +1,6 @@
 """Policy that `rlservo compile` turned into C, in this process: the same `act`, without onnxruntime.
 
-Its folder has the shared library that was proven on this machine. A library is a program: only load folders of your own.
+Its folder has the shared library that was proven on this machine. A library is a program: load only your own.
 """
 
 from __future__ import annotations

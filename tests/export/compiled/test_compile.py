@@ -88,7 +88,7 @@ def test_what_a_user_changed_is_not_overwritten(ur5: Path, tmp_path: Path, no_co
     compile_bundle(ur5, out)  # its own files are replaced
     assert (out / "notes.txt").read_text() == "mine"
     (out / "CMakeLists.txt").write_text("mine")
-    with pytest.raises(UsageError, match="CMakeLists.txt is not what `rlservo compile` wrote"):
+    with pytest.raises(UsageError, match=r"CMakeLists\.txt is not what `rlservo compile` wrote"):
         compile_bundle(ur5, out)
     assert (out / "CMakeLists.txt").read_text() == "mine"
 
@@ -149,7 +149,7 @@ def test_policies_of_every_kind_act_as_in_onnxruntime(
     made = compile_bundle(bundle, tmp_path / "c")
     assert made.proof is not None and made.proof.max_rel < 1
     with Policy.load(bundle) as policy, CompiledPolicy(made.folder) as compiled:
-        inputs = {name: array for name, array in policy_inputs(policy).items()}
+        inputs = dict(policy_inputs(policy).items())
         state = other = None
         for row in range(20):
             obs = {key: array[row] for key, array in inputs.items()}

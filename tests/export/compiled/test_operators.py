@@ -52,7 +52,8 @@ CASES: list[tuple[str, list[Any], dict[str, Any]]] = [
     ("IsNaN", [X], {}), ("IsInf", [X], {}), ("Cast", ["bytes"], {"to": INT32}), ("Cast", ["is_high"], {"to": DOUBLE}),
     *((name, [COUNTS, ints(3)], {}) for name in ("Add", "Sub", "Mul", "Div", "Mod", "Max", "Min", "Equal", "Less")),
     ("Mod", [COUNTS, ints(-3)], {"fmod": 1}), ("Abs", [COUNTS], {}), ("Neg", [COUNTS], {}), ("Sign", [COUNTS], {}),
-    ("Transpose", [PLANE], {"perm": [0, 3, 1, 2]}), ("Slice", [PLANE, ints(4, 0), ints(0, 6), ints(2, 3), ints(-2, 3)], {}),
+    ("Transpose", [PLANE], {"perm": [0, 3, 1, 2]}),
+    ("Slice", [PLANE, ints(4, 0), ints(0, 6), ints(2, 3), ints(-2, 3)], {}),
     ("Gather", [TABLE, ints(3, 0, 3, -1)], {"axis": 1}), ("Concat", [X, "small", X], {"axis": 1}),
     ("Pad", [PLANE, ints(0, 0, 1, 2, 0, 0, 0, 1), np.float32(0.7)], {}),
     ("Pad", [PLANE, ints(0, 0, 1, 1, 0, 0, 1, 1)], {"mode": "reflect"}), ("Tile", [TABLE, ints(1, 1, 2)], {}),
@@ -81,8 +82,10 @@ CASES: list[tuple[str, list[Any], dict[str, Any]]] = [
     ("GlobalMaxPool", [PLANE], {}),
 ]  # fmt: skip
 RECURRENT: list[tuple[str, list[Any], dict[str, Any]]] = [
-    ("LSTM", ["steps", some(1, 12, 6), some(1, 12, 3), some(1, 24)], {}), ("LSTM", ["steps", some(1, 12, 6), some(1, 12, 3)], {}),
-    ("GRU", ["steps", some(1, 9, 6), some(1, 9, 3), some(1, 18)], {}), ("RNN", ["steps", some(1, 3, 6), some(1, 3, 3)], {}),
+    ("LSTM", ["steps", some(1, 12, 6), some(1, 12, 3), some(1, 24)], {}),
+    ("LSTM", ["steps", some(1, 12, 6), some(1, 12, 3)], {}),
+    ("GRU", ["steps", some(1, 9, 6), some(1, 9, 3), some(1, 18)], {}),
+    ("RNN", ["steps", some(1, 3, 6), some(1, 3, 3)], {}),
     ("GRU", ["steps", some(1, 9, 6), some(1, 9, 3), some(1, 18)], {"linear_before_reset": 1}),
 ]  # fmt: skip
 PREPARED: list[tuple[str, str, list[Any], dict[str, Any]]] = [

@@ -95,7 +95,8 @@ def test_header_and_build_files_serve_a_cpp_program(compiled_ur5: Compiled, tmp_
     (program / "main.cpp").write_text(
         '#include <cstdio>\n#include "ur5.h"\nint main() {\n'
         "    static ur5_obs obs;\n    static ur5_state state;\n    static ur5_action action;\n"
-        "    ur5_reset(&state);\n    obs.values[UR5_OBS_ELEMENT_3] = 1.0e30F;\n    obs.values[UR5_OBS_ELEMENT_3] *= 1.0e30F;\n"
+        "    ur5_reset(&state);\n    obs.values[UR5_OBS_ELEMENT_3] = 1.0e30F;\n"
+        "    obs.values[UR5_OBS_ELEMENT_3] *= 1.0e30F;\n"
         "    const auto code = ur5_act(&obs, &state, &action);\n"
         '    std::printf("%d %s\\n", static_cast<int>(UR5_KIND(code)), ur5_element(code));\n'
         "    return code == ((UR5_NOT_FINITE << 24) | UR5_OBS_ELEMENT_3) ? 0 : 1;\n}\n"

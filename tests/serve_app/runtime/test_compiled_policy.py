@@ -109,5 +109,5 @@ def test_a_folder_without_a_library_says_why(leaky: tuple[Path, Compiled], tmp_p
     (copy / "compile.json").write_text(json.dumps({**about, "library": None, "unproven": "no C compiler was found"}))
     with pytest.raises(BundleError, match=r"has no library: it was written without a compiler \(no C compiler"):
         CompiledPolicy(copy)
-    with pytest.raises(BundleError, match="holds no compiled policy: expected compile.json"):
+    with pytest.raises(BundleError, match=r"holds no compiled policy: expected compile\.json"):
         CompiledPolicy(tmp_path)

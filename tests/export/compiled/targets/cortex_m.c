@@ -14,4 +14,7 @@ static void reset(void) {
     exit(main());
 }
 
-__attribute__((section(".vectors"), used)) static const void *const vectors[] = {stack_top, (const void *)reset};
+__attribute__((section(".vectors"), used)) static const struct {
+    uint32_t *stack;
+    void (*reset)(void);
+} vectors = {stack_top, reset};
