@@ -16,6 +16,7 @@ import typer
 import rlservo
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.cockpit import cockpit
+from rlservo.deploy.commands.compile import compile
 from rlservo.deploy.commands.demo import demo
 from rlservo.deploy.commands.export import export, prune
 from rlservo.deploy.commands.inspect import inspect
@@ -74,6 +75,7 @@ for command in (
     prune,
     inspect,
     verify,
+    compile,
     publish,
     serve,
     key,

@@ -25,6 +25,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "serve_app/interface.py": {"export/contract"},
     "serve_app/wire": {"export/contract"},
     "serve_app/runtime": {"export/contract", "serve_app/interface.py", "serve_app/wire"},
+    "export/compiled": {"export/contract", "serve_app/runtime"},
     "serve_app/recording": {"export/contract", "serve_app/interface.py"},
     "serve_app/replay": {"export/contract", "serve_app/recording", "serve_app/runtime"},
     "serve_app/client": {"export/contract", "serve_app/interface.py", "serve_app/recording", "serve_app/wire"},

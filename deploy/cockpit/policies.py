@@ -12,7 +12,7 @@ from rlservo.serve_app.client.http_transport import Transport
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.interface import ActingPolicy, Closeable
 from rlservo.serve_app.rollout.fallback import WithFallback
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.runtime.compiled_policy import open_policy
 
 TIMEOUT_S = 2.0  # of a look at what the server has
 WAIT = "wait"  # instead of a fallback: time stands still until the server answers
@@ -115,7 +115,7 @@ class BundledPolicies(PolicySource):
         if choice not in self._folders:
             there = ", ".join(f"{each.name}/{each.version}" for each in self._folders)
             raise UnknownPolicyError(f"there is no bundle {choice.name}/{choice.version}: expected one of {there}")
-        return Policy.load(self._folders[choice])
+        return open_policy(self._folders[choice])
 
     def close(self) -> None:
         """Nothing is open."""

@@ -117,9 +117,9 @@ def _acting_policy(
 ) -> ActingPolicy:
     """Return the policy to drive with; in process it needs no HTTP client."""
     if bundle is not None:
-        from rlservo.serve_app.runtime.policy import Policy
+        from rlservo.serve_app.runtime.compiled_policy import open_policy
 
-        return Policy.load(bundle)
+        return open_policy(bundle)
     with needs_extra("client"):
         from rlservo.serve_app.client.policy_client import PolicyClient
         from rlservo.serve_app.client.stream_client import StreamClient

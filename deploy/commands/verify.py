@@ -16,7 +16,7 @@ from rlservo.deploy import terminal
 from rlservo.deploy.commands.environment_options import parse_env_arguments
 from rlservo.deploy.terminal import Json, note, print_json
 from rlservo.export.contract.environment_id import plain_id
-from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.errors import ParityError, UsageError
 from rlservo.export.contract.extras import needs_extra
 
 if TYPE_CHECKING:
@@ -50,9 +50,17 @@ def verify(
     seed: Annotated[int, typer.Option(help="Seed of the first episode.")] = 0,
     env_arg: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="With --disturb, environment constructor argument (JSON value)."),
+        typer.Option(
+            metavar="NAME=VALUE", help="With --disturb or --compiled, environment constructor argument (JSON)."
+        ),
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="With --disturb, draw the table into this file.")] = None,
+    compiled: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of `rlservo compile`: drive --env with it too, on the same seeds, to the same endings."
+        ),
+    ] = None,
     write: Annotated[
         bool, typer.Option("--write", help="With --disturb, write the rows into the contract as evaluations.")
     ] = False,
@@ -65,14 +73,19 @@ def verify(
     under each disturbance, over the same seeds.
 
     Examples: `rlservo verify policies/ur5 --checkpoint runs/best --env rlservo/EndEffectorPositioningURSim-v0`,
-    `rlservo verify policies/ur5 --env rlservo/EndEffectorPositioningURSim-v0 --disturb`
+    `rlservo verify policies/ur5 --env rlservo/EndEffectorPositioningURSim-v0 --disturb`,
+    `rlservo verify policies/ur5 --compiled build --env rlservo/EndEffectorPositioningURSim-v0`
     """
-    if not disturb and (disturbances or plot or write or env_arg):
-        raise UsageError("disturbances, --plot, --write and --env-arg go with --disturb")
+    if not disturb and (disturbances or plot or write):
+        raise UsageError("disturbances, --plot and --write go with --disturb")
+    if env_arg and not disturb and compiled is None:
+        raise UsageError("--env-arg goes with --disturb and --compiled")
     env = env and plain_id(env)
-    if checkpoint is None and not disturb:
-        raise UsageError("give --checkpoint to compare the bundle with, or --disturb with --env, or both")
+    if checkpoint is None and not disturb and compiled is None:
+        raise UsageError("give --checkpoint to compare the bundle with, or --env with --disturb or --compiled")
     document: dict[str, Any] = {}
+    if compiled is not None:
+        document |= _verify_compiled(compiled, bundle, env, episodes or 20, seed, env_arg or [], as_json)
     if checkpoint is not None:
         document |= _verify_against(checkpoint, bundle, env, episodes or 20, seed, app_dir, as_json)
     if disturb:
@@ -128,6 +141,47 @@ def _verify_against(
         "evaluation": result.evaluation.model_dump(mode="json") if result.evaluation else None,
         "same_checkpoint": result.same_checkpoint,
     }
+
+
+def _verify_compiled(
+    compiled: Path, bundle: Path, env_id: str | None, episodes: int, seed: int, env_arg: list[str], as_json: bool
+) -> dict[str, Any]:
+    """Drive the environment with the bundle and with its C. Raises ParityError where an episode ends otherwise."""
+    if env_id is None:
+        raise UsageError("--compiled needs --env: the environment to drive")
+    with needs_extra("sim", "gymnasium"):
+        from rlservo.envs.randomization import wrapped_env
+        from rlservo.serve_app.rollout.control_loop import rollout
+        from rlservo.serve_app.runtime.compiled_policy import CompiledPolicy
+        from rlservo.serve_app.runtime.policy import Policy
+
+    with Policy.load(bundle) as ours, CompiledPolicy(compiled) as theirs, terminal.status("driving both") as show:
+        if ours.digest != theirs.digest:
+            raise UsageError(f"{compiled} was compiled from another bundle than {ours.path}")
+        trained = ours.contract.provenance
+        arguments = {**wrapped_env(trained.env_id or "", trained.env_config)[1], **parse_env_arguments(env_arg)}
+        reports = []
+        for policy, name in ((ours, "the bundle"), (theirs, "its C")):
+            show(f"driving {env_id} with {name}")
+            report = rollout(policy, env_id, episodes=episodes, seed=seed, env_kwargs=arguments)
+            if report.interrupted:  # half a comparison is none
+                raise KeyboardInterrupt
+            reports.append(report)
+    pairs = list(zip(reports[0].episodes, reports[1].episodes, strict=True))
+    for a, b in pairs:
+        if (a.final_status, a.steps) != (b.final_status, b.steps):
+            raise ParityError(
+                f"episode {a.index} (seed {a.seed}) ends otherwise: with the bundle '{a.final_status}' after {a.steps}"
+                f" steps, with its C '{b.final_status}' after {b.steps}"
+            )
+    apart = max(abs(a.episode_return - b.episode_return) for a, b in pairs)
+    if not as_json:
+        endings = ", ".join(f"{name}: {count}" for name, count in reports[0].final_status.items())
+        terminal.output().print(
+            f"compiled  {episodes} episodes of {env_id} end alike ({endings}); returns differ by at most {apart:.2g}",
+            markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
+    return {"compiled": {"episodes": episodes, "endings": reports[0].final_status, "max_return_difference": apart}}
 
 
 def _measure(

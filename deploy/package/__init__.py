@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rlservo.serve_app.recording.recorder import Recorder
     from rlservo.serve_app.rollout.control_loop import rollout
     from rlservo.serve_app.rollout.fallback import WithFallback
+    from rlservo.serve_app.runtime.compiled_policy import CompiledPolicy
     from rlservo.serve_app.runtime.policy import Policy
 
     __version__: str
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ActingPolicy",
     "AdminClient",
+    "CompiledPolicy",
     "Policy",
     "PolicyClient",
     "Recorder",
@@ -49,6 +51,7 @@ __all__ = [
 _MODULES = {
     "ActingPolicy": "rlservo.serve_app.interface",
     "AdminClient": "rlservo.serve_app.client.admin_client",
+    "CompiledPolicy": "rlservo.serve_app.runtime.compiled_policy",
     "Policy": "rlservo.serve_app.runtime.policy",
     "PolicyClient": "rlservo.serve_app.client.policy_client",
     "StreamClient": "rlservo.serve_app.client.stream_client",

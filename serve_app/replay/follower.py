@@ -22,6 +22,7 @@ from rlservo.export.contract.nested import build_action
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.policy_format import PolicyFormat, element_differences
 from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.runtime.compiled_policy import open_policy
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.runtime.recurrent_state import State
@@ -54,7 +55,7 @@ class Follower:
     def __init__(self, bundle: str | Path) -> None:
         """Load and prove the bundle."""
         self._bundle = bundle
-        self.policy = Policy.load(bundle)
+        self.policy = open_policy(bundle)
         self._loaded: dict[str, Policy] = {"{}": self.policy}
         self._checked: set[int] = set()
         self._carried: dict[tuple[int, str], tuple[State | None, dict[str, NDArray[Any]] | None]] = {}
@@ -139,7 +140,7 @@ class Follower:
             options = PolicyOptions()
         key = options.model_dump_json(exclude_defaults=True)
         if key not in self._loaded:
-            self._loaded[key] = Policy.load(self._bundle, check_golden=False, options=options)
+            self._loaded[key] = open_policy(self._bundle, check_golden=False, options=options)
         return self._loaded[key]
 
     def _check(self, recorded: PolicyFormat) -> None:

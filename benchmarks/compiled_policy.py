@@ -1,0 +1,128 @@
+"""Measure a step of a compiled policy beside onnxruntime and TorchScript in this process.
+
+    python benchmarks/compiled_policy.py [--rounds 7] [--cc gcc]
+
+The shipped UR5 policy (27-256-256-5) and the LSTM of the MiR100 are exported and compiled. The self-test, built with
+-DMEASURE, times 20,000 steps; onnxruntime's session and TorchScript get as long, one after the other in each round. A
+round's figure is a step's median, and the smallest of the rounds counts: other programs only add to it. Written to
+bench/compiled_policy.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from rlservo.export.compiled.compile import Compiled, compile_bundle
+from rlservo.export.compiled.proof import FLAGS, find_compiler
+from rlservo.export.contract.bundle import Bundle, load_bundle
+from rlservo.serve_app.runtime.compiled_policy import CompiledPolicy
+from rlservo.serve_app.runtime.policy import Policy
+
+ROOT = Path(__file__).resolve().parent.parent
+CHECKPOINTS = ("ur5_positioning", "mir100_sparse_fixes")
+STEPS = 2000
+MOST_US = 6.0  # issue 43's target, for the first
+
+
+def median_us(step: Callable[[], Any]) -> float:
+    """Return the median time of a call."""
+    taken = []
+    for _ in range(STEPS):
+        began = time.perf_counter_ns()
+        step()
+        taken.append(time.perf_counter_ns() - began)
+    return float(np.median(taken)) / 1e3
+
+
+def sides(bundle: Bundle, made: Compiled, compiler: str, folder: Path) -> dict[str, Callable[[], float]]:
+    """Return, by name, what gives the median of a step [µs]."""
+    prefix = str(made.about["prefix"])
+    program = folder / f"{prefix}_measured"
+    sources = [made.folder / f"{prefix}_test.c", made.folder / f"{prefix}.c"]
+    command = [compiler, *FLAGS, "-march=native", "-DMEASURE", *sources, "-o", program, "-lm"]
+    subprocess.run([*map(str, command)], check=True)
+
+    def measured() -> float:
+        said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
+        return float(re.findall(r"nanoseconds: (\d+)", said)[0]) / 1e3
+
+    inputs, _ = bundle.golden()
+    feed = {tensor.name: inputs[tensor.name][:1] for tensor in bundle.contract.inputs}
+    policy, compiled = Policy.load(bundle.path), CompiledPolicy(made.folder)
+    ort_run = policy.network()
+    script = torch.jit.load(str(bundle.torchscript))
+    tensors = [torch.from_numpy(array) for array in feed.values()]
+    obs = feed["obs"][0]
+
+    def torch_step() -> None:
+        with torch.inference_mode():
+            script(*tensors)
+
+    return {
+        "C": measured,
+        "onnxruntime, in process": lambda: median_us(lambda: ort_run(feed)),
+        "TorchScript, in process": lambda: median_us(torch_step),
+        "CompiledPolicy.act (Python)": lambda: median_us(lambda: compiled.act(obs)),
+        "Policy.act (Python)": lambda: median_us(lambda: policy.act(obs)),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--cc", help="C compiler; the machine's own by default")
+    options = parser.parse_args()
+    compiler = find_compiler(options.cc)
+    if compiler is None:
+        sys.exit("there is no C compiler")
+    torch.set_num_threads(1)
+    document: dict[str, Any] = {"compiler": compiler}
+    table = Table("a step [µs]", *CHECKPOINTS)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for checkpoint in CHECKPOINTS:
+            source = ROOT / "examples" / "checkpoints" / checkpoint
+            command = [
+                sys.executable,
+                "-m",
+                "rlservo.deploy.cli",
+                "export",
+                source,
+                "--out",
+                folder,
+                "--name",
+                checkpoint,
+            ]
+            subprocess.run([*map(str, command)], check=True, stdout=subprocess.DEVNULL)
+            bundle = load_bundle(folder / checkpoint)
+            made = compile_bundle(bundle.path, folder / f"{checkpoint}-c", compiler=compiler)
+            measured = sides(bundle, made, compiler, folder)
+            rounds = [{side: measure() for side, measure in measured.items()} for _ in range(options.rounds)]
+            document[checkpoint] = {side: min(each[side] for each in rounds) for side in measured}
+            document[checkpoint]["library_bytes"] = made.about["proof"]["code_bytes"]
+        for side in measured:
+            table.add_row(side, *(f"{document[checkpoint][side]:.1f}" for checkpoint in CHECKPOINTS))
+    Console().print(table)
+    out = ROOT / "bench"
+    out.mkdir(exist_ok=True)
+    (out / "compiled_policy.json").write_text(json.dumps(document, indent=2) + "\n")
+    if document[CHECKPOINTS[0]]["C"] > MOST_US:
+        print(f"the UR5's step took more than {MOST_US} µs")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""The command `rlservo compile`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.terminal import Json, print_json
+from rlservo.export.contract.extras import needs_extra
+
+
+def compile(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
+    out: Annotated[Path, typer.Option(help="Folder for the C; an earlier one of the same policy is replaced.")],
+    cc: Annotated[
+        str | None, typer.Option(help="C compiler for the proof; $CC or the machine's own by default.")
+    ] = None,
+    embed_weights: Annotated[
+        Literal["c", "bin"], typer.Option(help="Weights in the C file, or in a binary file beside it (large networks).")
+    ] = "c",
+    as_json: Json = False,
+) -> None:
+    """Turn a bundle into one C99 file without dependencies. It is compiled and proven equal to onnxruntime.
+
+    A difference is an error, and nothing is written. Without a C compiler the files are written and called unproven;
+    the self-test beside them proves them where there is one.
+
+    Example: `rlservo compile policies/ur5 --out build`
+    """
+    with needs_extra("train", "onnx"):
+        from rlservo.export.compiled.compile import compile_bundle
+
+    with terminal.status("importing") as show, terminal.ends_like_ctrl_c():
+        made = compile_bundle(bundle, out, compiler=cc, weights_in_file=embed_weights == "bin", progress=show)
+    if as_json:
+        print_json({"path": str(made.folder), **made.about})
+        return
+    proof = made.proof
+    lines = [f"written   {made.folder}: {made.about['prefix']}.c, .h, _test.c, CMakeLists.txt"]
+    if proof is None:
+        lines.append(f"unproven  {made.about['unproven']}")
+    else:
+        lines += [
+            f"proven    {proof.golden_vectors} golden vectors, {proof.observations:,} observations beside onnxruntime, "
+            f"largest difference {proof.max_abs:.2g} ({proof.max_rel:.0%} of what is allowed)",
+            f"step      {proof.step_us['median']:.1f} µs median, {proof.step_us['p99']:.1f} µs 99%, "
+            f"{proof.step_us['longest']:.0f} µs longest here ({proof.compiler}, {' '.join(proof.flags)})",
+            f"memory    {proof.code_bytes / 1000:,.0f} kB code and weights, {proof.state_bytes:,} bytes state"
+            + (f", {proof.stack_bytes:,} bytes stack" if proof.stack_bytes is not None else ""),
+        ]
+    for line in lines:
+        terminal.output().print(line, markup=False, highlight=False, soft_wrap=True)
