@@ -47,6 +47,9 @@ def list_policies(
 ) -> None:
     """Show what is served, and since when. Of a repository also what it holds beside that.
 
+    Behind a proxy or on Ray Serve the table is the answering replica's alone: ask again for others, or read
+    `rlservo_plan_generation` in each one's metrics.
+
     Example: `rlservo policy list`
     """
     if repository:

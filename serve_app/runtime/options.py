@@ -30,9 +30,9 @@ class PolicyOptions(BaseModel):
 
     micro_batch: Annotated[int, Field(ge=0, le=1024)] = 0
     """The most single observations that a server computes in one run of the network, of those that are there at the
-    same time; 0 and 1: each by itself. For large networks (`benchmarks/batching.py` tells which). A batch's sums are
-    formed in another order, so the last bits of an action may differ. Computed one by one all the same: policies with a
-    memory or a `max_action_step`, and requests that explore or say anything of an episode."""
+    same time; 0 and 1: each by itself. For large networks. A batch's sums are formed in another order, so the last bits
+    of an action may differ. Computed one by one all the same: policies with a memory or a `max_action_step`, and
+    requests that explore or say anything of an episode."""
 
     record: bool = True
     """Whether a server that records (`--record`) records this policy, too."""

@@ -3,8 +3,7 @@
 Nobody waits for others to come. What arrived while the event loop was busy is read in one turn of it, and what has been
 read by the end of the turn is run together. A single caller does not even wait for the end of the turn: observations
 are gathered only when there were several in the turn before. What that saves grows with the network, whose weights are
-read from memory once instead of once per observation (`micro_batch` in `options.py`; `benchmarks/batching.py` measures
-it).
+read from memory once instead of once per observation (`micro_batch` in `runtime/options.py`).
 """
 
 from __future__ import annotations
