@@ -53,5 +53,5 @@ def _leaf(leaf: LeafSpec, golden: NDArray[Any], kinds: NDArray[Any], rng: np.ran
     tiny = np.where(rng.random(shape) < 0.5, signs * 0.0, signs * 1e-41)
     by_kind = np.stack([usual, picked, corner, signs * sizes, one_huge, tiny])
     limit = float(np.finfo(dtype).max)
-    drawn: NDArray[Any] = np.clip(by_kind[kinds, np.arange(ROWS)], -limit, limit).astype(dtype)
-    return drawn
+    values: NDArray[Any] = np.clip(by_kind[kinds, np.arange(ROWS)], -limit, limit).astype(dtype)
+    return values
