@@ -21,7 +21,7 @@ def sample_inputs(
     rng = np.random.default_rng(0)
     leaves: dict[str, LeafSpec] = leaf_specs(contract.observation_space, "obs")
     if any(tensor.name == REWARD for tensor in contract.inputs):
-        leaves = {**leaves, REWARD: BoxSpec(shape=(1,), dtype="float32", low=None, high=None)}
+        leaves = {**leaves, REWARD: BoxSpec(shape=(1,), dtype="float32", low=None, high=None, elements=())}
     for _ in range(steps):
         kinds = rng.choice(6, ROWS, p=[0.4, 0.25, 0.15, 0.1, 0.05, 0.05])
         inputs = {name: _leaf(leaf, golden[name], kinds, rng) for name, leaf in leaves.items()}
@@ -53,4 +53,5 @@ def _leaf(leaf: LeafSpec, golden: NDArray[Any], kinds: NDArray[Any], rng: np.ran
     tiny = np.where(rng.random(shape) < 0.5, signs * 0.0, signs * 1e-41)
     by_kind = np.stack([usual, picked, corner, signs * sizes, one_huge, tiny])
     limit = float(np.finfo(dtype).max)
-    return np.clip(by_kind[kinds, np.arange(ROWS)], -limit, limit).astype(dtype)
+    values: NDArray[Any] = np.clip(by_kind[kinds, np.arange(ROWS)], -limit, limit).astype(dtype)
+    return values

@@ -72,7 +72,7 @@ def test_c_that_differs_from_onnxruntime_is_not_written(
 
     def build(compiler: str, folder: Path, prefix: str, library: str) -> tuple[str, ...]:
         source = folder / f"{prefix}.c"
-        source.write_text(source.read_text().replace("tanh_of(x0[i0])", "x0[i0]"))
+        source.write_text(source.read_text().replace("tanh_of(x0[i0])", "0.5f * tanh_of(x0[i0])"))
         return written(compiler, folder, prefix, library)
 
     monkeypatch.setattr(proof, "build", build)
