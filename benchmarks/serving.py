@@ -277,6 +277,8 @@ def report(rows: list[Row]) -> str:
             str(len(own)),
         ]  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
+    if ratio(rows, OURS, "one.p50") is None:
+        return "\n".join(lines) + "\n"
     lines += [
         "",
         f"`{OURS}` beside {BARE}, medians of the ratios within a round:",

@@ -143,9 +143,10 @@ def _bentoml(case: Case, port: int, folder: Path) -> Peer:
 def _on_ray(script: str, what: Path | str, port: int, folder: Path, **options: object) -> Peer:
     # A token of its own: a local ray.init() would write one into the user's home and keep using it.
     own = {"RAY_TMPDIR": str(folder), "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    own["RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S"] = "60"  # after 5 Serve kills a proxy that is not ready yet
     own |= {} if options.pop("is_plain", False) else SWITCHES
     command = [sys.executable, str(PEERS / script), str(port), str(what)]
-    return Peer(command, environment=own, starts_in_s=90, **options)  # type: ignore[arg-type]
+    return Peer(command, environment=own, starts_in_s=120, **options)  # type: ignore[arg-type]
 
 
 def _scripted(python: str, script: str, case: Case, port: int, **options: object) -> Peer:

@@ -159,9 +159,10 @@ def serving(*versions: str, production: str = "1", **more: Any) -> dict[str, Any
 
 
 def own_ports(folder: Path) -> dict[str, str]:
-    """Return variables that keep two of Ray's HAProxies on one machine apart: their ports and files."""
+    """Return variables that keep two of Ray's HAProxies on one machine apart: their ports and files; and patience."""
     stats, metrics, fallback, fallback_grpc, first, second = free_ports(6)
     return {
+        "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",  # after 5 Serve kills a HAProxy that is not ready yet
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),

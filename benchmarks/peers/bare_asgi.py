@@ -33,6 +33,11 @@ def build(onnx_file: str) -> Any:
                 streamed: Any = session.run(["action"], {"obs": obs})
                 await send({"type": "websocket.send", "bytes": streamed[0].tobytes()})
             return
+        if scope["type"] == "lifespan":  # Ray Serve's
+            for event in ("startup", "shutdown"):
+                await receive()
+                await send({"type": f"lifespan.{event}.complete"})
+            return
         body, more = b"", True
         while more:
             message = await receive()

@@ -20,12 +20,16 @@ from rlservo.serve_app.engines.ray_serve import BuildArguments, build
 
 
 def bare(onnx_file: str) -> Any:
-    from bare_asgi import build as build_asgi
+    folder = str(Path(__file__).parent)
 
     @serve.deployment(logging_config={"enable_access_log": False, "log_level": "WARNING"}, max_ongoing_requests=1000)
-    @serve.ingress(lambda: build_asgi(onnx_file))
+    @serve.ingress()
     class Bare:
-        pass
+        def __serve_build_asgi_app__(self) -> Any:  # Serve's hook: the app is built in the replica
+            sys.path.insert(0, folder)
+            from bare_asgi import build
+
+            return build(onnx_file)
 
     deployment: Any = Bare  # a Deployment: serve's decorator is typed as if it left the class alone
     return deployment.bind()
@@ -33,9 +37,7 @@ def bare(onnx_file: str) -> Any:
 
 def main(port: int, policies: str) -> None:
     stop = threading.Event()
-    # The dashboard is not on a request's way. The replica finds bare_asgi.py in this folder.
-    environment = {"env_vars": {"PYTHONPATH": str(Path(__file__).parent)}}
-    ray.init(include_dashboard=False, log_to_driver=False, runtime_env=environment)
+    ray.init(include_dashboard=False, log_to_driver=False)  # the dashboard is not on a request's way
     for number in (signal.SIGTERM, signal.SIGINT):  # after ray.init, which installs its own
         signal.signal(number, lambda *_: stop.set())
     try:
