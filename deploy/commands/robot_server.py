@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -135,6 +136,39 @@ def server_manager(
             orphan_s=orphan_timeout or None,
             on_ready=ready,
         )
+
+
+def ur_controller(
+    model: Annotated[
+        str, typer.Option(help="ur3e, ur5e, ur10e or ur16e (500 Hz); ur3, ur5 or ur10 (125 Hz).")
+    ] = "ur5e",
+    host: Annotated[
+        str, typer.Option(help="Address to listen on: ports 29999 and 30001 to 30004, which clients do not choose.")
+    ] = "127.0.0.1",
+    latency_ms: Annotated[float, typer.Option(min=0.0, help="Delay of the link, each way.")] = 0.0,
+    jitter_ms: Annotated[float, typer.Option(min=0.0, help="Up to so much more.")] = 0.0,
+    drop: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of RTDE data packages that are lost.")] = 0.0,
+) -> None:
+    """Be the controller of a simulated UR arm until Ctrl-C. Lines on standard input stop the arm or cut the link.
+
+    Example: `rlservo ur-controller --model ur5e`, then `rtde_control.RTDEControlInterface("127.0.0.1")` in Python;
+    `help` and Enter lists the lines
+    """
+    with _one_sentence_errors():
+        from rlservo.envs.ur_controller.controller import Controller
+        from rlservo.envs.ur_controller.server import Link, run
+
+        def ready() -> None:
+            terminal.output().print(
+                f"{model} controller on {host}, ports 29999 and 30001 to 30004; help and Enter lists commands, "
+                "Ctrl-C ends it",
+                highlight=False,
+                soft_wrap=True,
+            )
+
+        stop = threading.Event()
+        with terminal.ctrl_c_sets(stop):
+            run(Controller(model), host, Link(latency_ms / 1e3, jitter_ms / 1e3, drop), stop, ready)
 
 
 def _serve(settings: Settings, title: str) -> None:

@@ -196,6 +196,12 @@ class URSimulation:
         self._velocity[:] = 0.0
         self._remaining = 0
 
+    def drive(self, velocity: ArrayLike) -> None:
+        """Let one control cycle pass in which the setpoint moves at a velocity [rad/s] (6,)."""
+        self._velocity[:] = velocity
+        self._remaining = self._substeps
+        self.advance()
+
     def advance(self) -> None:
         """Let one control cycle pass. A contact in any physics step sets `in_collision` until the next `place`."""
         data = self.data
