@@ -107,6 +107,11 @@ class Controller:
         return self._program is not None
 
     @property
+    def is_free(self) -> bool:
+        """Whether a person leads the arm by hand."""
+        return self._is_free
+
+    @property
     def is_moving(self) -> bool:
         """Whether the setpoint moves, or is about to."""
         return self._motion is not None or bool(self._velocity.any())
@@ -167,6 +172,11 @@ class Controller:
         """Note that an input register was written."""
         if self._watchdog is not None and self._watchdog.register == register:
             self._watchdog.fed_at_s = self.time_s
+
+    def excuse(self, held_up_s: float) -> None:
+        """Let the watchdog wait until the time [s] for which the controller itself was held up is made good."""
+        if self._watchdog is not None:
+            self._watchdog.fed_at_s = max(self._watchdog.fed_at_s, self.time_s + held_up_s)
 
     # -- motions
 

@@ -1,7 +1,7 @@
 """Ports of the simulated controller, its clock, and the faults of the link to it.
 
-One loop in one thread: sockets while a control cycle's time has not come, then the cycle. Time is the wall clock's;
-where the machine is too slow, the controller's time goes slower.
+One loop in one thread: sockets while a control cycle's time has not come, then the cycle. Time is the wall clock's.
+Where the machine holds the loop up, the cycles are made good at once, and the watchdog does not blame the client.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from rlservo.envs.ur_controller.rtde import RtdeSession
 
 DASHBOARD, PRIMARY, SECONDARY, REAL_TIME, RTDE = 29999, 30001, 30002, 30003, 30004
 PORTS = (DASHBOARD, PRIMARY, SECONDARY, REAL_TIME, RTDE)  # a client has no way to ask for others
-LONGEST_CATCH_UP_S = 0.1  # [s] of cycles that a loop which was held up makes good
+LONGEST_CATCH_UP_S = 2.0  # [s] of cycles that a loop which was held up makes good
+HELD_UP_S = 0.02  # [s], after which the loop was: its client's commands wait in the socket
 LARGEST_BACKLOG = 64 * 1024  # [bytes] for a client that does not read; then samples are dropped
 LARGEST_PROGRAM = 4 * 1024 * 1024
 PROGRAM_END = b"\nend\n"
@@ -93,6 +94,8 @@ class ControllerServer:
                 next_due = min(due, self._waiting[0][0]) if self._waiting else due
                 self._pass_traffic(max(0.0, next_due - now))
                 continue
+            if now - due > HELD_UP_S:
+                self.controller.excuse(now - due)
             due = max(due + self.controller.dt, now - LONGEST_CATCH_UP_S)
             self._pass_traffic(0.0)
             asked, self._asked = self._asked, []
