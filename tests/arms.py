@@ -74,4 +74,5 @@ def run_arm(model: str = "ur5e") -> Iterator[RunningArm]:
 
 @pytest.fixture
 def arm() -> Iterator[RunningArm]:
-    yield from run_arm()
+    """A CB3 arm: at 125 Hz it costs a third of an e-Series' time."""
+    yield from run_arm("ur5")

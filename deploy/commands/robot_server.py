@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from rlservo.deploy import terminal
+from rlservo.deploy.serve_commands import parse_env_arguments
 from rlservo.deploy.terminal import Json, print_json
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import needs_extra
@@ -35,6 +36,12 @@ Gui = Annotated[bool, typer.Option("--gui", help="Show the robot in a window; ne
 Seed = Annotated[int | None, typer.Option(help="Of random object paths and laser noise; none: differs every run.")]
 
 
+Limit = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=VALUE", help="Real arm: a limit of docs/ur_arm.md, speed_scale=0.1 say; repeat it."),
+]
+
+
 @robot_server.command("ur")
 def robot_server_ur(
     ur_model: Annotated[str, typer.Option(help="ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5",
@@ -54,6 +61,7 @@ def robot_server_ur(
     robot: Annotated[
         str, typer.Option(help="mujoco, or a real arm: rtde://192.168.0.2 (extra 'ur'; docs/ur_arm.md first).")
     ] = "mujoco",
+    limit: Limit = None,
     yes: Annotated[bool, typer.Option("--yes", help="Real arm: go to a SetState's pose without asking here.")] = False,
     reference_frame: Annotated[str, typer.Option(help="base_link (simulation) or base (the real controller's).")] = (
         "base_link"
@@ -88,6 +96,7 @@ def robot_server_ur(
             objects=None if model is None else tuple(model),
             robot=robot,
             confirm=not yes,
+            limits=parse_env_arguments(limit or []),
         )
         _serve(settings, f"{ur_model}, {rs_mode}, {action_mode}, {action_cycle_rate:g} Hz")
 
@@ -151,6 +160,7 @@ def robot_latency(
     ur_model: Annotated[str, typer.Option(help="ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5e",
     control_rate: Annotated[float, typer.Option(min=0.1, help="The policy's rate [Hz].")] = 10.0,
     steps: Annotated[int, typer.Option(min=5, help="Motions to measure.")] = 20,
+    limit: Limit = None,
     yes: Annotated[bool, typer.Option("--yes", help="Move without asking.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -163,6 +173,7 @@ def robot_latency(
     with _one_sentence_errors():
         from rlservo.envs.robots.arm import RobotError, host_of
         from rlservo.envs.robots.latency import STEP, measure_latency
+        from rlservo.envs.robots.limits import Limits
         from rlservo.envs.robots.operator_terminal import Operator
         from rlservo.envs.robots.rtde_arm import RtdeArm
 
@@ -170,7 +181,7 @@ def robot_latency(
         if host is None:
             raise RobotError(f"robot {robot!r} is simulated: expected rtde://HOST")
         Operator(is_asked=not yes).confirm(f"wrist_3 of the robot at {host} turns by {STEP:g} rad, {steps} times")
-        arm = RtdeArm(host, ur_model, setpoint_timeout_s=0.5)
+        arm = RtdeArm(host, ur_model, setpoint_timeout_s=0.5, limits=Limits.of(parse_env_arguments(limit or [])))
         try:
             with terminal.status(f"0 of {steps} motions") as show:
                 report = measure_latency(

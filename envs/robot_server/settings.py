@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from rlservo.envs.mir100.worlds import WORLDS as MIR100_WORLDS
@@ -70,6 +70,7 @@ class URSettings(Common):
     world: str = "tabletop"
     objects: tuple[str, ...] | None = None  # None: what the mode needs
     robot: str = MUJOCO  # or rtde://HOST
+    limits: dict[str, Any] = field(default_factory=dict)  # of a real arm, as envs/robots/limits.py has them
     confirm: bool = True  # ask at the terminal before a real arm moves to a pose of SetState
 
     def __post_init__(self) -> None:

@@ -39,6 +39,7 @@ class URRobot:
         self.simulation = make_arm(
             settings.robot,
             settings.ur_model,
+            limits=settings.limits,
             confirm=settings.confirm,
             max_velocity_scale=settings.max_velocity_scale_factor,
             cycle_s=self.cycle_s,

@@ -149,6 +149,10 @@ class MirroredSimulation(URSimulation):
             info["changes"] = [change._asdict() for change in changes]
         return info
 
+    def take_over(self) -> None:
+        """Let a person lead the arm from the next control cycle on, or give it back."""
+        self.operator.toggle()
+
     def limited(self) -> dict[str, int]:
         """Return how many cycles of the command stream each limit was kept in, by element, and stale actions."""
         counts = dict(self._lost)
@@ -188,7 +192,8 @@ class MirroredSimulation(URSimulation):
             if time.monotonic() > limit:
                 self.stopped_by = "stale_observation"
                 self._arm.hold()
-                self.states.enter(State.FAULT, f"no fresh state from the robot for {FRESH_S:g} s")
+                age_s = time.monotonic() - state.received_s + state.age_s
+                self.states.enter(State.FAULT, f"the robot's newest state is {age_s:.2f} s old, {FRESH_S:g} s long")
                 break
             time.sleep(0.002)
             state = self._arm.arm_state()

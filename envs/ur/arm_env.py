@@ -181,7 +181,9 @@ class URArmEnv(RenderedEnv):
     # -- for disturbances
 
     def set_robot_model(self, name: str) -> None:
-        """Put another arm on the table; `reset` is next. Raises ValueError naming the seven."""
+        """Put another arm on the table; `reset` is next. Raises ValueError naming the seven, and for a real arm."""
+        if self.is_real:
+            raise ValueError(f"a real arm cannot be exchanged for {name!r}")
         simulation = self._simulations.get(name) or self._simulations.setdefault(name, self._build(name))
         if simulation is not self.simulation:
             self.simulation = simulation
@@ -198,6 +200,10 @@ class URArmEnv(RenderedEnv):
         return {"rad/s": self.simulation.commanded_velocity}
 
     # -- for viewers
+
+    def take_over(self) -> None:
+        """Let a person lead a real arm by hand, or give it back. Raises ValueError for a simulated one."""
+        self.simulation.take_over()
 
     def robot_position(self) -> Vector:
         """Return tool0's position in MuJoCo's world [m] (3,)."""

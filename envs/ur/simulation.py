@@ -108,6 +108,10 @@ class URSimulation:
         """Return what a step's info holds of a real robot."""
         return None
 
+    def take_over(self) -> None:
+        """Let a person lead the arm, or give it back. Raises ValueError: a simulated arm cannot be led."""
+        raise ValueError("a simulated arm cannot be led by hand")
+
     def limited(self) -> dict[str, int] | None:
         """Return in how many cycles each limit of a real arm was kept."""
         return None

@@ -72,7 +72,7 @@ class MoveJ:
         del velocity
         self._time_s = min(self._time_s + dt * speed_fraction, self._total_s)
         self.is_done = self._time_s >= self._total_s
-        ahead = self._start + self._way * self._share(self._time_s)
+        ahead: Vector = self._start + self._way * self._share(self._time_s)
         return (ahead - position) / dt
 
     def _share(self, time_s: float) -> float:

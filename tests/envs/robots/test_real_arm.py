@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from arms import PATIENCE_S, RunningArm
+from arms import PATIENCE_S, RunningArm, run_arm
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.robots.limits import Limits
 from rlservo.envs.robots.rtde_arm import RtdeArm
@@ -30,14 +30,14 @@ ENV = "rlservo/EndEffectorPositioningURRob-v0"
 START = np.array([0.0, -2.5, 1.5, -1.5, -1.4, 0.0])
 LIMIT = np.array(POSITION_LIMITS)
 WATCHDOG_HZ = 2.0  # the machine may be busy; the product's default is 10
-LIMITS = {"watchdog_hz": WATCHDOG_HZ, "rate_hz": 125.0, "start_speed": 1.0, "blend_s": 0.1}
+LIMITS = {"watchdog_hz": WATCHDOG_HZ, "start_speed": 1.0, "blend_s": 0.1}
 BRAKING_S = 0.6  # from full speed here, by the slowest of all ways to stop, with the follower's lag
 
 
 @contextmanager
 def real_env(arm: RunningArm, **arguments: Any) -> Iterator[gym.Env[Any, Any]]:
     env = gym.make(
-        ENV, robot=f"rtde://{arm.host}", ur_model="ur5e", confirm=False, disable_env_checker=True,
+        ENV, robot=f"rtde://{arm.host}", ur_model="ur5", confirm=False, disable_env_checker=True,
         **{"limits": LIMITS, **arguments},
     )  # fmt: skip
     try:
@@ -49,7 +49,7 @@ def real_env(arm: RunningArm, **arguments: Any) -> Iterator[gym.Env[Any, Any]]:
 @pytest.fixture
 def moving(arm: RunningArm) -> Iterator[RtdeArm]:
     """An arm whose base turns, and is given setpoints by no one any more: they last half a minute."""
-    real = RtdeArm(arm.host, "ur5e", setpoint_timeout_s=30.0, limits=Limits.of(LIMITS))
+    real = RtdeArm(arm.host, "ur5", setpoint_timeout_s=30.0, limits=Limits.of(LIMITS))
     try:
         real.command(START + np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]), 10.0)
         arm.wait_until(lambda: abs(arm.controller.simulation.joint_velocities[0]) > 0.25)
@@ -114,7 +114,7 @@ def test_emergency_stop_is_a_fault_that_is_named(arm: RunningArm, moving: RtdeAr
     arm.wait_until(lambda: bool(moving.fault()))
     assert moving.fault().startswith("emergency_stop")
     with pytest.raises(RobotError, match="emergency stop"):
-        RtdeArm(arm.host, "ur5e")
+        RtdeArm(arm.host, "ur5")
 
 
 def test_policy_process_that_dies_or_is_suspended_leaves_a_standing_arm(arm: RunningArm) -> None:
@@ -123,7 +123,7 @@ import time
 import numpy as np
 from rlservo.envs.robots.limits import Limits
 from rlservo.envs.robots.rtde_arm import RtdeArm
-arm = RtdeArm({arm.host!r}, "ur5e", limits=Limits.of({LIMITS!r}))
+arm = RtdeArm({arm.host!r}, "ur5", limits=Limits.of({LIMITS!r}))
 while True:
     arm.command(np.array([3.0, -2.5, 1.5, -1.5, -1.4, 0.0]), 10.0)
     time.sleep(0.05)
@@ -219,7 +219,7 @@ def test_person_takes_the_arm_over_leads_it_and_gives_it_back(arm: RunningArm) -
 @pytest.mark.parametrize("stream", ["random", "extremes", "jitter"])
 def test_hostile_setpoints_never_make_the_arm_jump_or_pass_a_limit(arm: RunningArm, stream: str) -> None:
     rng = np.random.default_rng(7)
-    real = RtdeArm(arm.host, "ur5e", limits=Limits.of({**LIMITS, "box_low": [-2.0, -2.0, 0.3], "tool_speed": 0.3}))
+    real = RtdeArm(arm.host, "ur5", limits=Limits.of({**LIMITS, "box_low": [-2.0, -2.0, 0.3], "tool_speed": 0.3}))
     try:
         for step in range(60):
             goals = {
@@ -244,11 +244,15 @@ def test_hostile_setpoints_never_make_the_arm_jump_or_pass_a_limit(arm: RunningA
     assert min(arm.controller.simulation.tool_at(one.positions)[0][2] for one in samples[::10]) > 0.29
 
 
-def test_wrong_model_unreachable_host_and_local_control_are_one_sentence(arm: RunningArm) -> None:
-    with pytest.raises(RobotError, match=r"is a ur5e's: ur_model says ur10e"):
-        RtdeArm(arm.host, "ur10e")
-    with pytest.raises(RobotError, match=r"no UR controller answers at 127\.0\.0\.250"):
-        RtdeArm("127.0.0.250", "ur5e")
-    arm.controller.is_remote = False
-    with pytest.raises(RobotError, match="enable remote control"):
+def test_wrong_model_and_unreachable_host_are_one_sentence(arm: RunningArm) -> None:
+    with pytest.raises(RobotError, match=r"is a ur5's: ur_model says ur5e"):
         RtdeArm(arm.host, "ur5e")
+    with pytest.raises(RobotError, match=r"no UR controller answers at 127\.0\.0\.250"):
+        RtdeArm("127.0.0.250", "ur5")
+
+
+def test_e_series_in_local_control_says_where_to_enable_remote_control() -> None:
+    for arm in run_arm("ur5e"):
+        arm.controller.is_remote = False
+        with pytest.raises(RobotError, match="enable remote control"):
+            RtdeArm(arm.host, "ur5e")

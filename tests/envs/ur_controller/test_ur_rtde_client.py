@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -33,6 +34,11 @@ control.disconnect()
 receive.disconnect()
 print("found", json.dumps(found))
 """
+
+
+@pytest.fixture
+def arm() -> Iterator[RunningArm]:
+    yield from run_arm("ur5e")
 
 
 def drive(arm: RunningArm, body: str) -> dict[str, Any]:
