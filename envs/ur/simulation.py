@@ -293,7 +293,8 @@ class URSimulation:
 
         Damped least squares from where the arm is, so that it keeps its posture; nothing moves.
         """
-        goal, joints = np.asarray(position, dtype=np.float64), self.joint_positions.copy()
+        goal = np.asarray(position, dtype=np.float64)
+        joints: Vector = self.joint_positions.copy()
         for _ in range(REACH_STEPS):
             tool, jacobian = self.tool_at(joints)
             way = goal - tool

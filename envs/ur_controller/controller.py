@@ -85,6 +85,7 @@ class Controller:
         self.speed_fraction = 1.0
         self.payload_kg = 0.0
         self.ticks = 0
+        self.held_up_s = 0.0  # since the start, by the machine
         self.trace: deque[Sample] = deque(maxlen=TRACE)
         self.stop_reasons: list[tuple[float, str]] = []  # when [s], why
         self._velocity: Vector = np.zeros(6)  # [rad/s], of the setpoint
@@ -174,9 +175,10 @@ class Controller:
             self._watchdog.fed_at_s = self.time_s
 
     def excuse(self, held_up_s: float) -> None:
-        """Let the watchdog wait until the time [s] for which the controller itself was held up is made good."""
+        """Leave time [s] for which the controller itself was held up, and that it makes good now, to no one's debit."""
+        self.held_up_s += held_up_s
         if self._watchdog is not None:
-            self._watchdog.fed_at_s = max(self._watchdog.fed_at_s, self.time_s + held_up_s)
+            self._watchdog.fed_at_s += held_up_s
 
     # -- motions
 

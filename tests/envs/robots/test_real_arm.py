@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -23,6 +24,11 @@ from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.robots.limits import Limits
 from rlservo.envs.robots.rtde_arm import RtdeArm
 from rlservo.envs.ur.parameters import POSITION_LIMITS
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.recording.episodes import episodes
+from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.rollout.control_loop import rollout
+from rlservo.serve_app.runtime.policy import Policy
 
 pytest.importorskip("rtde_control")
 
@@ -59,12 +65,14 @@ def moving(arm: RunningArm) -> Iterator[RtdeArm]:
 
 
 def time_to_stand(arm: RunningArm, fault: Callable[[], object]) -> float:
-    """Return how long the arm moved on after a fault [s], in the controller's time."""
-    began = arm.controller.time_s
+    """Return how long the arm moved on after a fault [s], in its own time, less what the machine held it up."""
+    controller = arm.controller
+    began, held_up_s = controller.time_s, controller.held_up_s
     fault()
-    arm.wait_until(lambda: arm.controller.time_s > began + 0.1 and not arm.controller.is_moving)
-    arm.wait_until(lambda: bool(abs(arm.controller.simulation.joint_velocities).max() < 0.01))
-    return arm.last_motion_s() - began
+    arm.wait_until(
+        lambda: controller.time_s > began + 0.1 and bool(abs(controller.simulation.joint_velocities).max() < 0.01)
+    )
+    return arm.last_motion_s() - began - (controller.held_up_s - held_up_s)
 
 
 def test_policy_reaches_targets_and_the_episode_says_what_the_robot_did(arm: RunningArm) -> None:
@@ -132,22 +140,14 @@ while True:
     try:
         fast = lambda: bool(abs(arm.controller.simulation.joint_velocities[0]) > 0.25)  # noqa: E731
         arm.wait_until(fast)
-        assert time_to_stand_by_speed(arm, lambda: policy.send_signal(signal.SIGSTOP)) < 0.25 + BRAKING_S
+        assert time_to_stand(arm, lambda: policy.send_signal(signal.SIGSTOP)) < 0.25 + BRAKING_S
         policy.send_signal(signal.SIGCONT)
         arm.wait_until(fast)
-        assert time_to_stand_by_speed(arm, policy.kill) < 0.25 + BRAKING_S
+        assert time_to_stand(arm, policy.kill) < 0.25 + BRAKING_S
         arm.wait_until(lambda: not arm.controller.is_program_running)
     finally:
         policy.kill()
         policy.wait()
-
-
-def time_to_stand_by_speed(arm: RunningArm, fault: Callable[[], object]) -> float:
-    """Return how long the arm moved on after a fault [s], where the stream goes on commanding it to stand."""
-    began = arm.controller.time_s
-    fault()
-    arm.wait_until(lambda: bool(abs(arm.controller.simulation.joint_velocities).max() < 0.01))
-    return arm.last_motion_s() - began
 
 
 def test_slow_policy_holds_the_arm_and_its_action_for_an_old_observation_is_not_taken(arm: RunningArm) -> None:
@@ -256,3 +256,23 @@ def test_e_series_in_local_control_says_where_to_enable_remote_control() -> None
         arm.controller.is_remote = False
         with pytest.raises(RobotError, match="enable remote control"):
             RtdeArm(arm.host, "ur5e")
+
+
+def test_rollout_refuses_an_unproven_policy_and_records_what_the_robot_did(
+    arm: RunningArm, shipped: Path, tmp_path: Path
+) -> None:
+    options: dict[str, Any] = {
+        "episodes": 1,
+        "seed": 1,
+        "env_kwargs": {"robot": f"rtde://{arm.host}", "ur_model": "ur5", "confirm": False, "limits": LIMITS},
+    }
+    with Policy.load(shipped / "ur5" / "1") as policy:
+        with pytest.raises(UsageError, match="was never evaluated under latency"):
+            rollout(policy, ENV, **options)
+        report = rollout(policy, ENV, unproven=True, record=tmp_path / "run.mcap", **options)
+    assert report.success_rate == 1.0
+    assert report.robot is not None
+    (episode,) = episodes(Recording(tmp_path / "run.mcap"))
+    states = [one["state"] for one in episode.robot]
+    assert len(states) == report.steps and states[-1] == "run"
+    assert "blend_in" in [change["state"] for change in episode.robot[0]["changes"]]
