@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from rlservo.deploy import terminal
-from rlservo.deploy.serve_commands import parse_env_arguments
+from rlservo.deploy.commands.environment_options import parse_env_arguments
 from rlservo.deploy.terminal import Json, print_json
 from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import needs_extra
+from rlservo.export.contract.extras import needs_extra, require
 
 if TYPE_CHECKING:
     from rlservo.envs.robot_server.settings import Settings
@@ -38,7 +38,9 @@ Seed = Annotated[int | None, typer.Option(help="Of random object paths and laser
 
 Limit = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME=VALUE", help="Real arm: a limit of docs/ur_arm.md, speed_scale=0.1 say; repeat it."),
+    typer.Option(
+        metavar="NAME=VALUE", help="Real arm: a limit (docs/how-to/ur-arm.md), speed_scale=0.1 say; repeat it."
+    ),
 ]
 
 
@@ -59,7 +61,7 @@ def robot_server_ur(
         typer.Option("--object", help="Object model in the scene, e.g. sphere50; repeat it. By default the mode's."),
     ] = None,
     robot: Annotated[
-        str, typer.Option(help="mujoco, or a real arm: rtde://192.168.0.2 (extra 'ur'; docs/ur_arm.md first).")
+        str, typer.Option(help="mujoco, or a real arm: rtde://192.168.0.2 (extra 'ur'; docs/how-to/ur-arm.md first).")
     ] = "mujoco",
     limit: Limit = None,
     yes: Annotated[bool, typer.Option("--yes", help="Real arm: go to a SetState's pose without asking here.")] = False,
@@ -170,6 +172,7 @@ def robot_latency(
 
     Example: `rlservo robot-latency rtde://192.168.0.2 --ur-model ur5e`
     """
+    require("ur", "rtde_control")
     with _one_sentence_errors():
         from rlservo.envs.robots.arm import RobotError, host_of
         from rlservo.envs.robots.latency import STEP, measure_latency

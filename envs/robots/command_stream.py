@@ -38,6 +38,7 @@ SLOW_CALL_S = 0.3  # [s] for one command; ur_rtde has lost the script or reconne
 OFFSET_CREEP = 0.001  # [s/s], of two clocks that drift; a link's delay that grows faster is one
 AGE_BOUND_S = 0.1  # [s] of a state that may be acted on
 AT_REST = 1e-3  # [rad/s]
+CLOSE_S = 4.0  # [s], for closing the connections
 VARIABLES = [
     "timestamp", "actual_q", "actual_qd", "target_q", "robot_mode", "safety_mode", "robot_status_bits",
     "target_speed_fraction",
@@ -332,11 +333,16 @@ def main(argv: list[str]) -> None:
             signal.signal(signal.SIGTERM, lambda *_: stream.is_asked_to_end.set())
             threading.Thread(target=_end_with_standard_input, args=(stream,), name="lifeline", daemon=True).start()
             stream.run(lambda: _say(output, READY))
+        except RobotError as error:  # said before anything waits for a connection that may be dead
+            if stream is not None:
+                stream.fail()
+            _say(output, f"{FAILED}{error}")
+            raise SystemExit(1) from None
         finally:
+            # ur_rtde waits without an end for a controller that is silent.
+            threading.Thread(target=lambda: (time.sleep(CLOSE_S), os._exit(1)), name="end", daemon=True).start()
             connection.close()
     except RobotError as error:
-        if stream is not None:
-            stream.fail()
         _say(output, f"{FAILED}{error}")
         raise SystemExit(1) from None
 

@@ -24,6 +24,7 @@ SILENCE_S = 5.0  # [s] without a report, after which the process counts as dead
 REACHED = 0.01  # [rad]
 AT_REST = 0.01  # [rad/s]
 LOOK_S = 0.01
+LINE_S = 2.0  # [s], for the sentence of a fault that is known
 
 Vector = NDArray[np.float64]
 
@@ -159,8 +160,8 @@ class RtdeArm:
     def fault(self) -> str:
         """Return why the arm does not take commands any more; empty where it does."""
         if not self._fault:
-            if self._process.poll() is not None:
-                line = self._read_line(0.0)
+            if self._process.poll() is not None or self.phase() == Phase.FAULT:
+                line = self._read_line(LINE_S)
                 self._fault = line.removeprefix(FAILED) or "stream_ended: the command stream's process was killed"
             elif time.monotonic() - float(self._report.read()["written_s"]) > SILENCE_S:
                 self._fault = "stream_silent: the command stream's process does not run"

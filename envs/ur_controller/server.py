@@ -179,7 +179,8 @@ class ControllerServer:
 
     def _publish(self) -> None:
         for connection in [one for one in self._connections.values() if one.rtde is not None]:
-            if len(connection.unsent) > LARGEST_BACKLOG or connection.rtde is None:
+            if connection.rtde is None or len(connection.unsent) > LARGEST_BACKLOG:
+                self._write(connection, b"")
                 continue
             package = connection.rtde.sample()
             if package and not (self.link.drop and self._rng.random() < self.link.drop):
