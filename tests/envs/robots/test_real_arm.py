@@ -95,12 +95,15 @@ def test_env_drives_the_arm_to_its_target_within_the_limits(arm: RunningArm) -> 
 
 def test_killed_command_stream_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:
     assert time_to_stand(arm, lambda: os.kill(moving.pid, signal.SIGKILL)) < 1.0 / WATCHDOG_HZ + BRAKING_S
+    arm.wait_until(lambda: not arm.controller.is_program_running)
+    assert "watchdog" in arm.controller.stop_reasons[-1][1]
     assert "killed" in moving.fault()
 
 
 def test_suspended_command_stream_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:
     try:
         assert time_to_stand(arm, lambda: os.kill(moving.pid, signal.SIGSTOP)) < 1.0 / WATCHDOG_HZ + BRAKING_S
+        arm.wait_until(lambda: not arm.controller.is_program_running)
     finally:
         os.kill(moving.pid, signal.SIGCONT)
     arm.wait_until(lambda: bool(moving.fault()))
