@@ -26,7 +26,7 @@ from rlservo.deploy.commands.policy import policy
 from rlservo.deploy.commands.promote import promote
 from rlservo.deploy.commands.publish import publish
 from rlservo.deploy.commands.replay import estimate, replay
-from rlservo.deploy.commands.robot_server import robot_server, server_manager
+from rlservo.deploy.commands.robot_server import robot_latency, robot_server, server_manager, ur_controller
 from rlservo.deploy.commands.rollout import rollout
 from rlservo.deploy.commands.serve import serve
 from rlservo.deploy.commands.verify import verify
@@ -83,6 +83,8 @@ for command in (
     demo,
     cockpit,
     server_manager,
+    ur_controller,
+    robot_latency,
     replay,
     estimate,
 ):

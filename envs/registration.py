@@ -8,6 +8,7 @@ from rlservo.export.contract.environment_id import NAMESPACE
 
 ENTRY_POINTS = {
     "EndEffectorPositioningURSim-v0": "rlservo.envs.ur.end_effector_positioning:EndEffectorPositioningURSim",
+    "EndEffectorPositioningURRob-v0": "rlservo.envs.ur.end_effector_positioning:EndEffectorPositioningURRob",
     "EmptyEnvironmentURSim-v0": "rlservo.envs.ur.empty_environment:EmptyEnvironmentURSim",
     "BasicAvoidanceURSim-v0": "rlservo.envs.ur.basic_avoidance:BasicAvoidanceURSim",
     "NoObstacleNavigationMir100Sim-v0": "rlservo.envs.mir100.no_obstacle_navigation:NoObstacleNavigationMir100Sim",

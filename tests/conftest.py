@@ -25,6 +25,7 @@ pytest_plugins = [
     "quick_rllib",  # its settings, for the tests that import RLlib
     "browser",
     "checkpoints",
+    "arms",
     "bundles",
     "clusters",
     "cockpits",

@@ -23,6 +23,7 @@ from rlservo.deploy.cockpit.policies import Choice, Link, PolicySource
 from rlservo.deploy.cockpit.stage import Disturbance, Stage, Vector, home_arguments, home_of
 from rlservo.deploy.cockpit.view import Cycle, Phase, View
 from rlservo.envs.rendering import Start
+from rlservo.envs.ur.arm_env import URArmEnv
 from rlservo.export.contract.contract import REWARD, Contract
 from rlservo.export.contract.errors import (
     DeadlineError,
@@ -139,6 +140,13 @@ class Drive:
         if self._phase == "arrived":
             self.play()
 
+    def take_over(self) -> None:
+        """Let a person lead a real arm by hand, or give it back to the policy."""
+        env = self._stage.env
+        if not isinstance(env, URArmEnv):
+            raise UsageError("this robot cannot be led by hand")
+        env.take_over()
+
     def set_speed(self, speed: float) -> None:
         """Let time pass `speed` times as fast as on the wall."""
         self._speed = speed
@@ -194,6 +202,7 @@ class Drive:
         self._drop_ghost()
         if choice is None:
             return
+        self._refuse_second_robot("a ghost")
         policy = self._source.open(choice, Link(self._link.deadline_ms))
         try:
             self._ghost = Ghost(policy, self._stage)
@@ -412,6 +421,7 @@ class Drive:
             env_id, arguments = home_of(contract), home_arguments(contract)
         else:
             env_id = self._stage.env_id
+        self._refuse_second_robot("another robot")
         stage = Stage(env_id, arguments, contract)
         try:
             stage.disturb(self._disturbance)
@@ -419,6 +429,10 @@ class Drive:
             self._disturbance = replace(self._disturbance, payload=0.0)
             stage.disturb(self._disturbance)
         return stage
+
+    def _refuse_second_robot(self, what: str) -> None:
+        if getattr(self._stage.env, "is_real", False):
+            raise UsageError(f"{what} cannot be had beside a real robot: start the cockpit again")
 
     def _drop_ghost(self) -> None:
         if self._ghost is not None:

@@ -58,6 +58,8 @@ class DrivePanel:
             speed.on_update(lambda event: drive.do(partial(drive.set_speed, number_of(event.target))))
             self._push = gui.add_checkbox("Drag the robot", initial_value=False, hint="instead of its target")
             self._push.on_update(lambda _: self._offer_start())
+            self._hand = gui.add_button("Take over, give back", visible=False, hint="lead the arm by hand")
+            self._hand.on_click(lambda _: drive.do(drive.take_over))
             self._drop = gui.add_button("Drop a cube ahead", visible=False)
             self._drop.on_click(lambda _: self._drop_obstacle())
         with gui.add_folder("Policy"):
@@ -140,6 +142,7 @@ class DrivePanel:
         )
         self._offer_start()
         aim_cameras(self._server, *env.viewpoint())
+        self._hand.visible = getattr(env, "is_real", False)
         self._drop.visible = len(env.obstacle_positions()) > 0
         self._robot.visible = not env.IS_PLANAR
         set_value(self._robot, view.stage.arguments.get("ur_model", "ur5"))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,14 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from rlservo.deploy import terminal
+from rlservo.deploy.commands.environment_options import parse_env_arguments
+from rlservo.deploy.terminal import Json, print_json
 from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import needs_extra
+from rlservo.export.contract.extras import needs_extra, require
 
 if TYPE_CHECKING:
     from rlservo.envs.robot_server.settings import Settings
 
 robot_server = typer.Typer(
-    help="Serve a simulated robot to robo-gym's environments. It is a drop-in for the ROS robot server.",
+    help="Serve a robot, simulated or real, to robo-gym's environments. It is a drop-in for the ROS robot server.",
     no_args_is_help=True,
 )
 
@@ -30,6 +34,14 @@ Clock = Annotated[
 RobotPort = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free one.")]
 Gui = Annotated[bool, typer.Option("--gui", help="Show the robot in a window; needs a display.")]
 Seed = Annotated[int | None, typer.Option(help="Of random object paths and laser noise; none: differs every run.")]
+
+
+Limit = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=VALUE", help="Real arm: a limit (docs/how-to/ur-arm.md), speed_scale=0.1 say; repeat it."
+    ),
+]
 
 
 @robot_server.command("ur")
@@ -48,6 +60,11 @@ def robot_server_ur(
         list[str] | None,
         typer.Option("--object", help="Object model in the scene, e.g. sphere50; repeat it. By default the mode's."),
     ] = None,
+    robot: Annotated[
+        str, typer.Option(help="mujoco, or a real arm: rtde://192.168.0.2 (extra 'ur'; docs/how-to/ur-arm.md first).")
+    ] = "mujoco",
+    limit: Limit = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Real arm: go to a SetState's pose without asking here.")] = False,
     reference_frame: Annotated[str, typer.Option(help="base_link (simulation) or base (the real controller's).")] = (
         "base_link"
     ),
@@ -79,6 +96,9 @@ def robot_server_ur(
             max_velocity_scale_factor=max_velocity_scale_factor,
             world=world,
             objects=None if model is None else tuple(model),
+            robot=robot,
+            confirm=not yes,
+            limits=parse_env_arguments(limit or []),
         )
         _serve(settings, f"{ur_model}, {rs_mode}, {action_mode}, {action_cycle_rate:g} Hz")
 
@@ -135,6 +155,89 @@ def server_manager(
             orphan_s=orphan_timeout or None,
             on_ready=ready,
         )
+
+
+def robot_latency(
+    robot: Annotated[str, typer.Argument(metavar="rtde://HOST", help="The arm.")],
+    ur_model: Annotated[str, typer.Option(help="ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5e",
+    control_rate: Annotated[float, typer.Option(min=0.1, help="The policy's rate [Hz].")] = 10.0,
+    steps: Annotated[int, typer.Option(min=5, help="Motions to measure.")] = 20,
+    limit: Limit = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Move without asking.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Measure a real arm's latency, from command to motion, and print the evaluation that a policy for it must pass.
+
+    wrist_3 turns by 0.05 rad, back and forth.
+
+    Example: `rlservo robot-latency rtde://192.168.0.2 --ur-model ur5e`
+    """
+    require("ur", "rtde_control")
+    with _one_sentence_errors():
+        from rlservo.envs.robots.arm import RobotError, host_of
+        from rlservo.envs.robots.latency import STEP, measure_latency
+        from rlservo.envs.robots.limits import Limits
+        from rlservo.envs.robots.operator_terminal import Operator
+        from rlservo.envs.robots.rtde_arm import RtdeArm
+
+        host = host_of(robot)
+        if host is None:
+            raise RobotError(f"robot {robot!r} is simulated: expected rtde://HOST")
+        Operator(is_asked=not yes).confirm(f"wrist_3 of the robot at {host} turns by {STEP:g} rad, {steps} times")
+        arm = RtdeArm(host, ur_model, setpoint_timeout_s=0.5, limits=Limits.of(parse_env_arguments(limit or [])))
+        try:
+            with terminal.status(f"0 of {steps} motions") as show:
+                report = measure_latency(
+                    arm, steps=steps, control_rate_hz=control_rate, on_step=lambda n: show(f"{n} of {steps} motions")
+                )
+        finally:
+            arm.close()
+    if as_json:
+        print_json(dataclasses.asdict(report) | {"disturbance": report.disturbance})
+        return
+    terminal.output().print(
+        f"command to motion: p50 {report.p50_ms:.0f}, p95 {report.p95_ms:.0f}, max {report.max_ms:.0f} ms, jitter "
+        f"{report.jitter_ms:.0f} ms over {steps} motions; a state every {report.state_period_ms:.3g} ms; joints at "
+        f"rest within {report.noise:.1e} rad\n"
+        f"at {control_rate:g} Hz that is up to {report.cycles} cycles. The policy must pass:\n"
+        f"rlservo verify BUNDLE {report.disturbance} --disturb --write "
+        f"--env rlservo/EndEffectorPositioningURSim-v0 --env-arg ur_model={ur_model}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def ur_controller(
+    model: Annotated[
+        str, typer.Option(help="ur3e, ur5e, ur10e or ur16e (500 Hz); ur3, ur5 or ur10 (125 Hz).")
+    ] = "ur5e",
+    host: Annotated[
+        str, typer.Option(help="Address to listen on: ports 29999 and 30001 to 30004, which clients do not choose.")
+    ] = "127.0.0.1",
+    latency_ms: Annotated[float, typer.Option(min=0.0, help="Delay of the link, each way.")] = 0.0,
+    jitter_ms: Annotated[float, typer.Option(min=0.0, help="Up to so much more.")] = 0.0,
+    drop: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of RTDE data packages that are lost.")] = 0.0,
+) -> None:
+    """Be the controller of a simulated UR arm until Ctrl-C. Lines on standard input stop the arm or cut the link.
+
+    Example: `rlservo ur-controller --model ur5e`, then `rtde_control.RTDEControlInterface("127.0.0.1")` in Python;
+    `help` and Enter lists the lines
+    """
+    with _one_sentence_errors():
+        from rlservo.envs.ur_controller.controller import Controller
+        from rlservo.envs.ur_controller.server import Link, run
+
+        def ready() -> None:
+            terminal.output().print(
+                f"{model} controller on {host}, ports 29999 and 30001 to 30004; help and Enter lists commands, "
+                "Ctrl-C ends it",
+                highlight=False,
+                soft_wrap=True,
+            )
+
+        stop = threading.Event()
+        with terminal.ctrl_c_sets(stop):
+            run(Controller(model), host, Link(latency_ms / 1e3, jitter_ms / 1e3, drop), stop, ready)
 
 
 def _serve(settings: Settings, title: str) -> None:

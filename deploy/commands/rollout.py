@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -61,6 +62,10 @@ def rollout(
             help="Drive under disturbances, such as latency=3,noise=real,payload=3; `rlservo verify -h` has the kinds.",
         ),
     ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Real robot: move to a start without asking.")] = False,
+    unproven: Annotated[
+        bool, typer.Option("--unproven", help="Real robot: take a policy that was never evaluated under latency.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Drive an environment with a policy. Success, return, latency and deadline misses are reported.
@@ -71,6 +76,10 @@ def rollout(
         raise UsageError("give either --url (a server) or --bundle (in process)")
     if bundle is not None and (fallback, deadline_ms, transport) != (None, None, "http"):
         raise UsageError("--transport, --deadline-ms and --fallback are for a server (--url)")
+    arguments = parse_env_arguments(env_arg or []) | ({"confirm": False} if yes else {})
+    if "robot" in arguments:
+        require("ur", "rtde_control", what="a real robot")
+        logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     if video is not None:
         choose_gl_backend()
     if record is not None:
@@ -90,11 +99,12 @@ def rollout(
             seed=seed,
             rate=rate,
             explore=explore,
-            env_kwargs=parse_env_arguments(env_arg or []),
+            env_kwargs=arguments,
             video=video,
             record=record,
             on_episode=lambda row: show(f"{row.index + 1} of {episodes} episodes"),
             disturb=disturb,
+            unproven=unproven,
         )
     if as_json:
         print_json(report.as_dict())

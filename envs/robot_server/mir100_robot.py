@@ -24,6 +24,8 @@ SETTLE_CYCLES = 2
 class Mir100Robot:
     """The robot in its world."""
 
+    is_real = False
+
     def __init__(self, settings: Mir100Settings) -> None:
         self.simulation = Mir100Simulation(settings.world_name, rng=np.random.default_rng(settings.seed))
         self.camera = Camera(self.simulation.model, self.simulation.data, **ROOM_VIEW)
@@ -32,6 +34,10 @@ class Mir100Robot:
     def cycle_s(self) -> float:
         """How long a control cycle lasts [s]."""
         return CYCLE_S
+
+    def close(self) -> None:
+        """Close the window."""
+        self.camera.close()
 
     def state(self) -> RobotState:
         """Return the 1,030 numbers; the original has no names for them."""

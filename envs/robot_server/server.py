@@ -50,7 +50,8 @@ class RobotServer:
 
     def __init__(self, settings: Settings) -> None:
         self.robot = make_robot(settings)
-        self.service = RobotService(self.robot, Clock(settings.clock, self.robot.cycle_s), gui=settings.gui)
+        clock = "fast" if self.robot.is_real else settings.clock  # a real robot's cycles last as long as they do
+        self.service = RobotService(self.robot, Clock(clock, self.robot.cycle_s), gui=settings.gui)
         self._server = grpc.server(futures.ThreadPoolExecutor(THREADS, "robot-server"), options=OPTIONS)
         self._server.add_generic_rpc_handlers((self.service.handler(),))
         self.port = bind(self._server, settings.host, settings.port)
@@ -59,7 +60,7 @@ class RobotServer:
     def stop(self) -> None:
         """Refuse new calls, abort what runs on for a tenth of a second, and free the port."""
         self._server.stop(grace=0.1).wait(timeout=1.0)
-        self.robot.camera.close()
+        self.robot.close()
 
 
 def make_robot(settings: Settings) -> Robot:

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from rlservo.envs.mir100.worlds import WORLDS as MIR100_WORLDS
 from rlservo.envs.robot_server.robot import CLOCKS
+from rlservo.envs.robots.arm import MUJOCO, host_of
 from rlservo.envs.ur.objects import object_model
 from rlservo.envs.ur.parameters import cycle_of, ur_parameters
 from rlservo.envs.ur.rs_modes import rs_mode_of
@@ -68,10 +69,14 @@ class URSettings(Common):
     max_velocity_scale_factor: float = 1.0
     world: str = "tabletop"
     objects: tuple[str, ...] | None = None  # None: what the mode needs
+    robot: str = MUJOCO  # or rtde://HOST
+    limits: dict[str, Any] = field(default_factory=dict)  # of a real arm, as envs/robots/limits.py has them
+    confirm: bool = True  # ask at the terminal before a real arm moves to a pose of SetState
 
     def __post_init__(self) -> None:
         super().__post_init__()
         ur_parameters(self.ur_model)
+        host_of(self.robot)
         mode = rs_mode_of(self.rs_mode)
         _one_of("action_mode", self.action_mode, ACTION_MODES)
         _one_of("reference_frame", self.reference_frame, REFERENCE_FRAMES)

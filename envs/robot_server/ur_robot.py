@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from rlservo.envs.rendering import Camera
 from rlservo.envs.robot_server.robot import RobotState
 from rlservo.envs.robot_server.settings import URSettings
+from rlservo.envs.robots.arm import MUJOCO
+from rlservo.envs.robots.connect import make_arm
 from rlservo.envs.ur.object_paths import object_path
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, cycle_of
 from rlservo.envs.ur.rs_modes import ROS_ORDER, state_names
 from rlservo.envs.ur.server_state import state_dict
-from rlservo.envs.ur.simulation import SETTLE_CYCLES, VIEW, URSimulation
+from rlservo.envs.ur.simulation import SETTLE_CYCLES, VIEW
 
 INITIAL_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad], until the first SetState
 ROS_JOINTS = [JOINTS[index] for index in ROS_ORDER]
@@ -33,8 +35,12 @@ class URRobot:
 
     def __init__(self, settings: URSettings) -> None:
         self._settings = settings
-        self.simulation = URSimulation(
+        self.is_real = settings.robot != MUJOCO
+        self.simulation = make_arm(
+            settings.robot,
             settings.ur_model,
+            limits=settings.limits,
+            confirm=settings.confirm,
             max_velocity_scale=settings.max_velocity_scale_factor,
             cycle_s=self.cycle_s,
             objects=settings.object_names,
@@ -46,7 +52,8 @@ class URRobot:
         self._rng = np.random.default_rng(settings.seed)
         self._float_params: dict[str, float] = {}
         self._string_params: dict[str, str] = {}
-        self.simulation.place(INITIAL_JOINTS)
+        if not self.is_real:
+            self.simulation.place(INITIAL_JOINTS)
 
     @property
     def cycle_s(self) -> float:
@@ -69,7 +76,9 @@ class URRobot:
             if function is not None:  # else it stays out of the way
                 paths[index] = object_path(function, index, floats, self._rng) * self._to_base_link
         self._float_params, self._string_params = floats, strings
-        self.simulation.place(joints)
+        if self.simulation.place(joints) and self.is_real:
+            links = " and ".join(self.simulation.contacts()[0])
+            raise ValueError(f"a real arm is not sent where {links} would touch")
         self.simulation.move_objects(paths)
         self.simulation.settle()
         return SETTLE_CYCLES
@@ -81,6 +90,8 @@ class URRobot:
         for joint, value in zip(ROS_JOINTS, action, strict=True):
             if not math.isfinite(value):
                 raise ValueError(f"the action for {joint} is {value:g}: expected a finite number [rad]")
+        if self.simulation.stopped_by is not None:
+            raise ValueError(f"the robot has stopped ({self.simulation.stopped_by}): SetState connects again")
         target = np.array([action[index] for index in ROS_ORDER])
         if self._settings.action_mode == "delta_pos":
             target += self.simulation.joint_positions
@@ -92,6 +103,11 @@ class URRobot:
         self.simulation.hold()
         for _ in range(cycles):
             self.simulation.advance()
+
+    def close(self) -> None:
+        """Close the window, and stop a real arm."""
+        self.camera.close()
+        self.simulation.close()
 
     def _target_joints(self, target: RobotState) -> NDArray[np.float64]:
         names = [f"{joint}_joint_position" for joint in JOINTS]

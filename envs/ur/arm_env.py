@@ -26,10 +26,12 @@ from rlservo.envs.checks import (
     element,
 )
 from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
+from rlservo.envs.robots.arm import MUJOCO
+from rlservo.envs.robots.connect import make_arm
 from rlservo.envs.ur.model import BASE_HEIGHT
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, cycle_of
 from rlservo.envs.ur.server_state import state_dict
-from rlservo.envs.ur.simulation import VIEW, URSimulation
+from rlservo.envs.ur.simulation import VIEW
 
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
 BASE: NDArray[np.float64] = np.array([0.0, 0.0, BASE_HEIGHT])  # [m], base_link in MuJoCo's world
@@ -71,6 +73,9 @@ class URArmEnv(RenderedEnv):
         max_velocity_scale_factor: float | None = None,
         action_cycle_rate: float | None = None,
         render_mode: str | None = None,
+        robot: str = MUJOCO,
+        limits: Mapping[str, Any] | None = None,
+        confirm: bool = True,
         rs_address: str | None = None,
         ip: str | None = None,
         lower_bound_port: int | None = None,
@@ -86,8 +91,16 @@ class URArmEnv(RenderedEnv):
         super().__init__(render_mode, gui=gui)
         self.metadata = {**self.metadata, "render_fps": rate_hz}
         self._build = partial(
-            URSimulation, max_velocity_scale=scale, cycle_s=cycle_of(rate_hz), objects=self.OBJECTS, table=self.TABLE
+            make_arm,
+            robot,
+            limits=limits,
+            confirm=confirm,
+            max_velocity_scale=scale,
+            cycle_s=cycle_of(rate_hz),
+            objects=self.OBJECTS,
+            table=self.TABLE,
         )
+        self.is_real = robot != MUJOCO
         self._simulations = {ur_model: self._build(ur_model)}  # an arm that comes again is not built again
         self.simulation = self._simulations[ur_model]
         self._free = np.flatnonzero(~fixed)
@@ -140,6 +153,7 @@ class URArmEnv(RenderedEnv):
 
         observation = self._observation()
         reward, status = self._judge(observation, command)
+        status = status or self.simulation.stopped_by
         terminated = status is not None
         truncated = not terminated and self._steps >= self.MAX_STEPS
         if truncated:
@@ -149,13 +163,27 @@ class URArmEnv(RenderedEnv):
             info = {"final_status": status, "is_success": status == "success", **self._final_info(status)}
         if self._rs_state_to_info:
             info["rs_state"] = state_dict(self.simulation, self.RS_MODE)
+        if (robot := self.simulation.robot_info()) is not None:
+            info["robot"] = robot
         self._refresh_window()
         return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Free the GL context, close the window, and stop a real arm."""
+        for simulation in self._simulations.values():
+            simulation.close()
+        super().close()
+
+    def limited(self) -> dict[str, int] | None:
+        """Return in how many cycles of a real arm's command stream each limit was kept; None for a simulated arm."""
+        return self.simulation.limited()
 
     # -- for disturbances
 
     def set_robot_model(self, name: str) -> None:
-        """Put another arm on the table; `reset` is next. Raises ValueError naming the seven."""
+        """Put another arm on the table; `reset` is next. Raises ValueError naming the seven, and for a real arm."""
+        if self.is_real:
+            raise ValueError(f"a real arm cannot be exchanged for {name!r}")
         simulation = self._simulations.get(name) or self._simulations.setdefault(name, self._build(name))
         if simulation is not self.simulation:
             self.simulation = simulation
@@ -172,6 +200,10 @@ class URArmEnv(RenderedEnv):
         return {"rad/s": self.simulation.commanded_velocity}
 
     # -- for viewers
+
+    def take_over(self) -> None:
+        """Let a person lead a real arm by hand, or give it back. Raises ValueError for a simulated one."""
+        self.simulation.take_over()
 
     def robot_position(self) -> Vector:
         """Return tool0's position in MuJoCo's world [m] (3,)."""

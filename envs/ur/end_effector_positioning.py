@@ -264,3 +264,19 @@ class EndEffectorPositioningURSim(URArmEnv):
         if status != "success":
             self._success_joints = None
         return {"target_coord": self._target.copy()}
+
+
+class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
+    """The same task on a real arm: `robot` is 'rtde://192.168.0.2', say.
+
+    Observations, actions, rewards and endings are the simulated environment's, computed from the measured joints; a
+    robot that stops ends the episode with what stopped it as `final_status` (protective_stop, emergency_stop,
+    program_stopped, connection_lost, stale_observation ...). A step lasts a control cycle of real time. `reset` moves
+    the arm slowly to its start, in a straight line of joint space, after asking at the terminal.
+
+    Of its own are `limits` (names and defaults: `rlservo.envs.robots.limits.Limits`), `confirm` (False: `reset` does
+    not ask), and `info["robot"]`: the state, its changes, and the limits that were kept since the last step.
+    """
+
+    def __init__(self, *, robot: str, **arguments: Any) -> None:
+        super().__init__(robot=robot, **arguments)

@@ -8,6 +8,7 @@ objects stand or move along paths. The Gymnasium environments and the robot serv
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.disturbances import MAX_MODEL_ERROR
+from rlservo.envs.robots.arm import ArmState
 from rlservo.envs.ur.model import BASE_HEIGHT, TIMESTEP, build_model
 from rlservo.envs.ur.object_paths import UPDATE_RATE_HZ, Path
 from rlservo.envs.ur.parameters import JOINTS, ur_parameters
@@ -92,9 +94,30 @@ class URSimulation:
             self.model.actuator_gainprm.copy(),
             self.model.actuator_biasprm.copy(),
         )
+        self._trial: Any = None  # MjData for what nothing of the scene may move
         self._velocity: Vector = np.zeros(6)  # [rad/s], of the trajectory that is being executed
         self._remaining = 0  # substeps until that trajectory arrives
         self.in_collision = False
+
+    # -- of a real arm's mirror
+
+    stopped_by: str | None = None
+    """Why the arm does not move any more, as an episode's final status; a simulated one is never stopped."""
+
+    def robot_info(self) -> dict[str, Any] | None:
+        """Return what a step's info holds of a real robot."""
+        return None
+
+    def take_over(self) -> None:
+        """Let a person lead the arm, or give it back. Raises ValueError: a simulated arm cannot be led."""
+        raise ValueError("a simulated arm cannot be led by hand")
+
+    def limited(self) -> dict[str, int] | None:
+        """Return in how many cycles each limit of a real arm was kept."""
+        return None
+
+    def close(self) -> None:
+        """Free what the arm holds; a simulated one holds nothing."""
 
     # -- placing
 
@@ -196,6 +219,12 @@ class URSimulation:
         self._velocity[:] = 0.0
         self._remaining = 0
 
+    def drive(self, velocity: ArrayLike) -> None:
+        """Let one control cycle pass in which the setpoint moves at a velocity [rad/s] (6,)."""
+        self._velocity[:] = velocity
+        self._remaining = self._substeps
+        self.advance()
+
     def advance(self) -> None:
         """Let one control cycle pass. A contact in any physics step sets `in_collision` until the next `place`."""
         data = self.data
@@ -235,6 +264,13 @@ class URSimulation:
         """Joint velocities [rad/s] (6,) of the trajectory that is being executed; zero once it has arrived."""
         return self._velocity.copy() if self._remaining else np.zeros(6)
 
+    def arm_state(self) -> ArmState:
+        """Return the arm of this moment; a simulation's clock is its own."""
+        now = time.monotonic()
+        return ArmState(
+            self.joint_positions.copy(), self.joint_velocities.copy(), self.data.time, now, 0.0, "running", "normal"
+        )
+
     @property
     def joint_positions(self) -> Vector:
         """Joint positions [rad] (6,), a view into the simulation."""
@@ -257,18 +293,26 @@ class URSimulation:
 
         Damped least squares from where the arm is, so that it keeps its posture; nothing moves.
         """
-        goal = np.asarray(position, dtype=np.float64) + (0.0, 0.0, BASE_HEIGHT)
-        trial, jacobian = mujoco.MjData(self.model), np.zeros((3, self.model.nv))
-        trial.qpos[:] = self.data.qpos
+        goal = np.asarray(position, dtype=np.float64)
+        joints: Vector = self.joint_positions.copy()
         for _ in range(REACH_STEPS):
-            mujoco.mj_kinematics(self.model, trial)
-            mujoco.mj_comPos(self.model, trial)
-            way = goal - trial.site_xpos[self._tool]
-            mujoco.mj_jacSite(self.model, trial, jacobian, None, self._tool)
+            tool, jacobian = self.tool_at(joints)
+            way = goal - tool
             way *= min(1.0, REACH_STEP / max(float(np.linalg.norm(way)), 1e-9))
             damped = jacobian @ jacobian.T + REACH_DAMPING**2 * np.eye(3)
-            trial.qpos += jacobian.T @ np.linalg.solve(damped, way)
-        return np.array(trial.qpos)
+            joints += jacobian.T @ np.linalg.solve(damped, way)
+        return joints
+
+    def tool_at(self, joint_positions: ArrayLike) -> tuple[Vector, Vector]:
+        """Return where tool0 would be in base_link [m] (3,) and its Jacobian [m/rad] (3, 6); nothing moves."""
+        if self._trial is None:
+            self._trial = mujoco.MjData(self.model)
+        trial, jacobian = self._trial, np.zeros((3, self.model.nv))
+        trial.qpos[:] = joint_positions
+        mujoco.mj_kinematics(self.model, trial)
+        mujoco.mj_comPos(self.model, trial)
+        mujoco.mj_jacSite(self.model, trial, jacobian, None, self._tool)
+        return trial.site_xpos[self._tool] - (0.0, 0.0, BASE_HEIGHT), jacobian
 
     @property
     def tool_rotation(self) -> Vector:

@@ -158,6 +158,11 @@ class Episode:
         )
 
     @property
+    def robot(self) -> list[dict[str, Any]]:
+        """Return for each row what a real robot's step said of it (`state`, `changes`, `limited`); empty elsewhere."""
+        return [{} if one is None else one.get("robot", {}) for one in self._outcomes]
+
+    @property
     def warnings(self) -> list[tuple[int, str]]:
         """Return (row, sentence) of everything that was warned of."""
         return [(row, text) for row, one in enumerate(self._decisions) for text in one.get("warnings", ())]

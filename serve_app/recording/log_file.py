@@ -110,6 +110,7 @@ class LogFile:
             "terminated": record.terminated or None,
             "truncated": record.truncated or None,
             "final_status": record.final_status,
+            "robot": record.robot,
         }
         self._add_rows("outcome", record, columns, _members(ending))
 

@@ -268,8 +268,27 @@ def outcome_schema(policy: PolicyFormat) -> dict[str, Any]:
             "final_status": _text("How the episode ended, in the environment's word"),
             "final_obs": {**policy.observations.schema(), "description": "The observation after the last action"},
             "commanded": {**policy.actions.schema(), "description": "What the robot was commanded instead"},
+            "robot": _object("Of a real robot", _ROBOT),
         },
     )
+
+
+_ROBOT: dict[str, Any] = {
+    "state": {"type": "string", "description": "Of the state machine around the policy; 'human': taken over"},
+    "changes": {
+        "type": "array",
+        "description": "Of the state, since the last decision",
+        "items": {
+            "type": "object",
+            "properties": {
+                "wall_s": {"type": "number", "description": "[s] since 1970"},
+                "state": {"type": "string"},
+                "why": {"type": "string"},
+            },
+        },
+    },
+    "limited": {"type": "object", "description": "Cycles in which a limit was kept, by element", "properties": {}},
+}
 
 
 DROPPED_SCHEMA: dict[str, Any] = {

@@ -54,6 +54,8 @@ class WithRecording(ActingPolicy):
         self._format_contract: Contract | None = None
         self._episode = ""
         self._step = 0
+        self.robot: Mapping[str, Any] | None = None
+        """What the next outcome holds of a real robot; whoever has its `info` sets it."""
         self.begin()
 
     @property
@@ -194,8 +196,9 @@ class WithRecording(ActingPolicy):
             record.warnings = getattr(self._source, "last_notices", ())  # of a policy in process
 
     def _add_outcome(self, **fields: Any) -> None:
+        robot, self.robot = self.robot, None
         if self._format is not None and self._step:
-            self.recorder.record(OutcomeRecord(self._format, self._episode, self._step - 1, **fields))
+            self.recorder.record(OutcomeRecord(self._format, self._episode, self._step - 1, robot=robot, **fields))
 
 
 def _innermost(policy: Any) -> Any:

@@ -69,6 +69,8 @@ class OutcomeRecord:
     """The observation after an episode's last action, which no decision holds."""
     commanded: Any = None
     """What the robot was commanded instead of the action."""
+    robot: Mapping[str, Any] | None = None
+    """Of a real robot: its state, its changes, and the limits that were kept."""
     rows: int = 1
     """Of the decision."""
     wall_ns: int = field(default_factory=time.time_ns)

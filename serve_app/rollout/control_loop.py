@@ -20,7 +20,7 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.interface import ActingPolicy, Observation
 from rlservo.serve_app.recording.start import record_policy
 from rlservo.serve_app.rollout.disturbance import disturb_env, parse_disturbance
-from rlservo.serve_app.rollout.environment import check_fit, control_rate_of, make_env
+from rlservo.serve_app.rollout.environment import check_fit, check_proven, control_rate_of, make_env
 from rlservo.serve_app.rollout.episode import Episode, EpisodeEnv, run_episode, success_of
 from rlservo.serve_app.rollout.fallback import LinkCounts, StoppedError, WithFallback
 from rlservo.serve_app.rollout.report import EpisodeRow, Link, Rate, RolloutReport, latency_of, wilson_interval
@@ -28,6 +28,7 @@ from rlservo.serve_app.rollout.smoothness import MeasuredEnv
 from rlservo.serve_app.rollout.video import FilmedEnv, VideoFile
 
 if TYPE_CHECKING:
+    from rlservo.serve_app.recording.recorded_policy import WithRecording
     from rlservo.serve_app.recording.recorder import Recorder
 
 OnEpisode = Callable[[EpisodeRow], None]
@@ -47,6 +48,7 @@ def rollout(
     record: str | Path | Recorder | None = None,
     on_episode: OnEpisode | None = None,
     disturb: str | None = None,
+    unproven: bool = False,
 ) -> RolloutReport:
     """Run `episodes` episodes of `env_id` with `policy` and return what came of it.
 
@@ -57,6 +59,7 @@ def rollout(
     A policy behind a URL is told rewards and ends, for a server that records or promotes by success. `record` receives
     every decision with its reward and end: a new .mcap file, a folder, or a Recorder.
     `disturb` disturbs environment and robot (`latency=3,noise=real`; `disturbance.py` has the kinds).
+    A real robot takes a policy only if its contract has an evaluation under latency, or with `unproven`.
     `on_episode` is called after each episode. Ctrl-C returns what was finished, with `interrupted` set; so does a
     fallback (`WithFallback`) that is to stop, with `stopped`.
 
@@ -78,6 +81,8 @@ def rollout(
         env = make_env(env_id, arguments, render=video is not None)
         cleanup.callback(env.close)
         check_fit(contract, env, arguments)
+        if not unproven:
+            check_proven(contract, env)
         control_rate_hz = control_rate_of(env, arguments, contract)
         if control_rate_hz is None and (rate == "real" or video is not None):
             purpose = "rate 'real'" if rate == "real" else "a video"
@@ -109,7 +114,7 @@ def rollout(
                     measured.env = FilmedEnv(acted, video_file.add)
                 loop_env: EpisodeEnv = measured
                 if report_outcome is not None:
-                    loop_env = _ReportedEnv(loop_env, report_outcome)
+                    loop_env = _ReportedEnv(loop_env, report_outcome, recording)
                 episode = run_episode(
                     loop_env,
                     paced,
@@ -127,6 +132,8 @@ def rollout(
         except StoppedError as error:
             stopped = error.message
         wall_s = time.perf_counter() - began
+        limited: Callable[[], dict[str, int] | None] = getattr(env.unwrapped, "limited", lambda: None)
+        robot = limited()
     latencies_s = paced.latencies_s
     outcomes = [row.success for row in rows if row.success is not None]
     returns = np.array([row.episode_return for row in rows])
@@ -160,6 +167,7 @@ def rollout(
         stopped=stopped,
         disturbance=disturb,
         step_sizes=measured.sizes(),
+        robot=robot,
     )
 
 
@@ -243,6 +251,7 @@ class _ReportedEnv:
 
     env: EpisodeEnv
     report_outcome: Callable[..., None]
+    recording: WithRecording | None = None
 
     def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
         return self.env.reset(seed=seed)
@@ -254,6 +263,8 @@ class _ReportedEnv:
         status = info.get("final_status") if is_over else None
         if status is None and is_over and success_of(info):
             status = "success"
+        if self.recording is not None:
+            self.recording.robot = info.get("robot")
         self.report_outcome(
             float(reward),
             terminated=bool(terminated),

@@ -37,6 +37,18 @@ def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.
         raise UsageError(f"environment {env_id!r} cannot be made with {arguments}: {error}") from error
 
 
+def check_proven(contract: Contract, env: gym.Env[Any, Any]) -> None:
+    """Raise UsageError where the robot is a real one and the policy was never evaluated under latency."""
+    if not getattr(env.unwrapped, "is_real", False):
+        return
+    if not any("latency" in (one.disturbance or "") for one in contract.evaluations):
+        raise UsageError(
+            f"policy '{contract.name}' version {contract.version} was never evaluated under latency: measure the robot "
+            "with `rlservo robot-latency`, evaluate with the `rlservo verify --disturb ... --write` that it prints, or "
+            "pass --unproven"
+        )
+
+
 def control_rate_of(env: gym.Env[Any, Any], arguments: Mapping[str, Any], contract: Contract) -> float | None:
     """Return the rate at which actions are due [Hz]: the environment's own word, else the contract's, else render_fps.
 

@@ -79,6 +79,7 @@ class RolloutReport:
     stopped: str | None = None  # why the loop ended before its episodes did: the fallback is 'stop'
     disturbance: str | None = None  # what was laid around the environment, as it was written
     step_sizes: dict[str, StepSize] = field(default_factory=dict)  # of "action", and of velocities by unit
+    robot: dict[str, int] | None = None  # a real robot's limits: in how many of its cycles each was kept
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types."""
@@ -165,6 +166,9 @@ def render_report(report: RolloutReport) -> Table:
         )
         if link.fallback is not None:
             table.add_row("fallback", f"{link.fallback_steps} of {report.steps} steps ({link.fallback})")
+    if report.robot is not None:
+        kept = ", ".join(f"{name} {count}" for name, count in report.robot.items()) or "none"
+        table.add_row("limits kept", f"{kept} (cycles of the command stream)")
     if report.stopped is not None:
         table.add_row("stopped", report.stopped)
     table.add_row("speed", f"{report.steps_per_s:,.0f} steps/s over {report.wall_s:.1f} s, rate '{report.rate}'")

@@ -1,0 +1,35 @@
+"""Arms by their address: a simulated scene for `mujoco`, a real arm's mirror for `rtde://HOST`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rlservo.envs.robots.arm import host_of
+from rlservo.envs.ur.simulation import URSimulation
+
+
+def make_arm(
+    robot: str, ur_model: str, *, limits: Mapping[str, Any] | None = None, confirm: bool = True, **scene: Any
+) -> URSimulation:
+    """Return the arm and its scene; `scene` is `URSimulation`'s. Raises RobotError where there is none to be had."""
+    host = host_of(robot)
+    if host is None:
+        return URSimulation(ur_model, **scene)
+    from rlservo.envs.robots.limits import Limits
+    from rlservo.envs.robots.mirror import MirroredSimulation
+    from rlservo.envs.robots.operator_terminal import Operator
+    from rlservo.envs.robots.rtde_arm import RtdeArm
+
+    checked = Limits.of(dict(limits or {}))
+
+    def connect(setpoint_timeout_s: float) -> RtdeArm:
+        return RtdeArm(
+            host,
+            ur_model,
+            velocity_scale=scene["max_velocity_scale"],
+            setpoint_timeout_s=setpoint_timeout_s,
+            limits=checked,
+        )
+
+    return MirroredSimulation(ur_model, connect=connect, operator=Operator(is_asked=confirm), **scene)

@@ -1,0 +1,175 @@
+"""Limits of a real arm's motion, kept with braking distance: an arm near a limit slows down, it does not freeze.
+
+Everything is in closed form, once a cycle of the command stream: what is wanted is a velocity, what comes out is the
+next joint setpoint. Limits of velocity, tool speed and workspace are met before the acceleration's, which then mixes
+the old velocity and the new: both keep those limits, and so does every mixture. Joint positions come last.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.envs.robots.arm import RobotError
+from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
+from rlservo.envs.ur.simulation import URSimulation
+
+Vector = NDArray[np.float64]
+
+# What was limited, by element: the order of the counts.
+COUNTED = (
+    *(f"{kind}.{joint}" for kind in ("position", "velocity", "acceleration") for joint in JOINTS),
+    "tool_speed", *(f"workspace.{axis}" for axis in "xyz"), "late_setpoint", "stale_observation",
+)  # fmt: skip
+POSITION, VELOCITY, ACCELERATION = (COUNTED.index(f"{kind}.base") for kind in ("position", "velocity", "acceleration"))
+TOOL_SPEED, WORKSPACE, LATE = (COUNTED.index(name) for name in ("tool_speed", "workspace.x", "late_setpoint"))
+PASSES = 2  # over the three axes: taking from one adds to another in a corner
+WALL_MARGIN = 0.03  # [m], by which walls stand further in: for the curvature that the closed form leaves out
+SHARE = 0.5  # of a tool axis' braking ability that a wall counts on: joints have other limits to keep meanwhile
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of the command stream; the controller's own safety limits stand behind them."""
+
+    speed_scale: float = 1.0  # of all velocities below; a first run takes 0.1
+    acceleration: float = 5.0  # [rad/s^2] of every joint, also to stop
+    tool_speed: float = 0.5  # [m/s]
+    box_low: tuple[float, ...] = (-2.0, -2.0, 0.0)  # [m], tool0 in base_link
+    box_high: tuple[float, ...] = (2.0, 2.0, 2.0)  # [m]
+    position_low: tuple[float, ...] = tuple(-limit for limit in POSITION_LIMITS)  # [rad]
+    position_high: tuple[float, ...] = POSITION_LIMITS  # [rad]
+    start_speed: float = 0.3  # [rad/s], of the way to a start pose
+    blend_s: float = 1.0  # [s], in which the policy's share of the speed grows from 0 to 1
+    watchdog_hz: float = 10.0  # the controller ends the program after 1 / watchdog_hz without a command
+    lookahead_s: float = 0.1  # [s], servoj's
+    gain: float = 300.0  # servoj's
+    rate_hz: float = 0.0  # of the command stream; 0: the robot's own, 125 or 500 Hz
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "speed_scale": (0.001, 1.0), "acceleration": (0.1, 15.0), "tool_speed": (0.01, 3.0),
+            "start_speed": (0.01, 1.0), "blend_s": (0.0, 60.0), "watchdog_hz": (1.0, 100.0),
+            "lookahead_s": (0.03, 0.2), "gain": (100.0, 2000.0), "rate_hz": (0.0, 500.0),
+        }  # fmt: skip
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if not (isinstance(value, (int, float)) and low <= value <= high):
+                raise RobotError(f"limits: {name} is {value!r}: expected a number from {low:g} to {high:g}")
+        for name, size in (("box", 3), ("position", 6)):
+            low_values, high_values = getattr(self, f"{name}_low"), getattr(self, f"{name}_high")
+            if not len(low_values) == len(high_values) == size or not np.all(np.less(low_values, high_values)):
+                raise RobotError(f"limits: {name}_low and {name}_high: expected {size} numbers each, low below high")
+
+    @classmethod
+    def of(cls, values: dict[str, object]) -> Limits:
+        """Return the limits with some values replaced. Raises RobotError for names that do not exist."""
+        names = [one.name for one in fields(cls)]
+        unknown = [name for name in values if name not in names]
+        if unknown:
+            raise RobotError(f"limits: {', '.join(unknown)} does not exist: expected some of {', '.join(names)}")
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})  # type: ignore[arg-type]  # checked above
+
+
+def braking_speed(distance: Vector | float, deceleration: Vector | float, dt: float) -> Vector:
+    """Return the speed from which `distance` suffices to stop, one more cycle of `dt` [s] included."""
+    reach = np.asarray(deceleration) * dt
+    return np.sqrt(reach**2 + 2.0 * np.asarray(deceleration) * np.maximum(distance, 0.0)) - reach
+
+
+@dataclass
+class MotionLimiter:
+    """The joint setpoint of the command stream: position and velocity, moved on by `step`."""
+
+    limits: Limits
+    simulation: URSimulation  # for the tool's place and Jacobian
+    velocity_limits: Vector  # [rad/s], (6,)
+    longest_dt: float  # [s], of a step
+    position: Vector = field(default_factory=lambda: np.zeros(6))
+    velocity: Vector = field(default_factory=lambda: np.zeros(6))
+    limited: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(len(COUNTED), dtype=np.bool_))
+
+    def __post_init__(self) -> None:
+        self._low, self._high = np.array(self.limits.position_low), np.array(self.limits.position_high)
+        self._box_low, self._box_high = np.array(self.limits.box_low), np.array(self.limits.box_high)
+        self._box_low, self._box_high = self._box_low + WALL_MARGIN, self._box_high - WALL_MARGIN
+
+    def restart(self, position: Sequence[float]) -> None:
+        """Stand at measured joint positions [rad] (6,)."""
+        self.position, self.velocity = np.array(position, dtype=np.float64), np.zeros(6)
+
+    def goal_within(self, goal: Vector) -> Vector:
+        """Return the goal within the position limits, and note the joints that were outside."""
+        within: Vector = np.clip(goal, self._low, self._high)
+        self.limited[POSITION : POSITION + 6] |= within != goal
+        return within
+
+    def velocity_towards(self, goal: Vector, remaining_s: float, dt: float) -> Vector:
+        """Return the velocity that reaches `goal` in the time that remains, without running past it."""
+        way = goal - self.position
+        if remaining_s > dt:
+            want = way / remaining_s
+            self.limited[VELOCITY : VELOCITY + 6] |= np.abs(want) > self.velocity_limits * 1.001
+        else:  # it should be there: as fast as it may
+            want = way * min(1.0 / dt, float((self.velocity_limits / np.maximum(np.abs(way), 1e-12)).min()))
+        bound = braking_speed(np.abs(way), self.limits.acceleration, dt)
+        clipped: Vector = np.clip(want, -bound, bound)
+        return clipped
+
+    def step(self, want: Vector, dt: float, scale: float) -> Vector:
+        """Move the setpoint on by `dt` [s], towards the velocity `want`, at most `scale` of the limits; return it."""
+        velocity = want * min(1.0, float((self.velocity_limits / np.maximum(np.abs(want), 1e-12)).min())) * scale
+        tool, jacobian = self.simulation.tool_at(self.position)
+        velocity = self._within_box(velocity, tool, jacobian)
+        most = self.velocity_limits * scale
+        velocity = velocity * min(1.0, float((most / np.maximum(np.abs(velocity), 1e-12)).min()))
+        velocity = self._within_tool_speed(velocity, jacobian)
+
+        change = velocity - self.velocity
+        most_change = self.limits.acceleration * dt
+        largest = float(np.abs(change).max())
+        if largest > most_change * 1.0001:
+            if largest > 2.0 * most_change:
+                self.limited[ACCELERATION : ACCELERATION + 6] |= np.abs(change) > 2.0 * most_change
+            # In this mixture a wall may be braked for too little, where other joints change more: it has precedence.
+            mixed = self._within_box(self.velocity + change * (most_change / largest), tool, jacobian)
+            velocity = np.clip(mixed, self.velocity - most_change, self.velocity + most_change)
+            velocity = np.clip(velocity, np.minimum(-most, self.velocity), np.maximum(most, self.velocity))
+        upper = braking_speed(self._high - self.position, self.limits.acceleration, self.longest_dt)
+        lower = -braking_speed(self.position - self._low, self.limits.acceleration, self.longest_dt)
+        bounded = np.clip(velocity, lower, upper)
+        self.limited[POSITION : POSITION + 6] |= np.abs(bounded - velocity) > 1e-9
+        self.velocity = np.clip(bounded, self.velocity - most_change, self.velocity + most_change)
+        self.position = self.position + self.velocity * dt
+        return self.position
+
+    def _within_box(self, velocity: Vector, tool: Vector, jacobian: Vector) -> Vector:
+        """Take from a velocity what would carry the tool through a wall; along the wall it goes on."""
+        squares = np.maximum((jacobian**2).sum(axis=1), 1e-6)
+        decelerations = SHARE * self.limits.acceleration * squares / np.maximum(np.abs(jacobian).max(axis=1), 1e-3)
+        most = braking_speed(self._box_high - tool, decelerations, self.longest_dt)
+        least = -braking_speed(tool - self._box_low, decelerations, self.longest_dt)
+        for _ in range(PASSES):
+            speeds = jacobian @ velocity
+            excess = speeds - np.clip(speeds, least, most)
+            if not excess.any():
+                break
+            self.limited[WORKSPACE : WORKSPACE + 3] |= excess != 0.0
+            for axis in np.flatnonzero(excess):
+                row = jacobian[axis]
+                speed = float(row @ velocity)
+                allowed = min(max(speed, float(least[axis])), float(most[axis]))
+                velocity = velocity + row * ((allowed - speed) / float(squares[axis]))
+        return velocity
+
+    def _within_tool_speed(self, velocity: Vector, jacobian: Vector) -> Vector:
+        speed = math.sqrt(float(((jacobian @ velocity) ** 2).sum()))
+        most = 0.95 * self.limits.tool_speed
+        if speed <= most:
+            return velocity
+        self.limited[TOOL_SPEED] = True
+        return velocity * (most / speed)

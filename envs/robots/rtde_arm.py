@@ -1,0 +1,197 @@
+"""A real UR arm: the command stream's process, seen from the process that has the policy."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import subprocess
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlservo.envs.robots.arm import STOP_NAMES, ArmState, RobotError
+from rlservo.envs.robots.command_stream import FAILED, ORDERS, READY, REPORT, Order, Phase, StreamSettings
+from rlservo.envs.robots.limits import COUNTED, Limits
+from rlservo.envs.robots.shared_block import SharedBlock, make_file
+
+CONNECT_TIMEOUT_S = 60.0
+END_TIMEOUT_S = 8.0
+SILENCE_S = 5.0  # [s] without a report, after which the process counts as dead
+REACHED = 0.01  # [rad]
+AT_REST = 0.01  # [rad/s]
+LOOK_S = 0.01
+LINE_S = 2.0  # [s], for the sentence of a fault that is known
+
+Vector = NDArray[np.float64]
+
+
+class RtdeArm:
+    """An arm behind a UR controller. `close` stops it and ends the process."""
+
+    def __init__(
+        self,
+        host: str,
+        ur_model: str,
+        *,
+        velocity_scale: float = 0.1,
+        setpoint_timeout_s: float = 0.25,
+        limits: Limits | None = None,
+    ) -> None:
+        """Connect and check the robot. Raises RobotError where it is another, not ready, or not to be reached.
+
+        `velocity_scale` is of the data sheet's velocities; after `setpoint_timeout_s` without a `command` it holds.
+        """
+        self.host, self.limits = host, limits or Limits()
+        orders, report = make_file(ORDERS), make_file(REPORT)
+        self._orders, self._report = SharedBlock(orders, ORDERS), SharedBlock(report, REPORT)
+        settings = StreamSettings(host, ur_model, velocity_scale, setpoint_timeout_s, self.limits, orders, report)
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "rlservo.envs.robots.command_stream", settings.to_json()],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=(orders, report),
+            env={"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ},
+            start_new_session=True,  # Ctrl-C in our terminal is ours to handle
+        )
+        os.close(orders)
+        os.close(report)
+        self._number, self._fault = 0, ""
+        try:
+            line = self._read_line(CONNECT_TIMEOUT_S)
+            if line != READY:
+                raise RobotError(
+                    line.removeprefix(FAILED) or f"the command stream to {host} ended, or was silent for 60 s"
+                )
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """The command stream's process id."""
+        return self._process.pid
+
+    def arm_state(self) -> ArmState:
+        """Return the newest state."""
+        report = self._report.read()
+        safety, mode = int(report["safety_mode"]), int(report["robot_mode"])
+        return ArmState(
+            positions=report["positions"],
+            velocities=report["velocities"],
+            time_s=float(report["time_s"]),
+            received_s=float(report["received_s"]),
+            age_s=float(report["age_s"]),
+            mode="running" if mode == 7 else f"robot mode {mode}",
+            safety={1: "normal", 2: "reduced"}.get(safety) or STOP_NAMES.get(safety, f"safety mode {safety}"),
+        )
+
+    def command(self, joint_positions: ArrayLike, duration_s: float = 0.5) -> None:
+        """Replace the setpoint: be at joint positions [rad] (6,) in `duration_s` [s], as far as limits allow.
+
+        Raises ValueError for what is not finite.
+        """
+        goal = np.asarray(joint_positions, dtype=np.float64)
+        if goal.shape != (6,) or not np.isfinite(goal).all():
+            raise ValueError(f"the setpoint is {goal.tolist()}: expected 6 finite joint positions [rad]")
+        self._give(Order.FOLLOW, goal=goal, duration_s=duration_s)
+
+    def hold(self) -> None:
+        """Decelerate and stand."""
+        self._give(Order.HOLD)
+
+    def free(self) -> None:
+        """Let a person lead the arm by hand, once it stands."""
+        self._give(Order.FREE)
+
+    def blend_in(self, *, at_once: bool = False) -> None:
+        """Stand, and let the speed of the commands to come grow from 0, or be full `at_once`."""
+        self._give(Order.HOLD, blend_from_s=0.0 if at_once else time.monotonic())
+
+    def go_to(self, joint_positions: ArrayLike) -> None:
+        """Move slowly to joint positions [rad] (6,) and wait until the arm stands there. Raises RobotError."""
+        goal = np.asarray(joint_positions, dtype=np.float64)
+        self._give(Order.GO, goal=goal)
+        slowest = self.limits.start_speed * self.limits.speed_scale
+        limit = time.monotonic() + 30.0 + 5.0 * float(np.abs(goal - self.arm_state().positions).max()) / slowest
+        while True:
+            state = self.arm_state()
+            if np.abs(state.positions - goal).max() < REACHED and np.abs(state.velocities).max() < AT_REST:
+                break
+            if fault := self.fault():
+                raise RobotError(f"on the way to its start the robot stopped: {fault}")
+            if time.monotonic() > limit:
+                away = float(np.abs(state.positions - goal).max())
+                self.hold()
+                raise RobotError(
+                    f"the robot does not reach its start, a joint is {away:.3f} rad away: see the speed slider, and "
+                    "whether limits are in the way"
+                )
+            time.sleep(LOOK_S)
+        self.hold()
+
+    # -- what the stream tells
+
+    def phase(self) -> Phase:
+        """Return what the stream does."""
+        return Phase(int(self._report.read()["phase"]))
+
+    def blend(self) -> float:
+        """Return the policy's share of the speed, 0 to 1."""
+        return float(self._report.read()["blend"])
+
+    def setpoint(self) -> Vector:
+        """Return the joint positions [rad] (6,) that the stream commands now."""
+        setpoint: Vector = self._report.read()["setpoint"]
+        return setpoint
+
+    def limited(self) -> dict[str, int]:
+        """Return how many cycles of the stream each limit was kept in, by element; what never happened is left out."""
+        counts = self._report.read()["limited"]
+        return {name: int(count) for name, count in zip(COUNTED, counts, strict=True) if count}
+
+    def longest_gap_s(self) -> float:
+        """Return the longest time between two commands to the robot [s]."""
+        return float(self._report.read()["longest_gap_s"])
+
+    def fault(self) -> str:
+        """Return why the arm does not take commands any more; empty where it does."""
+        if not self._fault:
+            if self._process.poll() is not None or self.phase() == Phase.FAULT:
+                line = self._read_line(LINE_S)
+                self._fault = line.removeprefix(FAILED) or "stream_ended: the command stream's process was killed"
+            elif time.monotonic() - float(self._report.read()["written_s"]) > SILENCE_S:
+                self._fault = "stream_silent: the command stream's process does not run"
+        return self._fault
+
+    def close(self) -> None:
+        """Stop the arm and end the process; where that hangs, kill it, and the watchdog stops the arm."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+
+    def _give(self, order: Order, **values: Any) -> None:
+        self._number += 1
+        self._orders.write({"order": order, "given_s": time.monotonic(), "number": self._number, **values})
+
+    def _read_line(self, timeout_s: float) -> str:
+        """Return the process's next line; empty where it ended without one, or nothing came in time."""
+        assert self._process.stdout is not None
+        pipe, output, limit = self._process.stdout.fileno(), b"", time.monotonic() + timeout_s
+        with selectors.DefaultSelector() as selector:
+            selector.register(pipe, selectors.EVENT_READ)
+            while b"\n" not in output and selector.select(max(0.0, limit - time.monotonic())):
+                part = os.read(pipe, 4096)
+                if not part:
+                    break
+                output += part
+        return output.decode(errors="replace").strip()

@@ -1,0 +1,289 @@
+"""The simulated controller: the arm, its safety stops, its registers and the program that runs on it.
+
+One call of `tick` is one control cycle. Time is the controller's own: cycles since it was started.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
+from rlservo.envs.ur.simulation import URSimulation
+from rlservo.envs.ur_controller.motion import Motion, MoveJ, Ramp, Servo
+from rlservo.envs.ur_controller.program import control_program
+
+log = logging.getLogger("rlservo.ur_controller")
+
+START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
+LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
+STOP_DECELERATION = 10.0  # [rad/s^2], of every stop that no program asks for
+LARGEST_ACCELERATION = 40.0  # [rad/s^2] of a setpoint; more is a jump, and a protective stop
+UNLOCK_S = 5.0  # [s] after a protective stop before it can be unlocked, as on the arm
+REGISTERS = 48
+TRACE = 60_000  # control cycles
+HISTORY = 600
+
+Vector = NDArray[np.float64]
+
+
+class RobotMode(IntEnum):
+    """RTDE's `robot_mode`, as far as it happens here."""
+
+    POWER_OFF = 3
+    IDLE = 5
+    RUNNING = 7
+
+
+class SafetyMode(IntEnum):
+    """RTDE's `safety_mode`, as far as it happens here."""
+
+    NORMAL = 1
+    PROTECTIVE_STOP = 3
+    ROBOT_EMERGENCY_STOP = 7
+
+
+class Sample(NamedTuple):
+    """The arm at the end of a control cycle."""
+
+    time_s: float
+    positions: Vector  # [rad], (6,)
+    velocities: Vector  # [rad/s], (6,)
+    setpoint_velocity: Vector  # [rad/s], (6,)
+
+
+@dataclass
+class _Watchdog:
+    register: int
+    period_s: float
+    fed_at_s: float
+
+
+class Controller:
+    """One arm and the program on it. Not thread-safe: one loop calls it."""
+
+    def __init__(self, ur_model: str = "ur5e") -> None:
+        self.ur_model = ur_model
+        self.is_e_series = ur_model.endswith("e")
+        self.rate_hz = 500.0 if self.is_e_series else 125.0
+        self.version = (5, 12, 2, 1101534) if self.is_e_series else (3, 15, 8, 106339)
+        self.dt = 1.0 / self.rate_hz
+        self.simulation = URSimulation(ur_model, max_velocity_scale=1.0, cycle_s=self.dt, objects=())
+        self.simulation.place(START_JOINTS)
+        self.inputs_int, self.inputs_double = [0] * REGISTERS, [0.0] * REGISTERS
+        self.outputs_int, self.outputs_double = [0] * REGISTERS, [0.0] * REGISTERS
+        self.robot_mode, self.safety_mode = RobotMode.RUNNING, SafetyMode.NORMAL
+        self.is_remote = True
+        self.speed_fraction = 1.0
+        self.payload_kg = 0.0
+        self.ticks = 0
+        self.held_up_s = 0.0  # since the start, by the machine
+        self.trace: deque[Sample] = deque(maxlen=TRACE)
+        self.stop_reasons: list[tuple[float, str]] = []  # when [s], why
+        self._velocity: Vector = np.zeros(6)  # [rad/s], of the setpoint
+        self._motion: Motion | None = None
+        self._is_free = False
+        self._program: Iterator[None] | None = None
+        self._watchdog: _Watchdog | None = None
+        self._stopped_at_s = 0.0
+
+    # -- reading
+
+    @property
+    def time_s(self) -> float:
+        """Time since the controller was started [s]."""
+        return self.ticks * self.dt
+
+    @property
+    def is_program_running(self) -> bool:
+        """Whether a program runs."""
+        return self._program is not None
+
+    @property
+    def is_free(self) -> bool:
+        """Whether a person leads the arm by hand."""
+        return self._is_free
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the setpoint moves, or is about to."""
+        return self._motion is not None or bool(self._velocity.any())
+
+    @property
+    def target(self) -> Vector:
+        """The joint setpoint [rad] (6,)."""
+        setpoint: Vector = self.simulation.data.act
+        return setpoint
+
+    @property
+    def target_velocity(self) -> Vector:
+        """The setpoint's velocity [rad/s] (6,)."""
+        return self._velocity
+
+    def tool_pose(self) -> list[float]:
+        """Return x, y, z [m] and a rotation vector [rad] of the flange in the controller's `base` frame."""
+        x, y, z = self.simulation.tool_position.tolist()
+        quaternion, vector = np.empty(4), np.empty(3)
+        mujoco.mju_mat2Quat(quaternion, self.simulation.tool_rotation.reshape(9))
+        w, i, j, k = quaternion.tolist()
+        mujoco.mju_quat2Vel(vector, np.array([-k, -j, i, w]), 1.0)  # `base` is base_link turned by pi about z
+        return [-x, -y, z, *vector.tolist()]
+
+    def positions_before(self, cycles: int) -> list[float]:
+        """Return the joint positions [rad] of so many control cycles ago."""
+        index = max(len(self.trace) - 1 - min(max(cycles, 0), HISTORY), 0)
+        positions: list[float] = (self.trace[index].positions if self.trace else np.array(START_JOINTS)).tolist()
+        return positions
+
+    # -- programs
+
+    def load_program(self, text: str) -> None:
+        """Run a URScript program, as far as it is known: ur_rtde's control script. One that runs is ended."""
+        if not self.is_remote:
+            log.warning("a program was refused: the controller is in local control")
+            return
+        if self.robot_mode != RobotMode.RUNNING or self.safety_mode != SafetyMode.NORMAL:
+            log.warning("a program was refused: the robot is %s, %s", self.robot_mode.name, self.safety_mode.name)
+            return
+        self.stop_program("another program was loaded")
+        self._program = control_program(self, text)
+
+    def stop_program(self, why: str) -> None:
+        """End the program; the arm decelerates to a halt."""
+        if self._program is not None:
+            log.info("%.3f s: the program ends: %s", self.time_s, why)
+            self.stop_reasons.append((self.time_s, why))
+        self._program, self._watchdog, self._is_free = None, None, False
+        self.stop(STOP_DECELERATION)
+
+    def set_watchdog(self, register: int, min_frequency_hz: float) -> None:
+        """End the program when an input register is not written for 1 / `min_frequency_hz`; 0 ends the watch."""
+        period_s = 1.0 / min_frequency_hz if min_frequency_hz > 0.0 else 0.0
+        self._watchdog = _Watchdog(register, period_s, self.time_s) if period_s else None
+
+    def feed_watchdog(self, register: int) -> None:
+        """Note that an input register was written."""
+        if self._watchdog is not None and self._watchdog.register == register:
+            self._watchdog.fed_at_s = self.time_s
+
+    def excuse(self, held_up_s: float) -> None:
+        """Leave time [s] for which the controller itself was held up, and that it makes good now, to no one's debit."""
+        self.held_up_s += held_up_s
+        if self._watchdog is not None:
+            self._watchdog.fed_at_s += held_up_s
+
+    # -- motions
+
+    def servo(self, target: ArrayLike, lookahead_s: float) -> None:
+        """Follow a target [rad] (6,)."""
+        goal = np.asarray(target, dtype=np.float64)
+        if isinstance(self._motion, Servo):
+            self._motion.retarget(goal, lookahead_s)
+        else:
+            self._motion = Servo(goal, lookahead_s)
+
+    def speed(self, velocity: ArrayLike, acceleration: float) -> None:
+        """Take up a velocity [rad/s] (6,)."""
+        self._motion = Ramp(np.asarray(velocity, dtype=np.float64), acceleration)
+
+    def move(self, goal: ArrayLike, speed: float, acceleration: float) -> None:
+        """Move to joint positions [rad] (6,) and stand there."""
+        self._motion = MoveJ(self.target, np.asarray(goal, dtype=np.float64), speed, acceleration)
+
+    def stop(self, deceleration: float) -> None:
+        """Decelerate to a halt."""
+        self._motion = Ramp(np.zeros(6), deceleration)
+
+    def set_free(self, is_free: bool) -> None:
+        """Let a person lead the arm by hand, or hold it again."""
+        self._is_free = is_free
+        if is_free:
+            self._motion, self._velocity = None, np.zeros(6)
+
+    # -- stops
+
+    def stop_protectively(self, why: str) -> None:
+        """Stop the arm and end the program."""
+        if self.safety_mode != SafetyMode.NORMAL:
+            return
+        log.warning("%.3f s: protective stop: %s", self.time_s, why)
+        self.safety_mode, self._stopped_at_s = SafetyMode.PROTECTIVE_STOP, self.time_s
+        self.stop_program(f"protective stop: {why}")
+
+    def stop_in_emergency(self) -> None:
+        """Press the emergency stop: the arm stops and is without power."""
+        log.warning("%.3f s: emergency stop", self.time_s)
+        self.safety_mode, self.robot_mode = SafetyMode.ROBOT_EMERGENCY_STOP, RobotMode.POWER_OFF
+        self.stop_program("emergency stop")
+
+    def recover_from_emergency_stop(self) -> None:
+        """Pull the emergency stop out again, power the arm on and release its brakes."""
+        if self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
+            self.safety_mode, self.robot_mode = SafetyMode.NORMAL, RobotMode.RUNNING
+
+    def unlock_protective_stop(self) -> bool:
+        """End a protective stop that is five seconds old; return whether there is none any more."""
+        if self.safety_mode == SafetyMode.PROTECTIVE_STOP:
+            if self.time_s - self._stopped_at_s < UNLOCK_S:
+                return False
+            self.safety_mode = SafetyMode.NORMAL
+            self.simulation.in_collision = False
+        return True
+
+    # -- time
+
+    def tick(self) -> None:
+        """Let one control cycle pass."""
+        watchdog = self._watchdog
+        if watchdog is not None and self.time_s - watchdog.fed_at_s > watchdog.period_s:
+            self.stop_program(f"watchdog: no command for {watchdog.period_s:g} s")
+        if self._program is not None:
+            try:
+                next(self._program)
+            except StopIteration:
+                self.stop_program("it came to its end")
+        if self._is_free:
+            self.simulation.hold()
+        else:
+            self._velocity = self._next_velocity()
+        self.simulation.drive(self._velocity)
+        self.ticks += 1
+        data = self.simulation.data
+        self.trace.append(Sample(self.time_s, data.qpos.copy(), data.qvel.copy(), self._velocity.copy()))
+        if self.simulation.in_collision:
+            self.stop_protectively(f"{' and '.join((self.simulation.contacts() or [('?', '?')])[0])} touch")
+
+    def _next_velocity(self) -> Vector:
+        if self._motion is None:
+            return np.zeros(6)
+        velocity = self._motion.velocity(self.target, self._velocity, self.dt, self.speed_fraction)
+        why = self._violation(velocity) if self.safety_mode == SafetyMode.NORMAL else None
+        if why is not None:
+            self.stop_protectively(why)
+            velocity = self._motion.velocity(self.target, self._velocity, self.dt, self.speed_fraction)
+        if self._motion.is_done and not velocity.any():
+            self._motion = None
+        elif self._motion.is_done and isinstance(self._motion, MoveJ):
+            self._motion = Ramp(np.zeros(6), LARGEST_ACCELERATION)
+        return velocity
+
+    def _violation(self, velocity: Vector) -> str | None:
+        for joint, value, limit in zip(JOINTS, velocity, self.simulation.max_velocity, strict=True):
+            if not abs(value) <= limit * 1.001:
+                return f"{joint} at {value:.3g} rad/s, over its limit of {limit:.3g}"
+        acceleration = (velocity - self._velocity) / self.dt
+        if not np.abs(acceleration).max() <= LARGEST_ACCELERATION * 1.001:
+            joint = JOINTS[int(np.abs(acceleration).argmax())]
+            return f"the target of {joint} jumps ({np.abs(acceleration).max():.0f} rad/s^2)"
+        outside = np.abs(self.target + velocity * self.dt) > LIMITS
+        if outside.any():
+            return f"{JOINTS[int(outside.argmax())]} at its position limit"
+        return None

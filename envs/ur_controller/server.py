@@ -1,0 +1,257 @@
+"""Ports of the simulated controller, its clock, and the faults of the link to it.
+
+One loop in one thread: sockets while a control cycle's time has not come, then the cycle. Time is the wall clock's.
+Where the machine holds the loop up, the cycles are made good at once, and the watchdog does not blame the client.
+"""
+
+from __future__ import annotations
+
+import errno
+import heapq
+import logging
+import select
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rlservo.envs.ur_controller import dashboard
+from rlservo.envs.ur_controller.controller import Controller
+from rlservo.envs.ur_controller.rtde import RtdeSession
+
+DASHBOARD, PRIMARY, SECONDARY, REAL_TIME, RTDE = 29999, 30001, 30002, 30003, 30004
+PORTS = (DASHBOARD, PRIMARY, SECONDARY, REAL_TIME, RTDE)  # a client has no way to ask for others
+LONGEST_CATCH_UP_S = 2.0  # [s] of cycles that a loop which was held up makes good
+HELD_UP_S = 0.02  # [s], after which the loop was: its client's commands wait in the socket
+LARGEST_BACKLOG = 64 * 1024  # [bytes] for a client that does not read; then samples are dropped
+LARGEST_PROGRAM = 4 * 1024 * 1024
+PROGRAM_END = b"\nend\n"
+
+log = logging.getLogger("rlservo.ur_controller")
+
+
+class CannotListenError(OSError):
+    """A port of the controller cannot be listened on; the message says which and why."""
+
+
+@dataclass
+class Link:
+    """Faults of the network between client and controller; each way has them."""
+
+    latency_s: float = 0.0
+    jitter_s: float = 0.0  # at most so much more, uniformly; order is kept, as TCP keeps it
+    drop: float = 0.0  # share of RTDE's data packages, both ways
+    is_down: bool = False
+
+
+@dataclass
+class _Connection:
+    port: int
+    socket: socket.socket
+    rtde: RtdeSession | None = None
+    text: bytes = b""
+    unsent: bytes = b""
+    last_due: dict[str, float] = field(default_factory=lambda: {"in": 0.0, "out": 0.0})
+
+
+class ControllerServer:
+    """A controller that listens; `serve` runs it, `close` frees the ports."""
+
+    def __init__(
+        self, controller: Controller, *, host: str = "127.0.0.1", link: Link | None = None, seed: int = 0
+    ) -> None:
+        self.controller = controller
+        self.link = link or Link()
+        self.host = host
+        self._rng = np.random.default_rng(seed)
+        self._in_use: dict[str, RtdeSession] = {}
+        self._connections: dict[socket.socket, _Connection] = {}
+        self._waiting: list[tuple[float, int, Callable[[], None]]] = []  # what the link holds back, by due time
+        self._count = 0
+        self._asked: list[Callable[[], object]] = []
+        self._listeners: dict[socket.socket, int] = {}
+        try:
+            for port in PORTS:
+                self._listeners[_listen(host, port)] = port
+        except OSError:
+            self.close()
+            raise
+
+    def do(self, action: Callable[[], object]) -> None:
+        """Run something between two control cycles; from any thread."""
+        self._asked.append(action)
+
+    def serve(self, stop: threading.Event) -> None:
+        """Serve until `stop` is set."""
+        due = time.perf_counter()
+        while not stop.is_set():
+            now = time.perf_counter()
+            if now < due:
+                next_due = min(due, self._waiting[0][0]) if self._waiting else due
+                self._pass_traffic(max(0.0, next_due - now))
+                continue
+            if now - due > HELD_UP_S:
+                self.controller.excuse(now - due)
+            due = max(due + self.controller.dt, now - LONGEST_CATCH_UP_S)
+            self._pass_traffic(0.0)
+            asked, self._asked = self._asked, []
+            for action in asked:
+                action()
+            self.controller.tick()
+            self._publish()
+
+    def close(self) -> None:
+        """Close all connections and ports."""
+        for opened in (*self._connections, *self._listeners):
+            opened.close()
+        self._connections.clear()
+        self._listeners.clear()
+
+    # -- traffic
+
+    def _pass_traffic(self, timeout_s: float) -> None:
+        """Wait for sockets at most so long, and deliver what the link has held back long enough."""
+        readers = [] if self.link.is_down else [*self._listeners, *self._connections]
+        ready, _, _ = select.select(readers, [], [], timeout_s)
+        for each in ready:
+            if each in self._listeners:
+                self._accept(each)
+            elif each in self._connections:
+                self._read(self._connections[each])
+        now = time.perf_counter()
+        while self._waiting and self._waiting[0][0] <= now and not self.link.is_down:
+            heapq.heappop(self._waiting)[2]()
+
+    def _accept(self, listener: socket.socket) -> None:
+        opened, _ = listener.accept()
+        opened.setblocking(False)
+        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection = _Connection(self._listeners[listener], opened)
+        if connection.port == RTDE:
+            connection.rtde = RtdeSession(self.controller, self._in_use)
+        self._connections[opened] = connection
+        if connection.port == DASHBOARD:
+            self._send(connection, f"{dashboard.GREETING}\n".encode())
+
+    def _read(self, connection: _Connection) -> None:
+        try:
+            data = connection.socket.recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(connection)
+        else:
+            self._delay(connection, "in", lambda: self._take(connection, data))
+
+    def _take(self, connection: _Connection, data: bytes) -> None:
+        if connection.rtde is not None:
+            if self.link.drop and data[2:3] == b"U" and self._rng.random() < self.link.drop:
+                return
+            try:
+                replies = connection.rtde.receive(data)
+            except (ValueError, IndexError) as error:
+                log.warning("a client of RTDE is disconnected: %s", error)
+                self._drop(connection)
+                return
+            if replies:
+                self._send(connection, replies)
+            return
+        connection.text += data
+        if connection.port == DASHBOARD:
+            *lines, connection.text = connection.text.split(b"\n")
+            for line in lines:
+                reply = dashboard.answer(self.controller, line.decode(errors="replace"))
+                self._send(connection, f"{reply}\n".encode())
+        elif connection.text.endswith(PROGRAM_END) or (
+            not connection.text.startswith(b"def ") and connection.text.endswith(b"\n")
+        ):
+            text, connection.text = connection.text.decode(errors="replace"), b""
+            self.controller.load_program(text)
+        if len(connection.text) > LARGEST_PROGRAM:
+            log.warning("a client of port %d is disconnected: more than %d bytes", connection.port, LARGEST_PROGRAM)
+            self._drop(connection)
+
+    def _publish(self) -> None:
+        for connection in [one for one in self._connections.values() if one.rtde is not None]:
+            if connection.rtde is None or len(connection.unsent) > LARGEST_BACKLOG:
+                self._write(connection, b"")
+                continue
+            package = connection.rtde.sample()
+            if package and not (self.link.drop and self._rng.random() < self.link.drop):
+                self._send(connection, package)
+            elif connection.unsent:
+                self._write(connection, b"")
+
+    def _send(self, connection: _Connection, data: bytes) -> None:
+        self._delay(connection, "out", lambda: self._write(connection, data))
+
+    def _delay(self, connection: _Connection, way: str, deliver: Callable[[], None]) -> None:
+        link = self.link
+        if not (link.latency_s or link.jitter_s or link.is_down or self._waiting):
+            deliver()
+            return
+        now = time.perf_counter()
+        due = max(now + link.latency_s + link.jitter_s * self._rng.random(), connection.last_due[way])
+        connection.last_due[way] = due
+        self._count += 1
+        heapq.heappush(self._waiting, (due, self._count, deliver))
+
+    def _write(self, connection: _Connection, data: bytes) -> None:
+        connection.unsent += data
+        try:
+            sent = connection.socket.send(connection.unsent)
+            connection.unsent = connection.unsent[sent:]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop(connection)
+
+    def _drop(self, connection: _Connection) -> None:
+        if connection.rtde is not None:
+            connection.rtde.close()
+        self._connections.pop(connection.socket, None)
+        connection.socket.close()
+
+
+def run(controller: Controller, host: str, link: Link, stop: threading.Event, on_ready: Callable[[], None]) -> None:
+    """Serve until `stop` is set, and obey the lines on standard input meanwhile. Raises CannotListenError."""
+    from rlservo.envs.ur_controller.console import obey
+
+    server = ControllerServer(controller, host=host, link=link)
+
+    def read_lines() -> None:
+        for line in sys.stdin:
+            if line.strip():
+                server.do(lambda line=line: print_reply(obey(server, line)))  # type: ignore[misc]
+
+    def print_reply(reply: str) -> None:
+        if reply:
+            sys.stdout.write(f"{reply}\n")
+            sys.stdout.flush()
+
+    try:
+        on_ready()
+        threading.Thread(target=read_lines, name="console", daemon=True).start()
+        server.serve(stop)
+    finally:
+        server.close()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        is_taken = error.errno == errno.EADDRINUSE
+        reason = "the port is taken; another address, 127.0.0.2 say, has ports of its own" if is_taken else str(error)
+        raise CannotListenError(f"cannot listen on {host}:{port}: {reason}") from error
+    return listener

@@ -1,0 +1,26 @@
+"""`robot-latency` against a controller whose link has a known delay."""
+
+from __future__ import annotations
+
+import pytest
+
+from arms import RunningArm
+from rlservo.envs.robots.latency import measure_latency
+from rlservo.envs.robots.limits import Limits
+from rlservo.envs.robots.rtde_arm import RtdeArm
+
+pytest.importorskip("rtde_control")
+
+
+def test_latency_is_the_links_and_the_followers_and_gives_the_evaluation_to_pass(arm: RunningArm) -> None:
+    arm.server.link.latency_s = 0.1
+    real = RtdeArm(arm.host, "ur5", setpoint_timeout_s=0.5, limits=Limits(watchdog_hz=1.0))
+    try:
+        report = measure_latency(real, steps=5)
+    finally:
+        real.close()
+    assert report.p50_ms >= 200.0  # there and back
+    assert report.cycles >= 3
+    assert report.disturbance == f"latency={report.cycles},noise=real"
+    assert report.state_period_ms >= 7.9
+    assert abs(arm.controller.simulation.joint_positions[5]) < 0.02

@@ -1,0 +1,278 @@
+"""A real arm's environment and command stream against the simulated controller, and every fault under motion.
+
+Stopping times are the controller's own: from the cycle of the last command to the one in which the last joint stood.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from arms import PATIENCE_S, RunningArm, run_arm
+from rlservo.envs.robots.arm import RobotError
+from rlservo.envs.robots.limits import Limits
+from rlservo.envs.robots.rtde_arm import RtdeArm
+from rlservo.envs.ur.parameters import POSITION_LIMITS
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.recording.episodes import episodes
+from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.rollout.control_loop import rollout
+from rlservo.serve_app.runtime.policy import Policy
+
+pytest.importorskip("rtde_control")
+
+ENV = "rlservo/EndEffectorPositioningURRob-v0"
+START = np.array([0.0, -2.5, 1.5, -1.5, -1.4, 0.0])
+LIMIT = np.array(POSITION_LIMITS)
+WATCHDOG_HZ = 2.0  # the machine may be busy; the product's default is 10
+LIMITS = {"watchdog_hz": WATCHDOG_HZ, "start_speed": 1.0, "blend_s": 0.1}
+BRAKING_S = 0.6  # from full speed here, by the slowest of all ways to stop, with the follower's lag
+
+
+@contextmanager
+def real_env(arm: RunningArm, **arguments: Any) -> Iterator[gym.Env[Any, Any]]:
+    env = gym.make(
+        ENV, robot=f"rtde://{arm.host}", ur_model="ur5", confirm=False, disable_env_checker=True,
+        **{"limits": LIMITS, **arguments},
+    )  # fmt: skip
+    try:
+        yield env
+    finally:
+        env.close()
+
+
+@pytest.fixture
+def moving(arm: RunningArm) -> Iterator[RtdeArm]:
+    """An arm whose base turns, and is given setpoints by no one any more: they last half a minute."""
+    real = RtdeArm(arm.host, "ur5", setpoint_timeout_s=30.0, limits=Limits.of(LIMITS))
+    try:
+        real.command(START + np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]), 10.0)
+        arm.wait_until(lambda: abs(arm.controller.simulation.joint_velocities[0]) > 0.25)
+        yield real
+    finally:
+        real.close()
+
+
+def time_to_stand(arm: RunningArm, fault: Callable[[], object]) -> float:
+    """Return how long the arm moved on after a fault [s], in its own time, less what the machine held it up."""
+    controller = arm.controller
+    began, held_up_s = controller.time_s, controller.held_up_s
+    fault()
+    arm.wait_until(
+        lambda: controller.time_s > began + 0.1 and bool(abs(controller.simulation.joint_velocities).max() < 0.01)
+    )
+    return arm.last_motion_s() - began - (controller.held_up_s - held_up_s)
+
+
+def test_env_drives_the_arm_to_its_target_within_the_limits(arm: RunningArm) -> None:
+    goal = START + np.array([0.5, 0.6, 0.0, 0.0, 0.0, 0.0])
+    with real_env(arm) as env:
+        target, _ = env.unwrapped.simulation.tool_at(goal)  # type: ignore[attr-defined]
+        observation, _ = env.reset(options={"ee_target_pose": [*target, 0.0, 0.0, 0.0]})
+        assert observation[0] > 0.15
+        action = goal / LIMIT
+        action[3] = (goal[3] + 3.48) / (3.48 + 0.31) * 2.0 - 1.0
+        states, over = set(), False
+        while not over:
+            observation, _, terminated, truncated, info = env.step(action[:5].astype(np.float32))
+            states.add(info["robot"]["state"])
+            over = terminated or truncated
+        assert info["final_status"] == "success"
+        assert states <= {"blend_in", "run", "hold"}
+    assert [why for _, why in arm.controller.stop_reasons] == ["it came to its end"]
+
+
+def test_killed_command_stream_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:
+    assert time_to_stand(arm, lambda: os.kill(moving.pid, signal.SIGKILL)) < 1.0 / WATCHDOG_HZ + BRAKING_S
+    arm.wait_until(lambda: not arm.controller.is_program_running)
+    assert "watchdog" in arm.controller.stop_reasons[-1][1]
+    assert "killed" in moving.fault()
+
+
+def test_suspended_command_stream_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:
+    try:
+        assert time_to_stand(arm, lambda: os.kill(moving.pid, signal.SIGSTOP)) < 1.0 / WATCHDOG_HZ + BRAKING_S
+        arm.wait_until(lambda: not arm.controller.is_program_running)
+    finally:
+        os.kill(moving.pid, signal.SIGCONT)
+    arm.wait_until(lambda: bool(moving.fault()))
+    assert moving.fault().partition(":")[0] in ("program_stopped", "connection_lost")
+
+
+def test_link_that_is_down_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:
+    link = arm.server.link
+    assert time_to_stand(arm, lambda: setattr(link, "is_down", True)) < 1.0 / WATCHDOG_HZ + BRAKING_S
+    arm.wait_until(lambda: bool(moving.fault()))
+    link.is_down = False
+
+
+def test_emergency_stop_is_a_fault_that_is_named(arm: RunningArm, moving: RtdeArm) -> None:
+    assert time_to_stand(arm, lambda: arm.do(arm.controller.stop_in_emergency)) < BRAKING_S
+    arm.wait_until(lambda: bool(moving.fault()))
+    assert moving.fault().startswith("emergency_stop")
+    with pytest.raises(RobotError, match="emergency stop"):
+        RtdeArm(arm.host, "ur5")
+
+
+def test_policy_process_that_dies_or_is_suspended_leaves_a_standing_arm(arm: RunningArm) -> None:
+    program = f"""
+import time
+import numpy as np
+from rlservo.envs.robots.limits import Limits
+from rlservo.envs.robots.rtde_arm import RtdeArm
+arm = RtdeArm({arm.host!r}, "ur5", limits=Limits.of({LIMITS!r}))
+while True:
+    arm.command(np.array([3.0, -2.5, 1.5, -1.5, -1.4, 0.0]), 10.0)
+    time.sleep(0.05)
+"""
+    policy = subprocess.Popen([sys.executable, "-c", program])
+    try:
+        fast = lambda: bool(abs(arm.controller.simulation.joint_velocities[0]) > 0.25)  # noqa: E731
+        arm.wait_until(fast)
+        assert time_to_stand(arm, lambda: policy.send_signal(signal.SIGSTOP)) < 0.25 + BRAKING_S
+        policy.send_signal(signal.SIGCONT)
+        arm.wait_until(fast)
+        assert time_to_stand(arm, policy.kill) < 0.25 + BRAKING_S
+        arm.wait_until(lambda: not arm.controller.is_program_running)
+    finally:
+        policy.kill()
+        policy.wait()
+
+
+def test_slow_policy_holds_the_arm_and_its_action_for_an_old_observation_is_not_taken(arm: RunningArm) -> None:
+    with real_env(arm) as env:
+        env.reset(seed=1)
+        action = np.array([0.2, -0.4, 0.5, 0.0, -0.2], dtype=np.float32)
+        for _ in range(8):
+            env.step(action)
+        time.sleep(1.0)
+        assert abs(arm.controller.simulation.joint_velocities).max() < 0.02
+        _, _, _, _, info = env.step(action)
+        simulation = env.unwrapped.simulation  # type: ignore[attr-defined]
+        assert simulation.stale_actions >= 1
+        states = [change["state"] for change in info["robot"].get("changes", [])]
+        assert "hold" in states
+        for _ in range(10):
+            _, _, _, _, info = env.step(action)
+        assert info["robot"]["state"] in ("run", "blend_in")
+
+
+def test_protective_stop_ends_the_episode_and_the_next_reset_says_what_to_do(arm: RunningArm) -> None:
+    with real_env(arm) as env:
+        env.reset(seed=1)
+        action = np.zeros(5, dtype=np.float32)
+        env.step(action)
+        arm.do(lambda: arm.controller.stop_protectively("a test"))
+        terminated = False
+        while not terminated:
+            _, _, terminated, _, info = env.step(action)
+        assert info["final_status"] == "protective_stop"
+        assert info["robot"]["state"] == "fault"
+        with pytest.raises(RobotError, match="in protective stop: find the cause"):
+            env.reset(seed=2)
+        arm.do(lambda: setattr(arm.controller, "ticks", arm.controller.ticks + 2600))
+        arm.do(arm.controller.unlock_protective_stop)
+        env.reset(seed=2)
+        env.step(action)
+
+
+def test_person_takes_the_arm_over_leads_it_and_gives_it_back(arm: RunningArm) -> None:
+    with real_env(arm) as env:
+        env.reset(seed=1)
+        simulation = env.unwrapped.simulation  # type: ignore[attr-defined]
+        action = np.array([0.3, -0.4, 0.5, 0.0, -0.2], dtype=np.float32)
+        env.step(action)
+        simulation.operator.toggle()
+        limit = time.monotonic() + PATIENCE_S
+        while not arm.controller.is_free:
+            _, _, _, _, info = env.step(action)
+            assert time.monotonic() < limit
+        assert info["robot"]["state"] == "human"
+        before = arm.controller.simulation.joint_positions.copy()
+        arm.do(lambda: arm.controller.simulation.data.qfrc_applied.__setitem__(0, 20.0))
+        while abs(arm.controller.simulation.joint_positions[0] - before[0]) < 0.02:
+            env.step(action)
+            assert time.monotonic() < limit
+        arm.do(lambda: arm.controller.simulation.data.qfrc_applied.__setitem__(0, 0.0))
+        simulation.operator.toggle()
+        states = []
+        for _ in range(30):
+            _, _, terminated, _, info = env.step(action)
+            states.append(info["robot"]["state"])
+            if "run" in states or terminated:
+                break
+        assert "blend_in" in states
+        assert arm.controller.safety_mode.name == "NORMAL"
+
+
+@pytest.mark.parametrize("stream", ["random", "extremes", "jitter"])
+def test_hostile_setpoints_never_make_the_arm_jump_or_pass_a_limit(arm: RunningArm, stream: str) -> None:
+    rng = np.random.default_rng(7)
+    real = RtdeArm(arm.host, "ur5", limits=Limits.of({**LIMITS, "box_low": [-2.0, -2.0, 0.3], "tool_speed": 0.3}))
+    try:
+        for step in range(60):
+            goals = {
+                "random": rng.uniform(-6.0, 6.0, 6),
+                "extremes": np.full(6, 6.2 if step % 2 else -6.2),
+                "jitter": START + rng.normal(0.0, 0.5, 6),
+            }
+            real.command(goals[stream], float(rng.uniform(0.0, 1.0)))
+            time.sleep(0.05)
+        for bad in (np.full(6, np.nan), np.full(5, 0.0)):
+            with pytest.raises(ValueError, match="expected 6 finite joint positions"):
+                real.command(bad)
+        assert not real.fault()
+        assert real.limited()
+    finally:
+        real.close()
+    samples = list(arm.controller.trace)
+    most = 0.1 * np.array(arm.controller.simulation.parameters.velocity_limits)
+    # The limits themselves are exact in test_limits.py; a busy machine delivers setpoints in bunches.
+    assert all((abs(one.setpoint_velocity) <= most * 1.5).all() for one in samples)
+    assert arm.controller.safety_mode.name == "NORMAL"
+    assert min(arm.controller.simulation.tool_at(one.positions)[0][2] for one in samples[::10]) > 0.29
+
+
+def test_wrong_model_and_unreachable_host_are_one_sentence(arm: RunningArm) -> None:
+    with pytest.raises(RobotError, match=r"is a ur5's: ur_model says ur5e"):
+        RtdeArm(arm.host, "ur5e")
+    with pytest.raises(RobotError, match=r"no UR controller answers at 127\.0\.0\.250"):
+        RtdeArm("127.0.0.250", "ur5")
+
+
+def test_e_series_in_local_control_says_where_to_enable_remote_control() -> None:
+    for arm in run_arm("ur5e"):
+        arm.controller.is_remote = False
+        with pytest.raises(RobotError, match="enable remote control"):
+            RtdeArm(arm.host, "ur5e")
+
+
+def test_rollout_refuses_an_unproven_policy_and_records_what_the_robot_did(
+    arm: RunningArm, shipped: Path, tmp_path: Path
+) -> None:
+    options: dict[str, Any] = {
+        "episodes": 1,
+        "seed": 1,
+        "env_kwargs": {"robot": f"rtde://{arm.host}", "ur_model": "ur5", "confirm": False, "limits": LIMITS},
+    }
+    with Policy.load(shipped / "ur5" / "1") as policy:
+        with pytest.raises(UsageError, match="was never evaluated under latency"):
+            rollout(policy, ENV, **options)
+        report = rollout(policy, ENV, unproven=True, record=tmp_path / "run.mcap", **options)
+    assert report.success_rate == 1.0
+    assert report.robot is not None
+    (episode,) = episodes(Recording(tmp_path / "run.mcap"))
+    states = [one["state"] for one in episode.robot]
+    assert len(states) == report.steps and states[-1] == "run"
+    assert "blend_in" in [change["state"] for change in episode.robot[0]["changes"]]
