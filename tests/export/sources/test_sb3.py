@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
+from rlservo.export.contract.errors import CheckpointError, ParityError, UnsupportedError
 from rlservo.export.export_checkpoint import ExportResult, export_checkpoint
 from rlservo.export.verify_bundle import verify_bundle
 from rlservo.serve_app.runtime.policy import Policy
@@ -97,6 +97,7 @@ CASES = {
     "CrossQ": (contrib.CrossQ, "MlpPolicy", VECTOR, BOX),
     "ARS": (contrib.ARS, "MlpPolicy", VECTOR, BOX),
     "ARS of a choice": (contrib.ARS, "MlpPolicy", VECTOR, ONE),
+    "PPO of a square": (sb3.PPO, "MlpPolicy", spaces.Box(-1, 1, (2, 3), np.float64), spaces.Box(-1, 2, (2, 2))),
     "PPO of images": (sb3.PPO, "CnnPolicy", IMAGE, ONE),
     "SAC of parts": (sb3.SAC, "MultiInputPolicy", PARTS, BOX),
 }
@@ -112,6 +113,7 @@ def test_a_bundle_acts_as_the_model_predicts(name: str, tmp_path: Path, notices:
     same(episodes(result, seen), [model.predict(obs, deterministic=True)[0] for episode in seen for obs in episode])
     origin = result.contract.provenance
     assert origin.algorithm == name.split()[0] and origin.source == "sb3"
+    assert result.path == tmp_path / "out" / "model" / "1"
     assert origin.framework.startswith("Stable-Baselines3 ")
     assert "run code when loaded" in notices[0]
 
@@ -306,12 +308,18 @@ class TestBroken:
         make(sb3.PPO, "MlpPolicy", VECTOR, spaces.Box(0, 5, (2,), np.int32)).save(tmp_path / "model")
         self.refused(tmp_path / "model.zip", "only float Boxes are", UnsupportedError)
 
+    def test_weights_of_another_observation(self, tmp_path: Path) -> None:
+        model = make(sb3.PPO, "MlpPolicy", VECTOR, BOX)
+        model.observation_space = OPEN
+        model.save(tmp_path / "model")
+        self.refused(tmp_path / "model.zip", "cannot be restored as PPO: .*size mismatch for mlp_extractor")
+
     def test_two_models_in_a_folder(self, model: Path) -> None:
         model.with_name("other.zip").write_bytes(model.read_bytes())
         self.refused(model.parent, r"holds 2 models \(model.zip, other.zip\): name one of them")
 
 
-def test_a_policy_that_decides_by_itself_is_exported_as_it_decides(
+def test_a_policy_with_a_rule_of_its_own_is_refused_by_the_gate(
     tmp_path: Path, notices: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from stable_baselines3.common.policies import ActorCriticPolicy
@@ -322,11 +330,9 @@ def test_a_policy_that_decides_by_itself_is_exported_as_it_decides(
 
     monkeypatch.setattr(sys.modules[__name__], "Halved", Halved, raising=False)
     Halved.__qualname__ = "Halved"
-    model = make(sb3.PPO, Halved, VECTOR, BOX)
-    model.save(tmp_path / "model")
-    result = export_checkpoint(tmp_path / "model.zip", tmp_path / "out", notify=notices.append)
-    seen = samples(VECTOR, 6)
-    same(episodes(result, seen), [model.predict(obs, deterministic=True)[0] for episode in seen for obs in episode])
+    make(sb3.PPO, Halved, VECTOR, BOX).save(tmp_path / "model")
+    with pytest.raises(ParityError, match=r"the export gives .*, Stable-Baselines3 "):
+        export_checkpoint(tmp_path / "model.zip", tmp_path / "out", notify=notices.append)
 
 
 def test_reading_a_zip_starts_nothing_and_imports_no_ray(tmp_path: Path) -> None:
