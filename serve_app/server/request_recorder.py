@@ -107,7 +107,7 @@ class RequestRecorder:
         if episode and step and (ends or reward is not None or said.last_action is not None):
             outcome = OutcomeRecord(
                 known, episode, step - 1, reward, ends and not said.truncated, ends and said.truncated,
-                said.final_status, obs if ends else None, said.last_action, rows,
+                said.final_status, obs if ends else None, said.last_action, rows=rows,
             )  # fmt: skip
             self.recorder.record(outcome)
         if ends:
