@@ -6,7 +6,7 @@ import hashlib
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version as installed_version
 from pathlib import Path
@@ -99,7 +99,8 @@ def compile_bundle(
             progress(f"proving it with {Path(chosen).name} and 10,000 observations")
 
             def compute(feed: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-                return dict(zip(names, ort_session.run(names, dict(feed)), strict=True))
+                computed: Sequence[Any] = ort_session.run(names, dict(feed))
+                return dict(zip(names, computed, strict=True))
 
             with np.errstate(over="ignore"):
                 proof = prove(contract, chosen, beside, face.prefix, library, compute, golden)

@@ -62,7 +62,7 @@ def number(value: Any) -> str:
     if dtype.kind == "b":
         return "1" if value else "0"
     if dtype.kind in "iu":
-        if value == np.iinfo(dtype).min and dtype.kind == "i":
+        if value == np.iinfo(dtype.name).min and dtype.kind == "i":
             return f"INT{dtype.itemsize * 8}_MIN"
         return f"{'U' if dtype.kind == 'u' else ''}INT{dtype.itemsize * 8}_C({value})"
     if not np.isfinite(value):

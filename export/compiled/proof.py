@@ -163,6 +163,8 @@ def _compare_all(
         codes, got = library.step(feed)
         bad_here, bad_there = is_refused(codes), must_not_leave(contract, expected)
         moved: list[Arrays] = []
+        worst: dict[str, float] = {}
+        both = ~bad_here & ~bad_there
         for attempt in range(2):
             allowed = allowed_differences(contract, expected, moved)
             shares = {name: _share(got[name], expected[name], limit) for name, limit in allowed.items()}

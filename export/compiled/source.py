@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +110,7 @@ def _functions(p: str, nodes: list[str]) -> tuple[str, str]:
 
 def _kernels(wanted: set[str]) -> str:
     """Return the functions that the program calls."""
-    text = files(__package__).joinpath("kernels.c").read_text(encoding="utf-8")
+    text = files("rlservo.export.compiled").joinpath("kernels.c").read_text(encoding="utf-8")
     parts = re.split(r"^//: (\w+)\n", text, flags=re.MULTILINE)[1:]
     return "".join(f"{body}\n" for name, body in zip(parts[::2], parts[1::2], strict=True) if name in wanted)
 
@@ -145,6 +146,7 @@ def _check_action(program: Program, face: Interface, member: Member, action: Ref
         bad = f"!({x} >= -{largest} && {x} <= {largest})"
         program.emit(f"{loop}\n    if ({bad}) return ({u}_ACTION_NOT_FINITE << 24) | {where};")
     low, high = member.leaf.bounds()
+    largest_number = 0.0
     if member.dtype.kind == "f":  # the largest number stands for unbounded, as in the runtime
         largest_number = float(np.finfo(member.dtype).max)
         low, high = np.maximum(low, -largest_number), np.minimum(high, largest_number)
@@ -177,9 +179,12 @@ def _bound_texts(
             yield f"{program.constant(array, 'bounds')}[i]"
 
 
-def _own_range(dtype: np.dtype[np.generic]) -> tuple[float | int, float | int]:
-    info = np.finfo(dtype) if dtype.kind == "f" else np.iinfo(dtype)
-    return (float(info.min), float(info.max)) if dtype.kind == "f" else (int(info.min), int(info.max))
+def _own_range(dtype: np.dtype[Any]) -> tuple[float | int, float | int]:
+    if dtype.kind == "f":
+        largest = float(np.finfo(dtype).max)
+        return -largest, largest
+    info = np.iinfo(dtype)
+    return int(info.min), int(info.max)
 
 
 def _in_scratch(program: Program, tensor: str, member: Member) -> Ref:

@@ -113,7 +113,8 @@ def _run_all(model: onnx.ModelProto, example: Mapping[str, NDArray[Any]]) -> dic
         onnx.save(probe, str(file))
         ort_session = open_ort_session(file)
     feed = {node.name: example[node.name] for node in ort_session.get_inputs()}
-    return dict(zip(names, ort_session.run(names, feed), strict=True)) if names else {}
+    computed: Sequence[Any] = ort_session.run(names, feed) if names else []
+    return dict(zip(names, computed, strict=True))
 
 
 def _constants(graph: onnx.GraphProto, initial: set[str], inputs: set[str]) -> set[str]:
