@@ -17,8 +17,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("envs", "export", "serve_app", "deploy")
 RLLIB = ROOT / "export" / "rllib"  # restores what RLlib keeps in private attributes
-# Documented, in spite of their names: of named tuples, of `os`, and what a policy of Stable-Baselines3 overrides.
-DOCUMENTED = {"_replace", "_asdict", "_exit", "_predict"}
+DOCUMENTED = {"_replace", "_asdict", "_exit"}  # of named tuples and `os`: documented, in spite of their names
 RAY_VARIABLES = {
     "RAY_SERVE_ENABLE_HA_PROXY", "RAY_SERVE_THROUGHPUT_OPTIMIZED", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS",
     "RAY_USAGE_STATS_ENABLED",
