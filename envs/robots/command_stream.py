@@ -340,7 +340,7 @@ def main(argv: list[str]) -> None:
             raise SystemExit(1) from None
         finally:
             # ur_rtde waits without an end for a controller that is silent.
-            threading.Thread(target=lambda: (time.sleep(CLOSE_S), os._exit(1)), name="end", daemon=True).start()
+            threading.Thread(target=_end_soon, name="end", daemon=True).start()
             connection.close()
     except RobotError as error:
         _say(output, f"{FAILED}{error}")
@@ -350,6 +350,11 @@ def main(argv: list[str]) -> None:
 def _say(descriptor: int, line: str) -> None:
     with contextlib.suppress(OSError):
         os.write(descriptor, f"{line}\n".encode())
+
+
+def _end_soon() -> None:
+    time.sleep(CLOSE_S)
+    os._exit(1)
 
 
 def _end_with_standard_input(stream: CommandStream) -> None:

@@ -51,7 +51,9 @@ def measure_latency(
 ) -> LatencyReport:
     """Move a wrist back and forth by 0.05 rad and time each start. Raises RobotError where nothing moves."""
     home = arm.arm_state().positions.copy()
-    latencies_s, periods_s, still = [], [], []
+    latencies_s: list[float] = []
+    periods_s: list[float] = []
+    still: list[Vector] = []
     for step in range(steps):
         arm.hold()
         began = time.monotonic()

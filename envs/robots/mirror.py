@@ -52,7 +52,7 @@ class MirroredSimulation(URSimulation):
         self.states = StateMachine()
         self.stale_actions = 0
         self._cycle_s = cycle_s
-        self._connect = lambda: connect(LATE_CYCLES * cycle_s)
+        self._connect = connect
         self._due_s = 0.0
         self._counts: dict[str, int] = {}
         self._lost: dict[str, int] = {}  # counts of connections that are closed
@@ -170,7 +170,7 @@ class MirroredSimulation(URSimulation):
 
     def _connected(self) -> RtdeArm:
         self.states.enter(State.CONNECT)
-        arm = self._connect()
+        arm = self._connect(LATE_CYCLES * self._cycle_s)
         self.states.enter(State.CHECK)
         self.states.enter(State.READY, arm.host)
         return arm
