@@ -183,7 +183,9 @@ def export_files(
         options = dataclasses.replace(options, restore=dataclasses.replace(options.restore, app_dir=folder))
         options.progress("reading the checkpoint")
         facts = source.facts(policies[0], options.notify)
-        base = options.name or default_name(facts.env_id, facts.env_config, root)
+        base = options.name or default_name(
+            facts.env_id, facts.env_config, root.with_suffix("") if root.is_file() else root
+        )
         written: list[tuple[Path, ExportResult]] = []
         queue = list(policies)
         while queue:

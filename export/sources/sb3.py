@@ -33,7 +33,8 @@ LOADED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
 """The pickles in the zip that acting needs."""
 HARMLESS: dict[str, Any] = {
     "learning_rate": 0.0, "clip_range": 0.2, "train_freq": 1, "buffer_size": 1, "n_steps": 1, "n_envs": 1,
-    "target_entropy": 0.0, "replay_buffer_kwargs": {}, "rollout_buffer_kwargs": {}, "optimize_memory_usage": False,
+    "target_entropy": 0.0, "seed": None, "optimize_memory_usage": False, "replay_buffer_kwargs": {},
+    "rollout_buffer_kwargs": {},
 }  # fmt: skip
 """What training's own settings are replaced with; those that are not named here become None."""
 ALGORITHMS = (  # (policy's class, a setting that only this algorithm saves, the algorithm)
@@ -189,7 +190,9 @@ def load_model(file: Path, data: Mapping[str, Any]) -> Any:
             warnings.simplefilter("ignore")  # about training's settings, which were replaced
             return getattr(importlib.import_module(module), name).load(file, device="cpu", custom_objects=unneeded)
     except Exception as error:  # whatever the framework, torch or the user's own constructor raises
-        raise CheckpointError(f"{file} cannot be restored as {name}: {explain(error)}") from error
+        # torch says which weights do not fit on the lines below the first.
+        reason = " ".join(str(error).split())[:300] if "state_dict" in str(error) else explain(error)
+        raise CheckpointError(f"{file} cannot be restored as {name}: {reason}") from error
 
 
 def looks_normalized(file: Path, data: Mapping[str, Any]) -> bool:

@@ -69,6 +69,8 @@ def restore_policy(
     if rule.masked:
         mask = MultiBinary(_choices(policy.action_space))
         if isinstance(layout.frame, Dict):
+            if ACTION_MASK in layout.frame.spaces:
+                raise UnsupportedError(f"{file}: the observation has a part '{ACTION_MASK}' already: rename it")
             observation_space = Dict({**layout.frame.spaces, ACTION_MASK: mask})
         else:
             observation_space = Dict({OBSERVATIONS: layout.frame, ACTION_MASK: mask})
@@ -127,7 +129,7 @@ class Rule:
             if discrete:
                 mode, names = "argmax", (ACTION_DIST_INPUTS,)
                 distribution = "categorical" if isinstance(space, Discrete) else "multi_categorical"
-            elif isinstance(policy.action_dist, DiagGaussianDistribution):
+            elif isinstance(policy.action_dist, DiagGaussianDistribution) and len(space.shape) == 1:
                 mode, names, distribution = "mean", (ACTION_DIST_INPUTS,), "diag_gaussian"
         elif own and isinstance(getattr(policy, "q_net", None), nn.Module):
             mode, names, scored_by = "argmax", (Q_VALUES,), "q_net"
@@ -193,7 +195,7 @@ class Network(nn.Module):
         mask: Tensor | None = None
         how: dict[str, Any] = {}
         if rule.masked:
-            mask, obs = _unmask(obs)
+            mask, obs = _unmask(obs, policy.observation_space)
             how["action_masks"] = mask if rule.mode == "given" else None
         if rule.recurrent:
             hidden = tuple(leaf.transpose(0, 1).contiguous() for leaf in state[0])
@@ -210,9 +212,9 @@ class Network(nn.Module):
         return (*actions, *named, *next_state)
 
 
-def _unmask(obs: Tree) -> tuple[Any, Tree]:
+def _unmask(obs: Tree, model_space: Any) -> tuple[Any, Tree]:
     rest = {key: value for key, value in obs.items() if key != ACTION_MASK}
-    return obs[ACTION_MASK], rest[OBSERVATIONS] if set(rest) == {OBSERVATIONS} else rest
+    return obs[ACTION_MASK], rest if isinstance(model_space, Dict) else rest[OBSERVATIONS]
 
 
 def _shaped(action: Tensor, space: Any) -> Tensor:
@@ -236,7 +238,7 @@ class PredictLoop:
         mask = None
         how: dict[str, Any] = {}
         if rule.masked:
-            mask, obs = _unmask(obs)
+            mask, obs = _unmask(obs, policy.observation_space)
             how["action_masks"] = mask
         if self._vec is not None and self._layout.normalized_first:
             obs = self._vec.normalize_obs(obs)

@@ -97,6 +97,7 @@ CASES = {
     "CrossQ": (contrib.CrossQ, "MlpPolicy", VECTOR, BOX),
     "ARS": (contrib.ARS, "MlpPolicy", VECTOR, BOX),
     "ARS of a choice": (contrib.ARS, "MlpPolicy", VECTOR, ONE),
+    "PPO of a square": (sb3.PPO, "MlpPolicy", spaces.Box(-1, 1, (2, 3), np.float64), spaces.Box(-1, 2, (2, 2))),
     "PPO of images": (sb3.PPO, "CnnPolicy", IMAGE, ONE),
     "SAC of parts": (sb3.SAC, "MultiInputPolicy", PARTS, BOX),
 }
@@ -112,6 +113,7 @@ def test_a_bundle_acts_as_the_model_predicts(name: str, tmp_path: Path, notices:
     same(episodes(result, seen), [model.predict(obs, deterministic=True)[0] for episode in seen for obs in episode])
     origin = result.contract.provenance
     assert origin.algorithm == name.split()[0] and origin.source == "sb3"
+    assert result.path == tmp_path / "out" / "model" / "1"
     assert origin.framework.startswith("Stable-Baselines3 ")
     assert "run code when loaded" in notices[0]
 
@@ -305,6 +307,12 @@ class TestBroken:
     def test_actions_that_are_whole_numbers(self, tmp_path: Path) -> None:
         make(sb3.PPO, "MlpPolicy", VECTOR, spaces.Box(0, 5, (2,), np.int32)).save(tmp_path / "model")
         self.refused(tmp_path / "model.zip", "only float Boxes are", UnsupportedError)
+
+    def test_weights_of_another_observation(self, tmp_path: Path) -> None:
+        model = make(sb3.PPO, "MlpPolicy", VECTOR, BOX)
+        model.observation_space = OPEN
+        model.save(tmp_path / "model")
+        self.refused(tmp_path / "model.zip", "cannot be restored as PPO: .*size mismatch for mlp_extractor")
 
     def test_two_models_in_a_folder(self, model: Path) -> None:
         model.with_name("other.zip").write_bytes(model.read_bytes())
