@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -38,7 +39,6 @@ from rlservo.export.sources.source import Notify, RestoreOptions
 OBSERVATIONS, ACTION_MASK = "observations", "action_mask"
 """Keys of the observation of a policy with action masks, as RLlib's examples have them."""
 MASKED = torch.finfo(torch.float32).min
-OWN = ("stable_baselines3.", "sb3_contrib.")
 
 
 @dataclass(frozen=True)
@@ -111,29 +111,28 @@ class Rule:
 
     @staticmethod
     def of(policy: Any, value: bool, notify: Notify) -> Rule:
-        """Return the rule by the policy's class; a class of the user's own that decides by itself is asked whole."""
+        """Return the rule by the parts of the policy. The gate refuses a class of the user's own with another rule."""
         space = policy.action_space
         transform: Transform = "none"
         if isinstance(space, Box):
             transform = "unsquash" if policy.squash_output else "clip"
         recurrent, masked = hasattr(policy, "lstm_actor"), _is_masked(policy)
-        own = type(policy)._predict.__module__.startswith(OWN)
         discrete = isinstance(space, Discrete | MultiDiscrete)
         names: tuple[str, ...] = ()
         mode: Mode = "given"
         distribution: DistributionKind | None = None
         scored_by = ""
         # MaskablePPO's policy is no ActorCriticPolicy, but has the same parts.
-        if own and hasattr(policy, "action_net") and hasattr(policy, "action_dist"):
+        if hasattr(policy, "action_net") and hasattr(policy, "action_dist"):
             scored_by = "action_net"
             if discrete:
                 mode, names = "argmax", (ACTION_DIST_INPUTS,)
                 distribution = "categorical" if isinstance(space, Discrete) else "multi_categorical"
             elif isinstance(policy.action_dist, DiagGaussianDistribution) and len(space.shape) == 1:
                 mode, names, distribution = "mean", (ACTION_DIST_INPUTS,), "diag_gaussian"
-        elif own and isinstance(getattr(policy, "q_net", None), nn.Module):
+        elif isinstance(getattr(policy, "q_net", None), nn.Module):
             mode, names, scored_by = "argmax", (Q_VALUES,), "q_net"
-        elif own and isinstance(getattr(policy, "quantile_net", None), nn.Module):
+        elif isinstance(getattr(policy, "quantile_net", None), nn.Module):
             mode, names, scored_by = "argmax", (Q_VALUES,), "quantile_net"
         if distribution is None:
             notify(f"the export of a {type(policy).__name__} on {space} cannot explore: only its own action is in it")
@@ -193,17 +192,25 @@ class Network(nn.Module):
         """Return the action where its rule is the policy's own, one tensor for each of `names`, and the next state."""
         policy, rule = self.module, self._rule
         mask: Tensor | None = None
-        how: dict[str, Any] = {}
+        next_state: list[Tensor] = []
         if rule.masked:
             mask, obs = _unmask(obs, policy.observation_space)
-            how["action_masks"] = mask if rule.mode == "given" else None
         if rule.recurrent:
             hidden = tuple(leaf.transpose(0, 1).contiguous() for leaf in state[0])
             starts = torch.zeros(hidden[0].shape[1])  # the state is an episode's first one where one starts
-            action, after = policy._predict(obs, hidden, starts, deterministic=True)
+            distribution, after = policy.get_distribution(obs, hidden, starts)
             next_state = [leaf.transpose(0, 1) for leaf in after]
+        elif rule.masked:
+            distribution = policy.get_distribution(obs, action_masks=mask if rule.mode == "given" else None)
+        elif hasattr(policy, "get_distribution"):
+            distribution = policy.get_distribution(obs)
         else:
-            action, next_state = policy._predict(obs, deterministic=True, **how), []
+            distribution = None
+        if distribution is not None:
+            action = distribution.get_actions(deterministic=True)
+        else:  # ARS has nothing but a deterministic action
+            known = "deterministic" in inspect.signature(policy.forward).parameters
+            action = policy(obs, deterministic=True) if known else policy(obs)
         actions = [_shaped(action, policy.action_space)] if rule.mode == "given" else []
         named = [
             policy.predict_values(obs).squeeze(-1) if name == "value" else self._scores.take(mask)
