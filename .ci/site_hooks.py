@@ -54,7 +54,7 @@ def on_files(files: Any, config: Any) -> Any:
     for folder, title in SECTIONS.items():
         config.nav.append({title: [page for page in pages if page.startswith(f"{folder}/")]})
     text = Path(config.docs_dir, PYTHON_PAGE).read_text(encoding="utf-8")
-    missing = [name for name in rlservo.__all__ if name not in NOT_OBJECTS and f".{name}\n" not in text]
+    missing = [name for name in rlservo.__all__ if name not in NOT_OBJECTS and f"::: rlservo.{name}\n" not in text]
     if missing:
         raise PluginError(f"{PYTHON_PAGE} does not document {', '.join(missing)}")
     return files
