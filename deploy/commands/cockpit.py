@@ -22,7 +22,7 @@ PORT = 8090
 def cockpit(
     url: Annotated[str | None, typer.Option(help="Server to ask for actions.")] = None,
     policy: Annotated[str | None, typer.Option(help="Policy name; the first one by default.")] = None,
-    version: Annotated[str | None, typer.Option(help="Version or alias; by default the one that clients get.")] = None,
+    version: Annotated[str | None, typer.Option(help="Version or alias; production by default.")] = None,
     bundle: Annotated[
         Path | None, typer.Option(help="Act in process with this bundle, or with those of this folder.")
     ] = None,
@@ -33,15 +33,15 @@ def cockpit(
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
     ] = None,
     recording: Annotated[
-        Path | None, typer.Option(help="Show a recording (.mcap); with --bundle also what that would have done.")
+        Path | None, typer.Option(help="Show a recording (.mcap); with --bundle also that bundle's actions.")
     ] = None,
     robot_server: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Show a robot server's simulation while a client drives it.")
     ] = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Of the page, on 127.0.0.1.")] = PORT,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the first episode.")] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page, on 127.0.0.1.")] = PORT,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the first episode.")] = None,
     api_key: Annotated[
-        str | None, typer.Option(envvar="RLSERVO_API_KEY", help="Rather in the variable: others see arguments.")
+        str | None, typer.Option(envvar="RLSERVO_API_KEY", help="API key. Prefer the variable: other users can see arguments.")
     ] = None,
 ) -> None:
     """Show in the browser how a policy drives a robot.

@@ -22,24 +22,24 @@ def export(
     out: Annotated[Path, typer.Option(help="Repository folder; the bundle goes to OUT/<name>/<version>/.")],
     name: Annotated[str | None, typer.Option(help="Policy name; the environment's by default.")] = None,
     version: Annotated[str | None, typer.Option(help="Integer or x.y.z; the next integer by default.")] = None,
-    description: Annotated[str, typer.Option(help="A sentence for people, kept in the contract.")] = "",
+    description: Annotated[str, typer.Option(help="A sentence about the policy, stored in the contract.")] = "",
     module_id: Annotated[
-        str | None, typer.Option(help="Which RLModule (old API stack: policy); needed when there are several.")
+        str | None, typer.Option(help="RLModule to export (old API stack: policy); required if there are several.")
     ] = None,
     all_modules: Annotated[
         bool, typer.Option("--all-modules", help="Export every module, each to OUT/<name>-<module>; all or none.")
     ] = False,
     agent_id: Annotated[
-        str | None, typer.Option(help="For which agent, where a module serves several that are filtered differently.")
+        str | None, typer.Option(help="Agent to export for, if agents that share a module are filtered differently.")
     ] = None,
-    app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+    app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
     value: Annotated[
-        bool, typer.Option("--value/--no-value", help="Whether the bundle has the value head, too.")
+        bool, typer.Option("--value/--no-value", help="Include the value head.")
     ] = True,
     untrained_filter: Annotated[
         bool,
         typer.Option(
-            "--untrained-filter", help="Export even if the observation filter's statistics are empty or evaluation's."
+            "--untrained-filter", help="Export even if the observation filter's statistics are empty or come from evaluation."
         ),
     ] = False,
     source: Annotated[
@@ -52,10 +52,10 @@ def export(
         int, typer.Option(min=1, help="Of Stable-Baselines3, how many frames VecFrameStack put into an observation.")
     ] = 1,
     metric: Annotated[
-        str | None, typer.Option(help="Of a Tune trial or experiment, the checkpoint with the best of this metric.")
+        str | None, typer.Option(help="Metric that picks the best checkpoint of a Tune trial or experiment.")
     ] = None,
     mode: Annotated[
-        Literal["max", "min"], typer.Option(help="Whether the best is the largest or the smallest.")
+        Literal["max", "min"], typer.Option(help="Whether the largest or the smallest value of the metric is best.")
     ] = "max",
     as_json: Json = False,
 ) -> None:
@@ -137,8 +137,8 @@ def export(
 def prune(
     checkpoint: Annotated[str, typer.Argument(help="RLlib checkpoint folder or URI.")],
     out: Annotated[Path, typer.Option(help="Folder to make; it must not exist.")],
-    module_id: Annotated[str | None, typer.Option(help="Which RLModule; needed when there are several.")] = None,
-    app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+    module_id: Annotated[str | None, typer.Option(help="RLModule to keep; required if there are several.")] = None,
+    app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
 ) -> None:
     """Copy only what export needs out of a checkpoint. The copy is small enough to commit or to mail.
 

@@ -15,7 +15,7 @@ def inspect(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
     as_json: Json = False,
 ) -> None:
-    """Show a bundle's contract. It says what goes in, what comes out, what is baked in and how it was proven.
+    """Show a bundle's contract. It lists inputs, outputs, baked-in steps and the proof.
 
     Example: `rlservo inspect policies/ur5`
     """

@@ -10,17 +10,17 @@ from rlservo.deploy.terminal import Json, note, print_json
 
 
 def key(
-    label: Annotated[str, typer.Argument(help="Whom the key is for: a robot, a person. Shown in messages.")],
-    admin: Annotated[bool, typer.Option("--admin", help="For administration; robots need no such key.")] = False,
+    label: Annotated[str, typer.Argument(help="Label of the key, such as a robot or a person; shown in logs.")],
+    admin: Annotated[bool, typer.Option("--admin", help="Make a key for administration; robots do not need one.")] = False,
     rate: Annotated[
-        float | None, typer.Option(help="Requests a second that each replica answers of it; any number by default.")
+        float | None, typer.Option(help="Requests per second that each process accepts from this key; unlimited by default.")
     ] = None,
     burst: Annotated[
-        int | None, typer.Option(help="Requests at once, after a pause; as many as in a second by default.")
+        int | None, typer.Option(help="Requests accepted at once after a pause; one second's worth by default.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Make an API key. What is printed is the key for the client and the line with its hash for the server's key file.
+    """Make an API key. It prints the key for the client, and the line with its hash for the server's key file.
 
     Example: `rlservo key cell-7`; append the line to a file and name that in RLSERVO_API_KEYS_FILE
     """

@@ -21,7 +21,7 @@ log = typer.Typer(no_args_is_help=True, help="Show, convert and draw recordings.
 Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), or folders of them.")]
 Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder: its newest version.")]
 PolicyName = Annotated[
-    str | None, typer.Option("--policy", help="Which recorded policy, by name; needed where it is not clear.")
+    str | None, typer.Option("--policy", help="Name of the recorded policy; required if the recordings hold several.")
 ]
 
 
@@ -35,7 +35,7 @@ class Format(str, Enum):
 
 @log.command()
 def info(files: Files, as_json: Json = False) -> None:
-    """Show what is in recordings, and what is missing.
+    """Show what recordings contain, and what is missing.
 
     Example: `rlservo log info recordings`
     """
@@ -53,10 +53,10 @@ def info(files: Files, as_json: Json = False) -> None:
 @log.command()
 def export(
     files: Files,
-    to: Annotated[Format, typer.Option("--to", help="The format.")],
+    to: Annotated[Format, typer.Option("--to", help="Target format.")],
     out: Annotated[Path, typer.Option(help="New file (parquet), or new folder.")],
     policy: PolicyName = None,
-    task: Annotated[str | None, typer.Option(help="For LeRobot: a sentence that says what the robot does.")] = None,
+    task: Annotated[str | None, typer.Option(help="Description of the robot's task, for LeRobot.")] = None,
 ) -> None:
     """Convert recordings to Parquet, LeRobotDataset v3.0 or Minari.
 
@@ -89,7 +89,7 @@ def repair(
 ) -> None:
     """Copy a recording that was cut off into a whole file.
 
-    To its last whole chunk, with an end and an index, which other programs need. FILE stays as it is.
+    The copy ends with the last complete chunk and has the index that other programs need. FILE is not changed.
 
     Example: `rlservo log repair run.mcap --out whole.mcap`
     """
@@ -103,8 +103,8 @@ def repair(
 @log.command()
 def plot(
     files: Files,
-    episode: Annotated[int, typer.Option(min=0, help="Which episode, from 0, in the order they ended.")] = 0,
-    out: Annotated[Path, typer.Option(help="The picture: .png, .svg, .pdf.")] = Path("episode.png"),
+    episode: Annotated[int, typer.Option(min=0, help="Number of the episode, from 0, in the order in which they ended.")] = 0,
+    out: Annotated[Path, typer.Option(help="File for the picture: .png, .svg or .pdf.")] = Path("episode.png"),
 ) -> None:
     """Draw one recorded episode.
 

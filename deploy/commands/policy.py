@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from rlservo.serve_app.server.offline_commands import OfflineCommands
 
 policy = typer.Typer(
-    help="Say what is served. Versions, aliases, rollback, canary, shadow; by a server, or by the repository itself.",
+    help="Change what is served: versions, aliases, rollback, canary, shadow. On a server, or in a repository.",
     no_args_is_help=True,
 )
 
-Url = Annotated[str, typer.Option(help="The server.", envvar="RLSERVO_URL")]
+Url = Annotated[str, typer.Option(help="URL of the server.", envvar="RLSERVO_URL")]
 KeyFile = Annotated[
     Path | None,
     typer.Option(help="File with the admin key; else RLSERVO_ADMIN_KEY, else the one 'rlservo serve' wrote here."),
@@ -34,7 +34,7 @@ Repository = Annotated[
     list[str] | None,
     typer.Option(
         metavar="DIR|URI",
-        help="Without a server: where 'rlservo serve' reads; all its places, in its order. Every server follows.",
+        help="Repository to change instead of a server; repeat it as for 'rlservo serve'. Its servers follow.",
     ),
 ]
 Name = Annotated[str, typer.Argument(help="Policy name.")]
@@ -45,7 +45,7 @@ LOCAL = "http://127.0.0.1:8000"
 def list_policies(
     url: Url = LOCAL, key_file: KeyFile = None, repository: Repository = None, as_json: Json = False
 ) -> None:
-    """Show what is served, and since when. Of a repository also what it holds beside that.
+    """Show what is served, and since when. With --repository also the versions that are not loaded.
 
     Behind a proxy or on Ray Serve the table is the answering replica's alone: ask again for others, or read
     `rlservo_plan_generation` in each one's metrics.
@@ -77,13 +77,13 @@ def list_policies(
 @policy.command()
 def load(
     name: Name,
-    version: Annotated[str | None, typer.Argument(help="The repository's newest by default.")] = None,
+    version: Annotated[str | None, typer.Argument(help="Version; the newest of the repository by default.")] = None,
     url: Url = LOCAL,
     key_file: KeyFile = None,
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Load a version and prove it, ready for an alias.
+    """Load and prove a version, without using it.
 
     What clients get stays as it is until then; of a policy that is not served at all, the version loaded first is in
     use at once.
@@ -96,13 +96,13 @@ def load(
 @policy.command()
 def unload(
     name: Name,
-    version: Annotated[str | None, typer.Argument(help="The whole policy by default.")] = None,
+    version: Annotated[str | None, typer.Argument(help="Version; the whole policy by default.")] = None,
     url: Url = LOCAL,
     key_file: KeyFile = None,
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Drop a version that nothing leads to, or a whole policy.
+    """Unload a version that no alias, canary or shadow uses, or a whole policy.
 
     Example: `rlservo policy unload ur5 3`
     """
@@ -112,13 +112,13 @@ def unload(
 @policy.command()
 def alias(
     name: Name,
-    pair: Annotated[str, typer.Argument(metavar="ALIAS=VERSION", help="ALIAS= removes it; production= cannot be.")],
+    pair: Annotated[str, typer.Argument(metavar="ALIAS=VERSION", help="Alias and version; ALIAS= removes it, except production.")],
     url: Url = LOCAL,
     key_file: KeyFile = None,
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Let an alias lead to a loaded version. `production` is what clients get that ask for none.
+    """Point an alias to a loaded version. Clients that ask for no version get `production`.
 
     Example: `rlservo policy alias ur5 production=4`
     """
@@ -129,13 +129,13 @@ def alias(
 @policy.command()
 def rollback(
     name: Name,
-    alias: Annotated[str, typer.Option(help="Which alias.")] = "production",
+    alias: Annotated[str, typer.Option(help="Alias to move.")] = "production",
     url: Url = LOCAL,
     key_file: KeyFile = None,
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Let an alias lead where it led before. Once more goes one further back.
+    """Point an alias back to its previous version. Repeat it to go further back.
 
     Example: `rlservo policy rollback ur5`
     """
@@ -145,13 +145,13 @@ def rollback(
 @policy.command()
 def canary(
     name: Name,
-    pair: Annotated[str, typer.Argument(metavar="VERSION=SHARE|off", help="A version or alias, and 0 < share <= 1.")],
+    pair: Annotated[str, typer.Argument(metavar="VERSION=SHARE|off", help="Version or alias, and its share, 0 < share <= 1.")],
     url: Url = LOCAL,
     key_file: KeyFile = None,
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Send a share of the sessions to another version, or end that.
+    """Send a share of the sessions to another version, or end the canary.
 
     Example: `rlservo policy canary ur5 candidate=0.1`
     """
@@ -162,13 +162,13 @@ def canary(
 @policy.command()
 def shadow(
     name: Name,
-    version: Annotated[str, typer.Argument(metavar="VERSION|off", help="A version or alias.")],
+    version: Annotated[str, typer.Argument(metavar="VERSION|off", help="Version or alias.")],
     url: Url = LOCAL,
     key_file: KeyFile = None,
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Let another version compute along, or end that. How its actions differ is recorded.
+    """Compute another version's actions only to compare them, or end the shadow. Metrics have the differences.
 
     Example: `rlservo policy shadow ur5 candidate`
     """

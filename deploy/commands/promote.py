@@ -24,28 +24,28 @@ LONGEST_S = 30 * 86400.0
 
 def promote(
     name: Name,
-    version: Annotated[str, typer.Argument(help="A loaded version, not in production yet.")],
-    canary: Annotated[str, typer.Option(metavar="SHARE", help="Of the sessions: 10%, or 0.1.")] = "10%",
-    seconds: Annotated[str, typer.Option("--for", metavar="TIME", help="To watch it: 90s, 10m, 2h.")] = "10m",
+    version: Annotated[str, typer.Argument(help="A loaded version that is not in production.")],
+    canary: Annotated[str, typer.Option(metavar="SHARE", help="Share of the sessions: 10%, or 0.1.")] = "10%",
+    seconds: Annotated[str, typer.Option("--for", metavar="TIME", help="How long to watch the canary: 90s, 10m, 2h.")] = "10m",
     max_error_rate: Annotated[
-        str | None, typer.Option(metavar="SHARE", help="Of its requests that may fail by its own fault: 0.1%.")
+        str | None, typer.Option(metavar="SHARE", help="Share of its requests that may fail by its own fault: 0.1%.")
     ] = None,
     max_p99: Annotated[
-        str | None, typer.Option(metavar="TIME", help="In the server that 1% of its answers may exceed: 20ms.")
+        str | None, typer.Option(metavar="TIME", help="Latency in the server that 1% of its answers may exceed: 20ms.")
     ] = None,
     max_action_difference: Annotated[
-        float | None, typer.Option(min=0, help="From production, in action units, that 1% of its actions may exceed.")
+        float | None, typer.Option(min=0, help="Difference from production, in action units, that 1% of its actions may exceed.")
     ] = None,
     max_success_drop: Annotated[
-        str | None, typer.Option(metavar="SHARE", help="Of episodes that succeed, below production's share: 2%.")
+        str | None, typer.Option(metavar="SHARE", help="Allowed drop in the share of successful episodes below production's: 2%.")
     ] = None,
-    min_requests: Annotated[int, typer.Option(min=1, help="Requests (or compared actions) to decide by.")] = 100,
-    min_episodes: Annotated[int, typer.Option(min=1, help="Episodes of either version to decide by.")] = 20,
-    log: Annotated[Path | None, typer.Option(help="JSON lines; promote-NAME-VERSION.jsonl here by default.")] = None,
-    every: Annotated[float, typer.Option(min=0.2, max=10, help="[s] Between checks.")] = 5.0,
+    min_requests: Annotated[int, typer.Option(min=1, help="Requests (or compared actions) required for a decision.")] = 100,
+    min_episodes: Annotated[int, typer.Option(min=1, help="Episodes of each version required for a decision.")] = 20,
+    log: Annotated[Path | None, typer.Option(help="File for the log in JSON lines; promote-NAME-VERSION.jsonl by default.")] = None,
+    every: Annotated[float, typer.Option(min=0.2, max=10, help="Seconds between checks.")] = 5.0,
     url: Annotated[
         list[str],
-        typer.Option(help="The server; more of them where each has metrics of its own.", envvar="RLSERVO_URL"),
+        typer.Option(help="URL of the server; repeat it to read the metrics of several replicas.", envvar="RLSERVO_URL"),
     ] = [LOCAL],  # noqa: B006 - typer copies it
     key_file: KeyFile = None,
     as_json: Json = False,

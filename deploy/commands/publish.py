@@ -20,7 +20,7 @@ def publish(
     uri: Annotated[str, typer.Argument(metavar="URI", help="s3://bucket/policies, or a folder.")],
     version: Annotated[
         str | None,
-        typer.Option(metavar="N|next", help="Another number than the bundle's own, or the next one that is free."),
+        typer.Option(metavar="N|next", help="Version to publish as: a number, or 'next'; the bundle's own by default."),
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -25,7 +25,7 @@ def replay(
     files: Files,
     bundle: Bundle,
     tolerance: Annotated[
-        float, typer.Option(min=0.0, help="By how much an element may differ without counting as changed.")
+        float, typer.Option(min=0.0, help="Largest difference of an element that does not count as a change.")
     ] = 0.0,
     policy: PolicyName = None,
     as_json: Json = False,
@@ -55,10 +55,10 @@ def replay(
 def estimate(
     files: Files,
     bundle: Bundle,
-    explore: Annotated[bool, typer.Option("--explore", help="Of the exploring policy, not of the mode.")] = False,
+    explore: Annotated[bool, typer.Option("--explore", help="Estimate the exploring policy instead of the deterministic one.")] = False,
     gamma: Annotated[float, typer.Option(help="Discount per step.")] = 1.0,
     policy: PolicyName = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the bootstrap.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Estimate a bundle's return from recordings of another.

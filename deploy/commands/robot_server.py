@@ -29,11 +29,11 @@ robot_server = typer.Typer(
 Host = Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for clients on other machines.")]
 Clock = Annotated[
     Literal["fast", "real"],
-    typer.Option(help="fast: a cycle takes what its simulation takes; real: its time on the wall, as on the robot."),
+    typer.Option(help="fast: as fast as the simulation runs; real: in real time, as on the robot."),
 ]
 RobotPort = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free one.")]
 Gui = Annotated[bool, typer.Option("--gui", help="Show the robot in a window; needs a display.")]
-Seed = Annotated[int | None, typer.Option(help="Of random object paths and laser noise; none: differs every run.")]
+Seed = Annotated[int | None, typer.Option(help="Random seed of object paths and laser noise; differs every run by default.")]
 
 
 Limit = Annotated[
@@ -48,17 +48,17 @@ Limit = Annotated[
 def robot_server_ur(
     ur_model: Annotated[str, typer.Option(help="ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5",
     rs_mode: Annotated[
-        str, typer.Option(help="What a state holds: only_robot, 1object, 1moving2points or 2objects2points.")
+        str, typer.Option(help="Content of a state: only_robot, 1object, 1moving2points or 2objects2points.")
     ] = "only_robot",
     action_mode: Annotated[
         str, typer.Option(help="abs_pos: actions are joint positions; delta_pos: offsets from where the arm is.")
     ] = "abs_pos",
     action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz].")] = 25.0,
-    max_velocity_scale_factor: Annotated[float, typer.Option(help="Of the joints' velocity limits.")] = 1.0,
+    max_velocity_scale_factor: Annotated[float, typer.Option(help="Share of the joints' velocity limits that is used.")] = 1.0,
     world: Annotated[str, typer.Option(help="empty, or a tabletop world of robo-gym.")] = "tabletop",
     model: Annotated[
         list[str] | None,
-        typer.Option("--object", help="Object model in the scene, e.g. sphere50; repeat it. By default the mode's."),
+        typer.Option("--object", help="Object model in the scene, such as sphere50; repeat it for more. Depends on --rs-mode by default."),
     ] = None,
     robot: Annotated[
         str, typer.Option(help="mujoco, or a real arm: rtde://192.168.0.2 (extra 'ur'; docs/how-to/ur-arm.md first).")
@@ -126,10 +126,10 @@ def robot_server_mir100(
 def server_manager(
     host: Host = "127.0.0.1",
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Port; without it the first free one of 50100 to 50199.")
+        int | None, typer.Option(min=1, max=65535, help="Port; the first free one of 50100 to 50199 by default.")
     ] = None,
     clock: Clock = "fast",
-    max_servers: Annotated[int, typer.Option(min=1, help="How many robot servers may run at once.")] = 100,
+    max_servers: Annotated[int, typer.Option(min=1, help="Most robot servers that may run at once.")] = 100,
     orphan_timeout: Annotated[
         float, typer.Option(min=0.0, help="Seconds without a client after which a robot server ends; 0: never.")
     ] = 120.0,
@@ -251,7 +251,7 @@ def _serve(settings: Settings, title: str) -> None:
 
 @contextmanager
 def _one_sentence_errors() -> Iterator[None]:
-    """Turn what the simulators refuse into the command line's errors, and say which extra is missing."""
+    """Turn the simulators' refusals into errors of the command line, and name a missing extra."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     try:
         with needs_extra("sim", "mujoco", "grpc"):

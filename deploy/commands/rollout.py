@@ -39,27 +39,27 @@ def rollout(
     transport: Annotated[
         TransportKind, typer.Option(help="http: JSON, a request per action; ws: one WebSocket.")
     ] = "http",
-    deadline_ms: Annotated[float | None, typer.Option(help="An action that takes longer is not used.")] = None,
+    deadline_ms: Annotated[float | None, typer.Option(help="Deadline for each action; a later one is not used.")] = None,
     fallback: Annotated[
         str | None,
         typer.Option(
-            metavar="hold|zero|stop|ACTION", help="What the robot does without an answer in time; by default it fails."
+            metavar="hold|zero|stop|ACTION", help="What the robot does if an action is late; by default the command fails."
         ),
     ] = None,
     server_state: Annotated[
-        bool, typer.Option("--server-state", help="Leave a recurrent policy's state with the server.")
+        bool, typer.Option("--server-state", help="Keep a recurrent policy's state on the server.")
     ] = False,
     api_key: Annotated[
-        str | None, typer.Option(envvar="RLSERVO_API_KEY", help="Rather in the variable: others see arguments.")
+        str | None, typer.Option(envvar="RLSERVO_API_KEY", help="API key. Prefer the variable: other users can see arguments.")
     ] = None,
     record: Annotated[
-        Path | None, typer.Option(help="Record every decision, with rewards and ends: a new .mcap file, or a folder.")
+        Path | None, typer.Option(help="Record every decision, reward and ending into a new .mcap file or a folder.")
     ] = None,
     disturb: Annotated[
         str | None,
         typer.Option(
             metavar="KIND=SIZE,...",
-            help="Drive under disturbances, such as latency=3,noise=real,payload=3; `rlservo verify -h` has the kinds.",
+            help="Disturbances to drive under, such as latency=3,noise=real,payload=3; see `rlservo verify -h`.",
         ),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Real robot: move to a start without asking.")] = False,

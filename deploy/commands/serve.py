@@ -33,16 +33,16 @@ AliasOption = Annotated[
     typer.Option(
         "--alias",
         metavar="NAME:ALIAS=VERSION",
-        help="ur5:production=3, say; repeat it. Without one the newest version is production, and stays it.",
+        help="Alias for a new plan, such as ur5:production=3; repeat it. The newest version is production by default.",
     ),
 ]
 CanaryOption = Annotated[
     list[str] | None,
-    typer.Option("--canary", metavar="NAME:VERSION=SHARE", help="Share of the sessions for another version."),
+    typer.Option("--canary", metavar="NAME:VERSION=SHARE", help="Version that gets a share of the sessions."),
 ]
 ShadowOption = Annotated[
     list[str] | None,
-    typer.Option("--shadow", metavar="NAME=VERSION", help="Version that computes along, only to be compared."),
+    typer.Option("--shadow", metavar="NAME=VERSION", help="Version that is computed only to compare its actions."),
 ]
 
 
@@ -56,14 +56,14 @@ def serve(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 is any free one.")] = 8000,
     grpc_port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC, here.")
+        int | None, typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC on this port.")
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
     default_policy: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Policy of a WebSocket at '/', where openpi's clients connect; the only one by default.",
+            help="Policy of a WebSocket at '/', where openpi's clients connect; if there is one policy, that one.",
         ),
     ] = None,
     record: Annotated[
@@ -71,13 +71,13 @@ def serve(
     ] = None,
     poll: Annotated[
         float | None,
-        typer.Option(min=1, metavar="SECONDS", help="Look for new versions this often; they are loaded, not in use."),
+        typer.Option(min=1, metavar="SECONDS", help="Look for new versions this often; they are loaded but not used."),
     ] = None,
     session_store: Annotated[
         str | None,
         typer.Option(
             metavar="memory|URL",
-            help="Where sessions by id are kept; several workers need redis://HOST:PORT/DATABASE.",
+            help="Storage of sessions by id; several workers need redis://HOST:PORT/DATABASE.",
         ),
     ] = None,
     config: ConfigOption = None,

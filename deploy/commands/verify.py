@@ -38,7 +38,7 @@ def verify(
         ),
     ] = None,
     checkpoint: Annotated[
-        str | None, typer.Option(help="The RLlib checkpoint to compare with; a folder or a URI.")
+        str | None, typer.Option(help="RLlib checkpoint to compare with; a folder or a URI.")
     ] = None,
     env: Annotated[str | None, typer.Option(help="Environment id for a closed-loop comparison.")] = None,
     disturb: Annotated[
@@ -64,12 +64,12 @@ def verify(
     write: Annotated[
         bool, typer.Option("--write", help="With --disturb, write the rows into the contract as evaluations.")
     ] = False,
-    app_dir: Annotated[Path, typer.Option(help="Folder of your own modules that the checkpoint refers to.")] = Path(),
+    app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
     as_json: Json = False,
 ) -> None:
-    """Prove a bundle against its checkpoint again. With --env also in closed loop, written into the contract.
+    """Prove a bundle against its checkpoint again. With --env it also drives episodes and adds them to the contract.
 
-    With --disturb it is driven as a real robot would have it, with no checkpoint needed: success, return and endings
+    With --disturb it drives the simulator with latency, noise and more, and needs no checkpoint: success, return and endings
     under each disturbance, over the same seeds.
 
     Examples: `rlservo verify policies/ur5 --checkpoint runs/best --env rlservo/EndEffectorPositioningURSim-v0`,
